@@ -43,17 +43,17 @@ class Key:
 
     @property
     def converted(self) -> bool:
-        """Whether field and key have different units."""
+        """Whether the field has another unit than the key."""
         return self.unit in ANGULAR or self.unit == MEGABYTES
 
     def inside(self, value: Any) -> Any:
-        """Convert a number from the configuration to the unit of the field."""
+        """A number from the configuration in the unit of the field."""
         if value is None or not self.converted:
             return value
         return math.radians(value) if self.unit in ANGULAR else value * 1_000_000
 
     def fault(self, value: Any) -> str:
-        """How the value of a field violates its bounds; "" if it does not."""
+        """What is wrong with the value of a field by its bounds; "" where nothing is."""
         if isinstance(value, float) and not math.isfinite(value):
             return "expected a finite number"
         if value is None:
@@ -75,7 +75,7 @@ _WORDS = {"gt": ">", "ge": ">=", "le": "<=", "pattern": "text of the form", "min
 
 
 class Declared:
-    """Settings whose fields are checked against the bounds that their keys declare.
+    """Settings whose fields are within the bounds that their keys declare.
 
     Raises:
         ValueError: one is not.

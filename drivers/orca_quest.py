@@ -43,7 +43,7 @@ QE = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.
 
 
 def quantum_efficiency(wavelength_nm: float) -> float:
-    """Photoelectrons per photon of light, linear between the points of the curve."""
+    """Photoelectrons a photon of light, linear between the points of the curve."""
     return float(np.interp(wavelength_nm, QE_NM, QE))
 
 
@@ -73,20 +73,20 @@ class LightPath:
             ("transmission", 1e-6, 1.0), ("wavelength_nm", QE_NM[0], QE_NM[-1]),
         ):  # fmt: skip
             if not low <= (value := getattr(self, name)) <= high:
-                raise ValueError(f"{name} must lie in {low:g} ... {high:g}, got {value:g}")
+                raise ValueError(f"{name} lies in {low:g} ... {high:g}, got {value:g}")
 
     @property
     def collected(self) -> float:
-        """Fraction of the light that the objective collects: a cone out of the screen, on one side."""
+        """Share of the light that the objective takes: a cone out of the screen, on one side."""
         return (1 - math.sqrt(1 - (self.aperture / self.index) ** 2)) / 2
 
     @property
     def electrons(self) -> float:
-        """Photoelectrons per X-ray photon stopped by the screen."""
+        """Photoelectrons of an X-ray photon that the screen stops."""
         return self.light * self.collected * self.transmission * quantum_efficiency(self.wavelength_nm)
 
     def x_rays_per_count(self, gain: float) -> float:
-        """X-ray photons at the screen per count.
+        """X-ray photons at the screen that make a count.
 
         Args:
             gain: counts of a photoelectron as photon transfer finds it. Of `electrons` that come together, the variance
@@ -96,7 +96,7 @@ class LightPath:
 
 
 def refusal(settings: CameraSettings, model: str = MODEL) -> str:
-    """Why the camera would refuse the settings, with the legal values; "" if it accepts them."""
+    """Reason for which the camera would refuse the settings, with the legal values; "" if it takes them."""
     if settings.readout not in LINE_TIME:
         return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:

@@ -20,7 +20,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Flag:
-    """The finding of a check about one or several frames.
+    """The finding of a check about one frame or several.
 
     Attributes:
         check: name of the check.
@@ -49,11 +49,11 @@ class Flag:
 
     @property
     def frames(self) -> range:
-        """The rows of the file that the flag applies to."""
+        """Frames of the file that it applies to."""
         return range(self.frame if self.first is None else self.first, self.frame + 1)
 
     def regions(self) -> dict[int, PixelBox]:
-        """Regions of the flagged frames that show the fault, if known."""
+        """Regions of its frames that show it, where they are known."""
         if self.region is None:
             return {}
         if self.from_region is None:

@@ -71,7 +71,7 @@ class CellGrid:
 
 @dataclass(frozen=True, eq=False)
 class CellView:
-    """A projection averaged on the cell grid."""
+    """A projection on the grid."""
 
     index: int  # its row in the file
     angle: float  # radians
@@ -109,7 +109,7 @@ def grid_of(
 
 
 def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
-    """A projection on the grid; `more_light`: its exposure relative to that of the flats."""
+    """A projection on the grid; `more_light`: its exposure over that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
     through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / more_light), darkest)
@@ -124,8 +124,7 @@ def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: flo
 
 
 def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
-    """Upper bound of the light in nine tenths of the places, relative to the last good view, or to the flats before
-    one.
+    """Upper bound of the light in nine tenths of the places, over the last good view, or over the flats before one.
 
     A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
     Opaque places do not count.
@@ -155,7 +154,7 @@ def brightest_place(view: CellView, grid: CellGrid) -> float:
 
 
 def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
-    """Logarithm of the fraction of light lost since the flats, measured in air; NaN if no air has been seen yet.
+    """Logarithm of the light that the beam has lost since the flats, as air shows it; NaN where none has shown it yet.
 
     A beam that weakens takes the same share of the light everywhere, from flats that were the same: both edges and the
     brightest place are then equally dark, and hardly darker than in the views before. A sample that enters is not.

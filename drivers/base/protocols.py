@@ -81,7 +81,7 @@ class RotationStage(Protocol):
     def to_angle(self, counts: int) -> float: ...
 
     def position(self) -> float:
-        """Position in radians, read from the device."""
+        """Radians, read from the device."""
 
     def start_move(self, angle: float, speed: float) -> None:
         """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
@@ -96,9 +96,7 @@ class RotationStage(Protocol):
     def moving(self) -> bool: ...
 
     def wait(self, timeout: float) -> float:
-        """Wait for the end of the move; returns the position in rad. Raises DeviceTimeout, or DeviceError if it stopped
-        short.
-        """
+        """Wait for the move to end; the position in rad. Raises DeviceTimeout, or DeviceError if it stopped short."""
 
     def stop(self) -> None:
         """Decelerate and stand. Legal in every state."""
@@ -183,7 +181,7 @@ class Camera(Protocol):
     name: str
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply settings and read them back. Raises DeviceRefused if the camera cannot."""
+        """Apply and read back. Raises DeviceRefused if the camera cannot."""
 
     @property
     def timing(self) -> CameraTiming: ...
@@ -207,9 +205,8 @@ class Camera(Protocol):
 
 class CooledCamera(Camera, Protocol):
     def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> float:
-        """Wait until the sensor is cold, at most `timeout` s; returns its temperature in °C. `progress` gets it and the
-        status of the cooler. Raises DeviceError if it does not get cold, or its cooler is off or faulty.
-        """
+        """Wait until the sensor is cold, at most `timeout` s; its temperature, °C. `progress` is told it and the status
+        of the cooler. Raises DeviceError: it does not get cold, or its cooler is off or in trouble."""
 
 
 class Shutter(Protocol):
@@ -249,10 +246,10 @@ class Filter(Protocol):
     name: str
 
     def put(self, place: str) -> None:
-        """Move the filter to a place, and return when it has arrived. Raises DeviceError if it did not arrive."""
+        """Move the filter to a place, and return when it is there. Raises DeviceError if it did not arrive."""
 
     def place(self) -> str | None:
-        """Name of the present place; None if it has no name or is unknown. Raises DeviceError."""
+        """Name of the present place; None if it has no name or is not known. Raises DeviceError."""
 
 
 class ConnectedFilter(Filter, Protocol):
@@ -271,7 +268,7 @@ class Monochromator(Protocol):
         """Move to an energy, and return when it has settled there. Raises DeviceError if it did not arrive."""
 
     def energy(self) -> float | None:
-        """Present energy in keV; None if it is unknown. Raises DeviceError."""
+        """Present energy in keV; None if it is not known. Raises DeviceError."""
 
 
 class ConnectedMonochromator(Monochromator, Protocol):
@@ -291,17 +288,16 @@ class Watchable(Protocol):
     """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """Call `check` repeatedly during every move from now on; its exception ends the wait."""
+        """From now on `check` is called again and again while it moves; its exception ends the wait."""
 
 
 @runtime_checkable
 class Rechecked(Protocol):
-    """A device whose position can be recorded after a move, and compared later."""
+    """A device whose position is trusted after a move, and can be checked again later."""
 
     def remember_place(self) -> Callable[[], str]:
-        """Record the position. The returned function states the position if it has changed; "" if it has not. Both
-        raise DeviceError.
-        """
+        """Note where it stands. The function returned says, whenever it is called, where it stands instead; "" if it is
+        still there. Both raise DeviceError."""
 
 
 @dataclass(frozen=True)

@@ -34,14 +34,14 @@ class Decisions:
         return value
 
     def preset(self, made: Mapping[str, Sequence[Any]]) -> None:
-        """Use these as the next decisions of these names, unless a followed run has already decided."""
+        """Use these as the next decisions of their names, unless a followed run has made them."""
         for name, values in made.items():
             if len(self._followed.get(name, ())) <= len(self.made.get(name, ())):
                 self._followed = {**self._followed, name: [*self.made.get(name, ()), *values]}
 
 
 class Stop:
-    """A request to end a run with its result so far; the run checks it between steps.
+    """A request to end a run with its result so far; the run asks it between steps.
 
     Args:
         asks: True ends the work, and it is not asked again.
@@ -76,5 +76,5 @@ class Stop:
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether a stop left some of the `planned` steps or iterations undone; 0 if no number is planned."""
+        """Whether a stop left some of the `planned` steps or iterations undone; 0: no number is planned."""
         return self.stopped and not 0 < planned <= done

@@ -23,7 +23,7 @@ _ALL = (0.05, 99.95)
 
 
 def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
-    """A sorted sample of the finite values, split into classes by thresholds.
+    """A sample of the finite values, ascending, split into classes by thresholds.
 
     A class is parted where two of its parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man
     Cybern. 9, 62), and each of these likewise.
@@ -85,12 +85,12 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
 
 
 def matter_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
-    """One window of matter for all these values together, see `grey_windows`."""
+    """The window of matter of all these values together, see `grey_windows`."""
     return grey_windows(np.concatenate([np.ravel(array) for array in arrays]))["matter"]
 
 
 def apart(low: float, high: float) -> tuple[float, float]:
-    """The ends of a range, separated if all values are equal."""
+    """The ends of a range, kept apart where all values are equal."""
     return low, max(high, low + 1e-6 * max(abs(low), 1e-3))
 
 
@@ -119,7 +119,7 @@ def png(pixels: U8) -> bytes:
 
 
 def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
-    """The middle slices across z, y and x of a volume [z, y, x], side by side, and the values shown as black and white.
+    """The middle slices across z, y and x of a volume [z, y, x], side by side, and the values of black and white.
 
     y and z point downwards. Long sides are thinned out to 256 voxels; values that are not finite are black.
     """
@@ -140,7 +140,7 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
 
 
 def fan(angles: NDArray[np.float64], centre: float) -> U8:
-    """Directions of the rays of views, drawn as dark lines through the rotation axis; x to the right, y downwards.
+    """Directions of the rays of views, as dark lines through the rotation axis; x to the right, y downwards.
 
     Args:
         angles: [view] radians.

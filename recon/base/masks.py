@@ -57,7 +57,7 @@ def plan_fill(mask: Mask) -> Fill:
 
 
 def areas(mask: Mask) -> Mask:
-    """Masked pixels [row, col] in areas of 3 x 3 or more; the outside of the detector counts as masked.
+    """Masked pixels [row, col] within an area of 3 x 3 or more; beyond the detector's edges all counts as masked.
 
     Their fill values are guesses. A single pixel or a line is interpolated well.
     """
@@ -74,7 +74,7 @@ def fill(image: Image, plan: Fill) -> None:
 def masked(
     projections: NDArray[np.float32], weight: NDArray[np.float32] | None = None, largest: float = math.inf
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Projections with non-finite values replaced, and their weights.
+    """Projections with all values finite, and their weights.
 
     Pixels that are not finite, or have weight 0, take the mean of their neighbours in the same view, for direct methods
     and first volumes. Their weight is 0, so that a fit ignores them.
@@ -122,8 +122,7 @@ def masked(
 
 
 def usual_weight(weights: F32, data: F32) -> float:
-    """The weight of a typical ray through matter: the mean over rays of non-zero weight, weighted by their line
-    integrals.
+    """The weight of a typical ray through matter: the mean over rays with weight, each counted by its line integral.
 
     Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
     """

@@ -79,7 +79,7 @@ class Energies(Checked):
 
 @dataclass(frozen=True, eq=False)
 class DataUse(Checked):
-    """How the projections are used by a method.
+    """How the projections are used.
 
     Attributes:
         weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
@@ -102,7 +102,7 @@ class DataUse(Checked):
 
 @dataclass(frozen=True, eq=False)
 class RunControl(Checked):
-    """How a caller watches, stops and continues a reconstruction.
+    """How a caller watches, ends and continues a reconstruction.
 
     Attributes:
         should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far. Direct
@@ -126,16 +126,16 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """The stop request that methods check between steps: should the run end with the volume so far?"""
+        """The request that methods ask between steps: should the run end with the volume so far?"""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """The stop request that trials check between sweeps."""
+        """The request that trials ask between sweeps."""
         return self.stop_trials or self.stop
 
     def tell(self, progress: Progress) -> None:
-        """Report the progress, if there is a listener."""
+        """Report the progress, where somebody listens."""
         if self.on_progress is not None:
             self.on_progress(progress)
 
@@ -145,7 +145,7 @@ class RunControl(Checked):
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
-        """The same control with a deadline on its clock."""
+        """The same control with a deadline by its clock."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 
@@ -186,7 +186,7 @@ class Ending:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A reconstructed volume, with what its method reports: the result of `Method.run` and `recon.reconstruct`.
+    """A reconstructed volume, with what its method says of itself: what `Method.run` and `recon.reconstruct` return.
 
     Attributes:
         volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
@@ -233,7 +233,7 @@ class Reconstruction:
         return html(f"Reconstruction by {self.method}", pixels, facts)
 
     def save(self, path: str | Path) -> None:
-        """Write the volume and its settings to the new file `path`, an .npz, which `beamline export` converts.
+        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
         As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays.
         """
@@ -243,7 +243,7 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class Traits:
-    """Abilities of a method beyond reconstructing one volume from line integrals.
+    """Abilities of a method, beyond turning line integrals into a volume.
 
     Attributes:
         direct: one pass without iterations: it has no history, and cannot be stopped.
@@ -279,7 +279,7 @@ class Traits:
 
     @property
     def several(self) -> bool:
-        """Whether the method reconstructs several volumes jointly from all views."""
+        """Whether the method makes several volumes, which all views determine together."""
         return self.in_time or self.by_energy
 
 
@@ -312,10 +312,10 @@ class Method(Protocol):
 
 @runtime_checkable
 class DividedMethod(Method, Protocol):
-    """A method with settings that depend on its share of the volume."""
+    """A method with settings that depend on its share of a volume."""
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for this share of the volume, with this share of the seconds."""
+        """The method for this share of a volume, in this share of its seconds."""
 
 
 @runtime_checkable
@@ -336,10 +336,10 @@ class TimedMethod(Method, Protocol):
 
 @runtime_checkable
 class ChoosingMethod(Method, Protocol):
-    """A method that may return the volume of another one, if that predicts held-out views as well."""
+    """A method that may take the volume of another one, where that predicts views held out as well."""
 
     def as_candidate(self) -> Self:
-        """The same method, which always returns its own volume."""
+        """The same method, which makes its own volume whatever others predict."""
 
 
 @runtime_checkable
@@ -353,11 +353,11 @@ class BoundedMethod(Method, Protocol):
 
 @runtime_checkable
 class EarlyStopMethod(Protocol):
-    """A method that held-out views may end early."""
+    """A method that views held out may end early."""
 
     @property
     def early_stop(self) -> bool:
-        """Whether held-out views may end the method."""
+        """Whether views held out may end the method."""
 
 
 @runtime_checkable
@@ -366,7 +366,7 @@ class SignedMethod(Protocol):
 
     @property
     def allow_negative(self) -> bool:
-        """Whether the method keeps negative voxels."""
+        """Whether it keeps negative voxels."""
 
 
 @runtime_checkable
@@ -388,19 +388,19 @@ class CheckpointedMethod(Method, Protocol):
 
     @property
     def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
-        """All settings that determine the steps, which a resumed run must share: a dataclass, and others by name."""
+        """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
 
 
 def volumes_of(method: Any) -> int:
-    """Number of volumes of a method's result."""
+    """Number of volumes that a method makes."""
     return int(method.volumes) if method.traits.several else 1
 
 
 def volume_names_of(method: Any) -> tuple[str, ...]:
-    """Names of the materials of a method's volumes; empty for other methods."""
+    """Names of the materials whose volumes a method makes; empty for other methods."""
     return tuple(method.volume_names) if method.traits.several else ()
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:
-    """The methods that `method` chooses among, the preferred one first; only `method` if it does not choose."""
+    """The methods that `method` chooses among, the preferred one first; itself if it does not choose."""
     return method.candidates if isinstance(method, ListedMethods) else (method,)

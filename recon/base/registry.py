@@ -54,7 +54,7 @@ class UnknownNameError(ValueError, KeyError):
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """The entries of a kind, by name: this project's first, then those of other packages in the order of their names.
+    """The entries of a kind, by name: ours first, then those of other packages in the order of their names.
 
     Other packages are asked at the first use, so that programs without it start quickly.
 
@@ -162,7 +162,7 @@ def entry_points_announced() -> tuple[EntryPoint, ...]:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Numbers of iterations or steps of a method that a comparison tries.
+    """Numbers of iterations or steps that a comparison tries of a method.
 
     Attributes:
         setting: "iterations" or "steps".
@@ -178,7 +178,7 @@ class Lengths:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """Registry entry of a method: where its settings class is, and when the method is compared with others.
+    """Where the settings class of a method is, and when it is compared with others.
 
     Attributes:
         module, cls: of its settings class, see `recon.base.method.Method`.

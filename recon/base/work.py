@@ -22,7 +22,7 @@ CLOCK = "clock"
 
 
 class Rate(NamedTuple):
-    """Seconds per unit of each of the two amounts of an operation."""
+    """Seconds that an operation takes for each unit of its two amounts."""
 
     first: float
     second: float
@@ -34,7 +34,7 @@ Rates = Callable[[str], Rate]
 
 @dataclass(frozen=True)
 class Work:
-    """Amounts of operations, by name. Works can be added, and multiplied by numbers."""
+    """Amounts of operations, by their names. Works add, and multiply by numbers."""
 
     amounts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -78,7 +78,7 @@ class Costs:
 
 
 class SizedRun(NamedTuple):
-    """An operation of some size: the two amounts of its work, and the function that performs it."""
+    """An operation of some size: the two amounts of its work, and what does it."""
 
     first: float
     second: float
@@ -99,16 +99,15 @@ class Span(NamedTuple):
 
 @runtime_checkable
 class CostedMethod(Protocol):
-    """A method that states its operations. The time of other methods is unknown until they are tried."""
+    """A method that states its operations. The time of other methods is not known before they are tried."""
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """The work on these views of a typical scan; what depends on the data, such as the trials of a weight, may
-        differ.
-        """
+        """Its work on these views of a usual scan; what depends on the data, such as the trials of a weight, may
+        differ."""
 
 
 def parts_of(geometry: Geometry, heights: Sequence[int]) -> list[tuple[Geometry, Grid]]:
-    """Views and voxels of each slab, if rows show slices; for other beams a single part."""
+    """Views and voxels of each slab, where rows show slices; of other beams the one part with all."""
     grid = Grid.matching(geometry)
     if len(heights) == 1 and heights[0] == grid.shape[0]:
         return [(geometry, grid)]
@@ -118,7 +117,7 @@ def parts_of(geometry: Geometry, heights: Sequence[int]) -> list[tuple[Geometry,
 
 
 def costs_of(method: Any, parts: Sequence[tuple[Geometry, Grid]], decided: bool = False) -> Costs | None:
-    """The work of a volume that is made in parts, one after the other; None if the method does not state it.
+    """The work of a volume that is made in parts, one after the other; None: the method does not state it.
 
     Args:
         parts: views and voxels of each slab.

@@ -104,9 +104,9 @@ def fdk(
     """
     grid = Grid.matching(geometry) if grid is None else grid
     if not geometry.is_cone:
-        raise ValueError("FDK needs a cone beam; use fbp for a parallel beam")
+        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
     if not geometry.is_straight:
-        raise ValueError("FDK needs views without roll and tilt; use `direct` for these")
+        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
     return _by_slabs(
         projections, geometry, grid, cone_weights, partial(_prepared_views, filter=filter), _along_columns, on_block
     )

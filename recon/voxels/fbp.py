@@ -168,9 +168,9 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     """
     _known(filter)
     if geometry.is_cone:
-        raise ValueError("FBP needs a parallel beam; use fdk for a cone beam")
+        raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
     if not geometry.is_straight:
-        raise ValueError("FBP needs views without roll and tilt; use `direct` for these")
+        raise ValueError("FBP takes straight views only; these are rolled or tilted: `direct` takes them")
     geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)

@@ -96,7 +96,7 @@ class Projector:
 
     @property
     def plain(self) -> Projector:
-        """The same projector without sharpening: no entry of its matrix is negative."""
+        """The same without sharpening: no entry of its matrix is negative."""
         return replace(self, matched=False) if self.matched else self
 
     def gain(self, weight: F32 | None = None) -> float:
@@ -119,7 +119,7 @@ class Projector:
         return rows * (1 + (cols - 1) * min(share, 1.0))
 
     def subset(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Projector:
-        """The projector restricted to some views, in that order."""
+        """The same for some views only, in that order."""
         return replace(self, geometry=self.geometry.select(views))
 
     def __call__(self, volume: F32) -> F32:

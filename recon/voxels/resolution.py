@@ -120,7 +120,7 @@ def on_rows(geometry: Geometry, grid: Grid) -> bool:
 
 
 def levels(geometry: Geometry, grid: Grid) -> tuple[F64, float]:
-    """The slice (fractional) seen by the first row of each view, and slices per row; parallel beam."""
+    """The slice (fractional) that the first row of each view sees, and slices a row; parallel beam."""
     middle = (grid.shape[0] - 1) / 2 - grid.centre[0] / grid.spacing[0]
     step = geometry.pixel_pitch / grid.spacing[0]
     return middle - (geometry.axis_row + geometry.shifts[:, 1]) * step, step

@@ -136,7 +136,7 @@ def seen_by(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
 
 
 def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F64:
-    """Quadrature weights [view, col] of the rays of one slice, from the views that see it; 0 for the others.
+    """Quadrature weights [view, col] of the rays of one slice, from the views alone that see it; 0 for the others.
 
     As `ray_weights`: views that step along the axis see each slice from angles of its own, some of them more often.
 
@@ -237,7 +237,7 @@ def missing_arc(geometry: Geometry) -> float:
 
 
 class Wedge(NamedTuple):
-    """Missing rays: those of the absent views from the angle `first` on, over `size` (radians)."""
+    """Rays that no view shows: those of views that are missing from the angle `first` on, over `size` (radians)."""
 
     first: float
     size: float
@@ -250,7 +250,7 @@ class Wedge(NamedTuple):
 
 
 def unseen_wedges(geometry: Geometry) -> list[Wedge]:
-    """Missing rays, as angles of the absent views, modulo π; none if views suffice.
+    """Rays that no view shows, as angles of the views that are missing, modulo π; none where views suffice.
 
     Of a parallel beam, and of a cone whose views leave several gaps, these are rays through the rotation axis. Of a
     short scan of a cone the wedge is `missing_arc`: rays at the rim of the field are missing before those at the axis.

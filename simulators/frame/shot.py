@@ -91,7 +91,7 @@ class Pose:
         return Pose(self.angle, self.shift, _added(self.tilt, tilt, (self.angle.size, 2)))
 
     def frames(self) -> tuple[Reals, Reals]:
-        """The axes of the laboratory in the sample's coordinates.
+        """The laboratory in the sample's coordinates.
 
         Returns:
             Axes float64 [row, 3, 3], whose columns are u, b and v in (x, y, z), and the laboratory's origin,
@@ -195,12 +195,12 @@ class Moments:
 
 
 def frame_rng(effect: str, shot: Shot) -> np.random.Generator:
-    """The random generator of (seed, effect, frame): any frame can be computed alone, whatever the other effects."""
+    """The generator of (seed, effect, frame): any frame can be computed alone, whatever the other effects."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
 def fixed_rng(effect: str, seed: int) -> np.random.Generator:
-    """The random generator of (effect, its own seed), for what is the same in every frame.
+    """The generator of (effect, its own seed), for all that is the same in every frame.
 
     It has a spawn key: numpy ignores zeros at the end, so (seed, effect) would equal (seed, effect, frame 0)."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

@@ -86,5 +86,5 @@ class Beam:
 
     @property
     def has_energy(self) -> bool:
-        """Whether the beam states its energies, as materials require."""
+        """Whether it states its energies, as materials need."""
         return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

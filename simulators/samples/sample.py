@@ -16,8 +16,7 @@ from simulators.frame.shot import Detector, Pose
 class Sample(Protocol):
     @property
     def radius(self) -> float:
-        """Distance in mm from the rotation axis to the farthest matter; the blur of a turning sample is largest
-        there."""
+        """mm from the rotation axis to the farthest matter; the blur of a turning sample is largest there."""
 
     @property
     def names(self) -> tuple[str, ...]:

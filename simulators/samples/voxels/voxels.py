@@ -98,7 +98,7 @@ class Voxels:
 
     @property
     def first(self) -> tuple[float, float, float]:
-        """Centre of the first voxel, mm (z, y, x)."""
+        """mm (z, y, x), centre of the first voxel."""
         z, y, x = (-(n - 3) / 2 * step for n, step in zip(self.padded.shape, self.spacing, strict=True))
         return z, y, x
 

@@ -115,7 +115,7 @@ def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
     assert "residual" in lines[-1]
     assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5").exit_code == 5
     assert beamline("recon", "none.h5", "-m", "fbp", "--log", "bad.txt").exit_code == 5
-    assert "none.h5 is not there" in (folder / "bad.txt").read_text().splitlines()[-1]
+    assert "none.h5" in (folder / "bad.txt").read_text().splitlines()[-1]
     said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
     shown = [line.split()[1] for line in said.splitlines()]
     steady = [[kind for kind in each if kind != "progress:"] for each in (shown, kinds[1:])]  # that comes by the clock

@@ -51,7 +51,7 @@ class PieceBuilder(Protocol):
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """Attenuation in 1/mm of each role, in a beam without energies."""
+        """1/mm of each role, in a beam without energies."""
 
     def pieces(self) -> tuple[Piece, ...]:
         """All pieces. Raises ValueError where they cannot be placed."""
@@ -73,9 +73,7 @@ class ChangeInTime(Protocol):
     """A change of a sample with time."""
 
     def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
-        """The pieces at this time since the camera was connected. Raises ValueError for pieces that cannot change this
-        way.
-        """
+        """The pieces at this time since the camera was connected. ValueError: pieces that do not change so."""
 
 
 @dataclass(frozen=True)
