@@ -180,7 +180,7 @@ def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> 
 def _refuse_contradictions(request: ScanRequest) -> None:
     """Raises UsageError for options that do not go together."""
     if request.discard and not request.rehearse:
-        raise click.UsageError("--discard removes what a rehearsal made: give --rehearse.")
+        raise click.UsageError("--discard removes the files of a rehearsal: it needs --rehearse.")
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     several = _are_several_scans(request.files)

@@ -209,12 +209,12 @@ def disk_of(folder: Path) -> Path:
     """
     folder = folder.absolute()
     if link := broken_link(folder):
-        raise ConfigError(f"runs cannot go to {folder}: {link} Choose another folder; nothing was started.")
+        raise ConfigError(f"runs cannot be written to {folder}: {link} Choose another folder; nothing was started.")
     there = next((place for place in (folder, *folder.parents) if place.exists()), None)
     if there is None or not there.is_dir():
         problem = "no such disk" if there is None else f"a file at {there}"
         raise ConfigError(
-            f"runs cannot go to {folder}: there is {problem}. Choose another folder; nothing was started."
+            f"runs cannot be written to {folder}: there is {problem}. Choose another folder; nothing was started."
         )
     return there
 

@@ -134,5 +134,5 @@ def used_and_kept_back(
     if kept_back.size >= n_views:
         raise ValueError(f"all {n_views} views are held out: none is left for the fit")
     if early_stop and not kept_back.size:
-        raise ValueError("early_stop looks at views held out, and there are none")
+        raise ValueError("early_stop needs held-out views, and there are none")
     return np.setdiff1d(np.arange(n_views), kept_back), kept_back

@@ -101,7 +101,7 @@ def window_of(text: str) -> tuple[float, float]:
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"{text!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+        raise ValueError(f"{text!r} is not a window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
     return low, high
 
 

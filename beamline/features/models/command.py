@@ -45,7 +45,7 @@ def box_of(text: str) -> Box:
     except ValueError:
         box = ()
     if len(box) != 3 or not all(-math.inf < low < high < math.inf for low, high in box):
-        raise ValueError(f"{text!r} is no box; expected Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
+        raise ValueError(f"{text!r} is not a box; expected Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
     return box
 
 

@@ -51,7 +51,7 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
     if name not in legal:
         near = " (did you mean axis?)" if name in _AXIS else did_you_mean(name, legal)
         raise ValueError(
-            f"{name!r} is no option of a slice{near}; those of `beamline recon --help-all` under Data, Corrections and "
+            f"{name!r} cannot be swept{near}; options of `beamline recon --help-all` under Data, Corrections and "
             "Method can be swept, such as tv-weight, rings or axis"
         )
     tried = _values(name, values)

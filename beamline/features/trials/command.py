@@ -202,7 +202,7 @@ def _compare(
         answer.lines = text(table, layout), f"\n{'report':<10}{folder / layout.page}"
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
-        raise ScanStopped(f"The {layout.name} was stopped after {counts}; {folder} holds those.")
+        raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {folder}.")
 
 
 @dataclass(frozen=True, eq=False)

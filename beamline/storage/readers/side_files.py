@@ -127,7 +127,7 @@ class SidedSource(WrappedSource):
         super().__init__(base)
         views = int((base.image_key == FrameKind.PROJECTION).sum())
         if views != side.count:
-            raise DataError(f"{side.path} is of {side.count} projections; {base.path} holds {views}.")
+            raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
         self.cone, self.pixel_size_mm, self.row_pitch_mm = side.cone, side.pixel_mm, None
         self._side = side
         self.not_used = tuple(field for field in base.not_used if field.where != side.path.name)

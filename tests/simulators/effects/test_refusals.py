@@ -106,8 +106,8 @@ BELOW_ONE = "must be less than 1, got"
         ("pixel_area", {"rays": 9}, "rays must be less than or equal to 8, got 9"),
         ("prnu", {"spread": 0.5}, r"spread must be less than or equal to 0\.2"),
         ("prnu", {"seed": -1}, f"seed {NOT_NEGATIVE}"),
-        ("quantum_efficiency", {}, "give either value or wavelength_nm"),
-        ("quantum_efficiency", {"value": 0.5, "wavelength_nm": 500.0}, "give either value or wavelength_nm"),
+        ("quantum_efficiency", {}, "give one of value, wavelength_nm"),
+        ("quantum_efficiency", {"value": 0.5, "wavelength_nm": 500.0}, "give one of value, wavelength_nm"),
         ("quantum_efficiency", {"value": 1.2}, f"value {TO_ONE} 1.2"),
         (
             "quantum_efficiency",

@@ -91,7 +91,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
         (["-o", "g.tif", "--window", "0:1"], 2, "needs --bits 8"),
         (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
-        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "no window"),
+        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "not a window"),
         (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
         (["-o", "v.gif"], 2, "--film goes with the suffixes .gif and .mp4"),
         (["-o", "v.tif", "--film", "z"], 2, "--film goes with the suffixes .gif and .mp4"),
