@@ -42,7 +42,7 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(write: Write, frames
         assert np.flatnonzero(source.image_key == FrameKind.INVALID).tolist() == [ROW]
         assert sum(1 for _ in replay(source)) == len(frames)  # and does not count to 2**61
     assert [f.severity for f in validate(path) if f.rule == "records"] == ["error"]
-    assert any("Look for an intact copy" in said for said in describe(path)["findings"])
+    assert any("Look for a good copy" in said for said in describe(path)["findings"])
     with h5py.File(path) as file:
         assert len(views_in(file)) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
     with pytest.raises(DataError, match=rf"it: {ROW}\..* Nothing was written"):
