@@ -278,7 +278,7 @@ class BeamLog:
             self._react(reading)
 
     def _fail(self, name: str, error: BaseException) -> None:
-        self._failed += 1
+        self._failed += 1  # and nothing else: a failing beam monitor never stops a scan
         if self._failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."

@@ -45,6 +45,7 @@ from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, VALID, write_le
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
+# Not "latest": that writes datatypes that HDF5 1.14 cannot open.
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
