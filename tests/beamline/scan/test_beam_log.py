@@ -100,7 +100,7 @@ def test_a_monitor_that_fails_stops_no_scan(tmp_path: Path, error: Exception) ->
     path, events = scan(tmp_path, Scripted(*[error] * 100_000))
     assert [event.data["status"] for event in events if event.event == "scan_done"] == ["complete"]
     warnings = [event.data["message"] for event in events if event.event == "warning"]
-    assert len([message for message in warnings if "The scan goes on" in message]) == 1
+    assert len([message for message in warnings if "The scan continues" in message]) == 1
     with h5py.File(path) as file:
         assert file[f"{BEAM}/value"].shape == (0,)
         assert file["entry/progress/status"][()] == b"complete"
