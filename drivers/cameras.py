@@ -24,7 +24,7 @@ class CameraDriver(Protocol):
         """The driver, connected. Raises DeviceError if there is no such camera."""
 
     def timing_of(self, settings: Any, wanted: CameraSettings) -> CameraTiming:
-        """The camera's timing, before it is connected. ValueError for settings that it would refuse."""
+        """The camera's timing, before it is connected. Raises ValueError for settings that it would refuse."""
 
 
 CAMERAS: Registry[CameraDriver] = Registry("camera", {}, with_keys, reserved=("dcam", "simulated_orca"))

@@ -41,7 +41,7 @@ else:
 
 
 class FrameMemory:
-    """Gives memory for frames, and takes it back when the frame and all its parts are released.
+    """Allocates memory for frames, and reuses it when the frame and all its parts are released.
 
     It keeps as many buffers as there were frames at one time. May be used from any thread.
     """

@@ -43,15 +43,15 @@ class PlacedStage:
         self._check: Callable[[], None] = lambda: None
 
     def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again on the way; its exception stops the stage and ends the move."""
+        """Call `check` repeatedly during every move from now on; its exception stops the stage and ends the move."""
         self._check = check
 
     def place(self) -> str | None:
-        """Raises DeviceError."""
+        """Name of the present place. Raises DeviceError."""
         return next((name for name in self._places.places if self._is_at(name)), None)
 
     def put(self, place: str) -> None:
-        """Raises DeviceError: it did not arrive."""
+        """Move to a place. Raises DeviceError if the stage did not arrive."""
         stage, speed, target = self._stage, self._places.speed, self._places.places[place]
         try:
             if self._is_at(place):
@@ -107,11 +107,11 @@ class StageSampleMover:
         self.remember_place = motor.remember_place
 
     def out(self) -> None:
-        """Raises DeviceError: the sample did not arrive."""
+        """Move the sample out. Raises DeviceError if it did not arrive."""
         self._motor.put(OUTSIDE)
 
     def back(self) -> None:
-        """Raises DeviceError: the sample did not arrive."""
+        """Move the sample back. Raises DeviceError if it did not arrive."""
         self._motor.put(INSIDE)
 
 
@@ -183,7 +183,7 @@ class OutputShutter:
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
-                f"the output {self._output.name} does not hold the level that was set",
+                f"the output {self._output.name} is not at the level that was set",
                 request="high" if level else "low",
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",

@@ -65,7 +65,7 @@ def predicts_best(
     control: RunControl,
     order: Sequence[int] | None = None,
 ) -> TrialsVerdict:
-    """Which of the methods leaves least of unseen views (one of eight is held out); of equal ones the first.
+    """Which method has the least residual in held-out views (one of eight); of equal ones the first.
 
     A simpler one within one standard error is not preferred, as it is among priors: on a shell of 50 views that costs
     1.7 dB, and the user would get a volume that predicts worse than another one that was tried.
@@ -134,7 +134,7 @@ def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | No
 
 
 def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
-    """A part of the problem for trials, and its name: a slab of so many rows, or all rows with binned pixels.
+    """The part of the problem used for trials, and its name: a slab of so many rows, or all rows with binned pixels.
 
     None if nothing can be held out or projected, with the reason.
     """
@@ -181,7 +181,7 @@ def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) ->
 
 
 def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
-    """The problem with these views only."""
+    """The problem restricted to these views."""
     weights = problem.use.weights
     return replace(
         problem, projections=problem.projections[views], geometry=problem.geometry.select(views),
@@ -208,7 +208,7 @@ def _candidates() -> tuple[Method, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Auto:
-    """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
+    """Tries methods on a part of the scan, and reconstructs the volume with the one that predicts held-out views best.
 
     The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
     and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
@@ -230,10 +230,10 @@ class Auto:
     def __post_init__(self) -> None:
         check_settings(self)
         if not self.candidates:
-            raise ValueError("candidates must be at least one method, got none")
+            raise ValueError("candidates must contain at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The result of the chosen method, with the reason.
+        """The result of the chosen method, with the reason for the choice.
 
         Raises:
             ValueError: no candidate takes these views or data.
@@ -287,7 +287,7 @@ class Auto:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """Work of the one trial that judges all candidates, or of a trial of each."""
+        """Work of the single trial that compares all candidates, or of a trial of each."""
         methods = [
             method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
         ]

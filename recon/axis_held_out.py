@@ -41,7 +41,7 @@ def axis_by_views(
     near: bool = False,
     lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
-    """The axis column with which a volume of two thirds of the views predicts the others best.
+    """The axis column for which a volume of two thirds of the views predicts the other views best.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
     best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,
@@ -64,7 +64,7 @@ def axis_by_views(
     """
     check_arguments(axis_by_views, locals())
     if geometry.n_views < _LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
+        raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {_LEAST_VIEWS} are needed")
     warn_of_other_quantity(projections)
     views = _Views(projections if lit is None else np.where(lit, projections, 0).astype(np.float32), geometry, lit)
     if not wider_than_field(views.data, geometry):
@@ -190,7 +190,7 @@ class _Judge:
         left = measured - images * lit
         most = _norm(measured)
         if most == 0:
-            raise AxisError("the views held out show no matter, so that they tell nothing of the axis; give the axis")
+            raise AxisError("the held-out views show no matter, so that the axis cannot be determined; give the axis")
         return _norm(left) / most
 
 

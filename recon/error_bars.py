@@ -110,7 +110,7 @@ def error_bars(
 
 
 def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Method:
-    """The method whose refits show the noise: of a fit, the one that made its volume or the last steps of its finish.
+    """The method whose refits show the noise: for a fit, the one that made its volume or the last steps of its finish.
 
     Raises:
         ValueError: a fit without a finish.
@@ -126,7 +126,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
-    """Most bytes that `error_bars` takes beside the projections, their weights and the volume."""
+    """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
     made_by = (FistaTv(), PnpDct()) if isinstance(method, FitMethod) else (method,)
     work = max(one.memory(geometry, grid, True) for one in made_by)

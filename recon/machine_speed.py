@@ -39,7 +39,7 @@ RUNS = 3  # the quickest counts; one more comes first, and loads the code and th
 
 
 def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:
-    """The rate of an operation on this machine, where no other program runs.
+    """Measure the rate of an operation on this machine while no other program runs.
 
     Args:
         operation: its name, as of `OPERATIONS`, with what follows a comma.

@@ -50,27 +50,30 @@ METHODS = Registry("method", REGISTRY, _made, reserved=(AUTO,))
 
 
 def names() -> tuple[str, ...]:
-    """Names of all methods; loads no module of ours."""
+    """Names of all methods; imports no module of this project."""
     return tuple(METHODS)
 
 
 def names_of_one_volume() -> tuple[str, ...]:
-    """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
+    """Names of the methods that make one volume of all views, as rows of a table do; imports no module of this
+    project."""
     return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 
 def names_of_one_scan() -> tuple[str, ...]:
-    """Names of the methods that take one scan; loads no module of ours."""
+    """Names of the methods that use a single scan; imports no module of this project."""
     return tuple(name for name, entry in METHODS.items() if entry.several != "materials")
 
 
 def names_compared(emission: bool = False) -> tuple[str, ...]:
-    """Names of the methods that a trade-off tries by default, more where the sample emits; loads no module of ours."""
+    """Names of the methods that a trade-off tries by default, more for an emission scan; imports no module of this
+    project.
+    """
     return tuple(name for name, entry in REGISTRY.items() if entry.compared or (emission and entry.emission))
 
 
 def streams(name: str) -> bool:
-    """Whether a method's volume can grow while views arrive; loads nothing.
+    """Whether a method's volume can grow while views arrive; imports nothing.
 
     Raises:
         ValueError: for an unknown name.
@@ -89,7 +92,7 @@ def by_name(name: str) -> type[Method]:
 
 
 def taking(field: str) -> tuple[str, ...]:
-    """Names of the methods that have a setting, such as "iterations", or "fit.loss" within another one."""
+    """Names of the methods that have a setting, such as "iterations", or "fit.loss" of a nested one."""
     return tuple(name for name in METHODS if has_setting(by_name(name), field))
 
 

@@ -153,7 +153,7 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
     foreign = [(what, trait) for what, (trait, given) in wanted.items() if given and not getattr(method.traits, trait)]
     if foreign:
         owners = ", ".join(f"{what} (of {', '.join(with_trait(trait))})" for what, trait in foreign)
-        raise ValueError(f"method {method.name!r} does not take {owners}: leave that out, or choose another method")
+        raise ValueError(f"method {method.name!r} has no option {owners}: leave that out, or choose another method")
 
 
 def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:

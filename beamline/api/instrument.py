@@ -29,7 +29,7 @@ _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each s
 
 
 def to_stderr(text: str) -> None:
-    """Print a sentence as the commands do."""
+    """Print a sentence to stderr, as the commands do."""
     with suppress(OSError, ValueError, AttributeError):  # the terminal is closed or missing
         sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
@@ -59,7 +59,7 @@ class Instrument:
         self.close()
 
     def close(self) -> None:
-        """Free ports and camera; a second time does nothing."""
+        """Close all ports and the camera; a second call does nothing."""
         self._open = False
         self._devices.close()
 
@@ -74,7 +74,8 @@ class Instrument:
         stop: StopRequest | None = None,
         on_event: Callable[[Event], None] | None = None,
     ) -> ScanResult:
-        """Run a scan, as `beamline scan` does: a folder of its own, every frame checked, a file readable in any case.
+        """Run a scan, as `beamline scan` does: in a new folder, with every frame checked and a file that stays
+        readable.
 
         The first Ctrl-C stops the scan cleanly, the second aborts it; either ends a loop over samples too. (Python
         catches signals only in the main thread: use `stop` in others.)

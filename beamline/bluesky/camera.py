@@ -46,7 +46,7 @@ LOOK_EVERY = 0.2  # s, at a request to stop
 
 
 class ShownFrames(StrictEnum):
-    """What frames show. Shutter and sample are brought where they need them."""
+    """What the frames show. Shutter and sample are moved accordingly."""
 
     PROJECTION = "projection"
     FLAT = "flat"
@@ -217,7 +217,7 @@ class _File(DetectorDataLogic):
 
 
 class CameraDetector(StandardDetector):
-    """The configured camera. `kind` says what the next frames show; the shutter is closed at the end.
+    """The configured camera. `kind` is what the next frames show; the shutter is closed at the end.
 
     Args:
         instrument: connected devices, which stay open.

@@ -55,12 +55,12 @@ class TomoScan(Device):
 
     @AsyncStatus.wrap
     async def stage(self) -> None:
-        """Nothing moves."""
+        """Do nothing: staging moves no device."""
         self._refuse_second()
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """A scan that still runs is stopped, as by `beamline stop`, and its file closed."""
+        """Stop a scan that is still running, as `beamline stop` does, and close its file."""
         task, self._task = self._task, None
         if task is None or not task.done():  # a kickoff may be about to begin one
             self._stop.stop("the plan ended")
@@ -69,7 +69,7 @@ class TomoScan(Device):
             task.exception()  # looked at, so that asyncio does not report it
 
     async def pause(self) -> None:
-        """A pause of the plan, also by a suspender, pauses the scan as `beamline pause` does.
+        """Pause the scan, as `beamline pause` does, when the plan is paused, also by a suspender.
 
         Raises:
             NoReplayAllowed: always once the scan has begun: a second kickoff would be a second scan.
@@ -80,7 +80,7 @@ class TomoScan(Device):
             raise NoReplayAllowed
 
     async def resume(self) -> None:
-        """The scan goes on."""
+        """Resume the paused scan."""
         if self._task is not None:
             await self._tell(Verb.RESUME)
 
@@ -99,7 +99,7 @@ class TomoScan(Device):
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
-        """Start the scan. Raises what it raises before its file is there; nothing has moved then."""
+        """Start the scan. Raises the errors that occur before its file exists; nothing has moved then."""
         self._refuse_second()
         self._stop, self._folder = StopRequest(), None
         self._stream = await asyncio.to_thread(ScanStream, self._config, self.name)  # which reads files of angles
@@ -111,7 +111,9 @@ class TomoScan(Device):
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
-        """Wait for the end. Raises the scan's own error: frames are missing, it was stopped, a device failed."""
+        """Wait for the end of the scan. Raises the scan's own error: frames are missing, it was stopped, a device
+        failed.
+        """
         task, began = self._task, time.monotonic()
         if task is None:
             raise RuntimeError(f"{self.name}: kickoff comes before complete")
@@ -128,7 +130,7 @@ class TomoScan(Device):
         return self._stream.data_keys()
 
     async def get_index(self) -> int:
-        """Rows that others can read."""
+        """Number of rows that other processes can read."""
         return self._stream.rows
 
     async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[Any]:
@@ -163,7 +165,8 @@ class Rotation(Device):
 
     @AsyncStatus.wrap
     async def set(self, value: float) -> None:
-        """Move there and wait. DeviceRefused: beyond the limits; DeviceError: it stopped short."""
+        """Move to the angle and wait. Raises DeviceRefused beyond the limits, DeviceError if the stage stopped
+        short."""
         self._setpoint = value
         await asyncio.to_thread(self._move, math.radians(value))
 

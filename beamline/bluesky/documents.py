@@ -44,7 +44,7 @@ class Column(NamedTuple):
     unit: str
 
     def row_shape(self, frame: tuple[int, int]) -> tuple[int, ...]:
-        """Of a row, where frames have the shape `frame`."""
+        """Shape of a row, if frames have the shape `frame`."""
         return frame if self.dataset == layout.DATA else ()
 
 
@@ -56,7 +56,7 @@ COLUMNS = {  # by the ending of the data key
 
 
 def event_model() -> Any:
-    """The library. ConfigError: it is not installed."""
+    """The library event-model. Raises ConfigError if it is not installed."""
     try:
         import event_model as library
     except ImportError as error:
@@ -79,7 +79,7 @@ class ScanStream:
         self._emitted = self.rows = 0
 
     def data_keys(self) -> dict[str, Any]:
-        """Of a descriptor."""
+        """The data keys of a descriptor."""
         return {
             self._name + ending: {
                 "source": f"splatline:{column.dataset}",
@@ -104,8 +104,9 @@ class ScanStream:
             self.rows = event.result.n_frames
 
     def assets(self, until: int, run_start: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Resources and datums of the rows that were not told yet, before the row `until`. `run_start`: uid of the
-        run; None: a RunEngine fills it in."""
+        """Resources and datums of the rows before `until` that were not emitted yet. `run_start`: uid of the run; None:
+        a RunEngine fills it in.
+        """
         until = min(until, self.rows)
         if until <= self._emitted:
             return
@@ -196,7 +197,7 @@ class Documents:
 
 
 def file_url(path: Path) -> str:
-    """As resources name a file."""
+    """The URL of a file, as resources state it."""
     return path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
 
 
@@ -212,7 +213,8 @@ def json_lines(stream: TextIO) -> Emit:
 
 @contextmanager
 def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
-    """Sends documents to a proxy of 0MQ, by bluesky's own Publisher. It never waits: what nobody takes is dropped.
+    """Sends documents to a 0MQ proxy with bluesky's own Publisher. It never waits: documents without a receiver are
+    dropped.
 
     Args:
         address: tcp://HOST:PORT, where the proxy takes documents.

@@ -16,7 +16,7 @@ from recon.base.registry import Registry, tables_in_folders
 
 
 class Libraries(Enum):
-    """Address space that the libraries of a command need, and modules to load before its data.
+    """Address space that the libraries of a command need, and modules to import before its data are read.
 
     Attributes:
         addresses: bytes that a command on a tiny scan takes at its peak, with one thread of BLAS, and a twentieth more;
@@ -35,7 +35,7 @@ class Libraries(Enum):
 
 @dataclass(frozen=True)
 class CommandEntry:
-    """A command: the module that defines it, and its line in the help.
+    """A command: the module that defines it, and its one-line help.
 
     Attributes:
         module: in which the command has its own name, "-" as "_".
@@ -100,7 +100,7 @@ def own_commands() -> dict[str, CommandEntry]:
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands. Other packages are searched only for names that are not ours."""
+    """All commands. Other packages are searched only for names that this package lacks."""
     return Registry("command", own_commands(), _entry_of)
 
 

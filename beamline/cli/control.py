@@ -62,7 +62,7 @@ def _running_in(runs: Path) -> str:
 
     names = [run.name for run in running(runs)]
     if not names:
-        return f"no scan runs in {runs}"
+        return f"no scan is running in {runs}"
     return f"{len(names)} {'scan runs' if len(names) == 1 else 'scans run'} in {runs}: {', '.join(names)}"
 
 
@@ -78,7 +78,7 @@ def _only(runs: Path) -> Path:
 
 @click.command()
 @config_argument
-@click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
+@click.option("--yes", is_flag=True, help="Skip the question whether the stage may turn.")
 @click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Longest time of the search, s.")
 @set_option
 def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
@@ -144,7 +144,7 @@ def recover(file: Path, as_json: bool) -> None:
 
 
 def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
-    """Tell of each file of a run that was recovered, and of the parts that were left out."""
+    """Report each recovered file of a run, and the parts that were left out."""
     for sentence in left_out:
         click.echo(f"Warning: {sentence}", err=True)
     for done in recovered:
@@ -192,7 +192,11 @@ def print_schema() -> None:
 @click.command()
 @config_argument
 @set_option
-@click.option("--rehearse", is_flag=True, help="As `beamline scan --rehearse` would run it.")
+@click.option(
+    "--rehearse",
+    is_flag=True,
+    help="Show the configuration with simulated devices, as `beamline scan --rehearse` would run it.",
+)
 @json_option
 def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool) -> None:
     """Validate CONFIG. Nothing moves.

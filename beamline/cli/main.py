@@ -199,7 +199,9 @@ Exit codes:
 
 @click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(version(), prog_name="beamline")
-@click.option("--debug", is_flag=True, envvar="BEAMLINE_DEBUG", help="End with the traceback of a defect.")
+@click.option(
+    "--debug", is_flag=True, envvar="BEAMLINE_DEBUG", help="Print the full traceback if a defect ends the program."
+)
 def main(debug: bool) -> None:
     """X-ray micro-tomography from trigger to volume: acquire, monitor, reconstruct.
 

@@ -34,16 +34,16 @@ PRESETS_OF_METHODS = ("published",)
 
 
 def checkpoint_output(path: Path) -> Path:
-    """The path of a checkpoint to write. ValueError for a path without a file name."""
+    """The path of a checkpoint to write. Raises ValueError for a path without a file name."""
     if not path.name:
         raise ValueError(f"{str(path)!r} is no file; name one, such as fit.checkpoint.h5")
     return path
 
 
 def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
-    """Callback that checks a checkpoint to read. DataError if the file does not exist."""
+    """A callback that checks a checkpoint to read. Raises DataError if the file does not exist."""
     if path is not None and not path.exists():
-        raise DataError(f"--{param.name} {path} is not there. Nothing was touched.")
+        raise DataError(f"--{param.name} {path} does not exist. Nothing was changed.")
     return path
 
 
@@ -54,7 +54,7 @@ def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any
 
 
 def row_settings(command: click.Command, methods: Sequence[str], values: dict[str, Any]) -> dict[str, dict[str, Plain]]:
-    """Settings by method, of the options of `row_options` that were given; takes all of these out of `values`.
+    """Settings by method, from the given options of `row_options`; removes these options from `values`.
 
     Raises:
         UsageError: an option that no method takes.
@@ -89,7 +89,7 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
 
 
 def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
-    """Settings by name, from texts of NAME=VALUE separated by spaces; values are JSON, else plain text."""
+    """Parse settings by name from texts of NAME=VALUE separated by spaces; values are JSON, or else plain text."""
     settings: dict[str, Any] = {}
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")
@@ -103,7 +103,7 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
 
 
 def preset_of(method: str | None, preset: str | None) -> str | None:
-    """The name of the method with a preset's settings; the method itself without one.
+    """The method of this name with a preset's settings; without a preset, with its defaults.
 
     Raises:
         UsageError: the method has no such preset.
@@ -134,7 +134,7 @@ _STEPS = run_option(
     "--steps",
     type=WholeRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-    f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
+    f"{MODEL_STEPS} where voxels alone predict held-out views as well.",
 )
 _GAUSSIANS = run_option(
     "--gaussians",
@@ -145,7 +145,7 @@ _FINISH = run_option(
     "--finish",
     type=WholeRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
-    "with sparse patches where views held out are predicted better so.",
+    "with sparse patches where these predict held-out views better.",
 )
 _ITERATIONS = run_option(
     "--iterations",
@@ -161,7 +161,7 @@ _PATCH_THRESHOLD = run_option(
     "--patch-threshold",
     type=POSITIVE,
     help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
-    "Default: as views held out prefer.",
+    "Default: chosen by held-out views.",
 )
 _ALLOW_NEGATIVE = run_option(
     "--allow-negative",
@@ -175,13 +175,13 @@ _IN_TIME = together(
         "volumes",
         type=WholeRange(min=2),
         metavar="N",
-        help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
+        help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",
     ),
     run_option(
         "--moves/--no-moves",
         default=None,
-        help="With --time: matter moves, or only its density changes. Default: what views held out prefer.",
+        help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -249,7 +249,7 @@ method_options = together(
     run_option(
         "--early-stop",
         is_flag=True,
-        help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
+        help="End the fit when held-out views stop improving; holds out every tenth unless --views does.",
     ),
     _FINISH,
     heading(OUTPUT),
@@ -278,8 +278,8 @@ method_options = together(
     run_option(
         "--plain-splatting",
         is_flag=True,
-        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It shows the bias that the "
-        "corrected projection does not have.",
+        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It has a bias that the "
+        "corrected projection avoids.",
     ),
     option(
         "--set",

@@ -36,7 +36,7 @@ class MonitorRequest:
     config: Path | None = set_by(
         "--config",
         type=click.Path(path_type=Path),
-        help="Configuration whose sections `monitor` and `references` give the limits. Default: those of a new scan.",
+        help="Configuration with the limits, in its sections `monitor` and `references`. Default: the default limits.",
     )
     overrides: tuple[str, ...] = set_by(set_option)
     sheet: Path | None = set_by(

@@ -42,7 +42,7 @@ class FiniteRange(click.FloatRange):
 
 
 class WholeRange(click.IntRange):
-    """A range of whole numbers; click's own names its type where another number is given, and not the range."""
+    """A range of integers; for other numbers click's own error names its type, but not the range."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
@@ -93,7 +93,7 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class Declared(click.Option):
-    """A click option with its rule: what it excludes and needs, and whether recipes contain it.
+    """A click option with its rule: what it excludes and requires, and whether recipes contain it.
 
     Args:
         rule: whose it is, and what it goes with; `excludes` and `needs` make one.
@@ -127,12 +127,12 @@ def run_option(name: str, *names: str, **facts: Any) -> Decorator:
 
 
 def name_of(option: click.Option) -> str:
-    """The long name, without its dashes."""
+    """The long name of the option, without its dashes."""
     return max(option.opts, key=len).lstrip("-")
 
 
 def declared(command: click.Command) -> dict[str, Declared]:
-    """The options of a command that state what they go with, by parameter name."""
+    """The options of a command that declare rules, by parameter name."""
     return {param.name: param for param in command.params if isinstance(param, Declared) and param.name}
 
 
@@ -144,7 +144,7 @@ def rules_of(command: click.Command) -> dict[str, OptionRule]:
 def refuse_contradictions(
     command: click.Command, given: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
 ) -> None:
-    """Raises UsageError for two options that do not go together, or one without another that it needs.
+    """Raise UsageError for two options that exclude each other, or one without another that it requires.
 
     Args:
         given: long names of the options that the user gave, and of what else options may exclude.
@@ -183,7 +183,7 @@ dry_option = option(
 
 
 def names_in(value: str) -> tuple[str, ...]:
-    """Names that commas separate."""
+    """Split names at commas."""
     return tuple(name.strip() for name in value.split(",")) if value else ()
 
 
@@ -255,7 +255,7 @@ def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parame
 
 
 def as_scan(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
-    """Callback that replaces the folder of a run by its scan file with all parts."""
+    """A callback that replaces the folder of a run by its scan file with all parts."""
     from beamline.storage.interrupted import scan_file  # here: help needs none of it
 
     return scan_file(value)
@@ -274,7 +274,7 @@ volume_argument = click.argument("volume", metavar="VOLUME|RUN", type=click.Path
 
 
 def volume_path(text: str) -> Path:
-    """A path whose suffix names the format of a volume. ValueError for another."""
+    """Check that the suffix of a path names a format of volumes. Raises ValueError otherwise."""
     from beamline.storage.volumes.files import format_of  # here: help needs none of it
 
     format_of(Path(text))
@@ -282,7 +282,7 @@ def volume_path(text: str) -> Path:
 
 
 def refuse_shared(files: Mapping[str, Path | None]) -> None:
-    """Raises UsageError if two of `files`, by option, are the same file, which would then be overwritten.
+    """Raise UsageError if two of `files`, by option, are the same file, which would then be overwritten.
 
     Only --checkpoint may replace the file of --resume.
     """

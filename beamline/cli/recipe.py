@@ -26,7 +26,7 @@ _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as th
 
 
 class Repeatable(click.Command):
-    """A command that remembers its options as they were typed."""
+    """A command that records its options as they were typed."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta[_RAW] = self.make_parser(ctx).parse_args(args=list(args))[0]
@@ -63,7 +63,7 @@ def _is_of_one_call(option: click.Option) -> bool:
 
 
 def recipe_text(ctx: click.Context, method: str) -> str:
-    """The recipe of this call, as YAML: the method, and the given options that hold for any scan."""
+    """The recipe of this call as YAML: the method, and the given options that are not specific to one scan."""
     values = {
         name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
@@ -124,7 +124,7 @@ def _from_anywhere(value: str, kind: object) -> str:
 
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --config: a recipe, whose options hold where the command line has none."""
+    """Add --config: a recipe whose options apply unless the command line overrides them."""
     return declared_option(
         "--config",
         of_one_call=True,
@@ -133,8 +133,8 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: options by their long names (YAML), or a volume with its recipe. The command line "
-        "goes before it.",
+        help="Recipe: options by their long names (YAML), or a volume with its recipe. Options on the command "
+        "line override it.",
     )(command)
 
 
@@ -152,7 +152,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
             raise click.BadParameter(f"{value}: {unknown('option of a recipe', name, options)}")
         if not isinstance(text, str) or not text:
             raise click.BadParameter(
-                f"{value}: {name} holds no text or several; expected one value, as on the command line"
+                f"{value}: {name} is not a single value; expected one value, as on the command line"
             )
         option = options[name]
         defaults[str(option.name)] = text.split() if option.multiple else text
@@ -167,9 +167,9 @@ def _read(path: Path) -> Mapping[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+        raise click.BadParameter(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
-        raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
+        raise click.BadParameter(f"{path} is not a recipe; expected lines such as method: fbp")
     return content
 
 
@@ -182,7 +182,7 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} holds no recipe; expected a volume that `beamline recon` wrote")
+            raise click.BadParameter(f"{path} contains no recipe; expected a volume that `beamline recon` wrote")
         return str(record.parameters["recipe"])
 
 
@@ -215,7 +215,7 @@ def heading(group: str) -> Decorator:
 
 
 class Grouped(Repeatable):
-    """A command with many options. Each of them has a group.
+    """A command whose options are shown in groups.
 
     Args:
         first: names of the parameters that `--help` shows, in this order.

@@ -60,7 +60,7 @@ class LogLines:
 
 @contextmanager
 def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes a log, if one is requested. An error in the block becomes its last line.
+    """The sink that writes the log, if one is requested. An error in the block becomes its last line.
 
     If its disk is full, `warn` gets a warning, and the work goes on.
     """
@@ -135,7 +135,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     path = values["output"] or Path(f"{file.stem}_{method}.h5")
     if there and not file.exists():
         with json_events(values["as_json"]):
-            raise DataError(f"{file} is not there.")
+            raise DataError(f"{file} does not exist.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
     from recon.voxels.enough_views import Goal
@@ -189,12 +189,13 @@ def _checked_method(context: click.Context, default: str = "") -> str:
 
 def _in_time() -> str:
     if IN_TIME is None:
-        raise click.UsageError("--time: this installation makes no volumes in time. Leave it out.")
+        raise click.UsageError("--time: this installation cannot reconstruct a time series. Leave it out.")
     return IN_TIME
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError for a recipe whose options do not go together, or with a volume, whatever the scan."""
+    """Raise UsageError for a recipe whose options contradict each other, or cannot be used with a volume, for any
+    scan."""
     with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
         values = dict(context.params)
         method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
@@ -203,7 +204,7 @@ def refuse_recipe(config: Path) -> None:
 def run_reconstruction(
     options: ReconOptions, values: Mapping[str, Any], more: Callable[[ReconRecord], Sequence[str]] = lambda record: ()
 ) -> None:
-    """Write the volume and its report, with what happens on the terminal.
+    """Write the volume and its report, with progress on the terminal.
 
     Args:
         values: of the command's parameters; those that it lacks are not given.
@@ -237,15 +238,15 @@ def run_reconstruction(
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
     if lost := record.ending.lost_checkpoint:
-        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
+        raise DataError(f"The last checkpoint could not be written: {lost} The volume is in {output}.")
     if record.ended_early:
-        raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
-    if limit is not None:
+        raise ScanStopped(f"The reconstruction was stopped early; {output} has the volume reached so far.")
+    if limit is not None:  # only on request: no limit suits every sample
         require(record.metrics, limit)
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
-    """Raises QualityError if the data residual of a finished volume exceeds the limit."""
+    """Raise QualityError if the data residual of a finished volume exceeds the limit."""
     name = "residual_held_out" if "residual_held_out" in metrics else "residual"
     if not metrics[name] <= max_residual:
         views = "held out" if name == "residual_held_out" else "used"

@@ -35,15 +35,17 @@ if TYPE_CHECKING:
 
 
 def memory_size(text: str) -> int:
-    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units). ValueError for anything else."""
+    """Parse a size such as 8G, 500M or 1.5GB (decimal units) to bytes. Raises ValueError for any other text."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
-        raise ValueError(f"{text!r} is no size; expected a number and K, M, G or T, such as 8G")
+        raise ValueError(f"{text!r} is not a size; expected a number and K, M, G or T, such as 8G")
     return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
 
 
 def cluster_of(text: str) -> str:
-    """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
+    """Parse a cluster: number of workers, `local:N`, an address or `slurm:CONFIG`. Raises ValueError for any other
+    text.
+    """
     from beamline.reconstruct.memory import cluster  # here: help needs none of it
 
     cluster().check_cluster(text)
@@ -55,7 +57,9 @@ _FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not (entry.s
 
 
 def region_of(text: str) -> Region | AroundSample:
-    """A box of voxels, `z0:z1,y0:y1,x0:x1`, or that around the sample, `auto`. ValueError for anything else."""
+    """Parse a box of voxels, `z0:z1,y0:y1,x0:x1`, or `auto` for the one around the sample. Raises ValueError for any
+    other text.
+    """
     from beamline.reconstruct.region import AroundSample, Region  # here: help needs none of it
 
     return AroundSample() if text == "auto" else Region.parse(text)
@@ -72,7 +76,7 @@ unfinished_option = run_option(
     "--unfinished",
     of_one_call=True,
     is_flag=True,
-    help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
+    help="Accept an incomplete scan, one that failed or is still running, and use its frames.",
 )
 memory_option = run_option(
     "--memory",
@@ -91,7 +95,7 @@ recon_options = together(
         "-m",
         "--method",
         type=MethodChoice((AUTO, *names_of_one_scan())),
-        help="auto chooses fbp, fista-tv, pnp-dct or r2 by views held out. r2 fits Gaussians to the views, "
+        help="auto chooses fbp, fista-tv, pnp-dct or r2 by held-out views. r2 fits Gaussians to the views, "
         "fbp is filtered back-projection, the others iterate on voxels; "
         f"{_FOR_COMPARISON} are there for comparison. Default: auto; r2 with --follow and with options of the fit.",
     ),
@@ -156,7 +160,7 @@ recon_options = together(
         "--enough-loss",
         type=POSITIVE,
         metavar="DB",
-        help="With --follow: report when the remaining views would add at most so many dB of PSNR.",
+        help="With --follow: report when all remaining views together would add at most so many dB of PSNR.",
     ),
     run_option(
         "--enough-gain",

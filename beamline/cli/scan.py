@@ -36,7 +36,7 @@ TABLE = ".csv"  # suffix of a table of scans
 
 @dataclass(frozen=True, eq=False)
 class ScanRequest:
-    """What `beamline scan` is asked for."""
+    """The arguments of `beamline scan`."""
 
     files: tuple[Path, ...] = set_by(
         click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
@@ -63,10 +63,12 @@ class ScanRequest:
         'Needs: pip install "splatline[bluesky]".',
     )
     stop_on_failure: bool = set_by(
-        "--stop-on-failure", is_flag=True, help="Of several scans: begin none after the first one that fails."
+        "--stop-on-failure", is_flag=True, help="With several scans: stop after the first one that fails."
     )
     wait: bool = set_by(
-        "--wait", is_flag=True, help="Of several scans: wait for Enter before each but the first, to change the sample."
+        "--wait",
+        is_flag=True,
+        help="With several scans: wait for Enter before each but the first, so that the sample can be changed.",
     )
     as_json: bool = set_by(json_option)
     output: Path | None = set_by(
@@ -92,7 +94,7 @@ class ScanRequest:
 @click.command()
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
-    """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
+    """Run the scan in CONFIG, or continue one that ended early (--resume RUN).
 
     Several CONFIGs, or a TABLE with a line for each scan (docs/commands.md), are taken one after the other. One that
     fails does not stop the others; Ctrl-C does.
@@ -160,7 +162,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
-    """How long a rehearsal took and the scan will take. `--discard` removes its folder where all frames are good."""
+    """Duration of the rehearsal and of the scan, as lines. `--discard` removes the folder if all frames are good."""
     from beamline.plan.timeline import duration_text
     from beamline.scan.preflight import dry_run
 
@@ -178,7 +180,7 @@ def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> 
 def _refuse_contradictions(request: ScanRequest) -> None:
     """Raises UsageError for options that do not go together."""
     if request.discard and not request.rehearse:
-        raise click.UsageError("--discard removes what a rehearsal made: give --rehearse.")
+        raise click.UsageError("--discard removes the files of a rehearsal: it needs --rehearse.")
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     several = _are_several_scans(request.files)
@@ -194,11 +196,13 @@ def _refuse_contradictions(request: ScanRequest) -> None:
     if request.run is None:
         return
     if request.output is not None or (request.overrides and request.file is None):
-        raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+        raise click.UsageError("--resume continues RUN with its own configuration: leave out -o and --set.")
     if request.rehearse:
-        raise click.UsageError("--rehearse begins a run: --resume goes on with its devices, simulated ones, too.")
+        raise click.UsageError(
+            "--rehearse starts a new run: leave it out with --resume, which uses the devices of RUN."
+        )
     if request.documents is not None:
-        raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
+        raise click.UsageError("--documents describes complete scans: leave it out with --resume.")
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
@@ -210,7 +214,7 @@ def _queue() -> Any:
     """The module of the feature whose `take_all` takes several scans. UsageError: this installation has none."""
     modules = in_folders("beamline.features", "QUEUES")
     if "scan" not in modules:
-        raise click.UsageError("This installation takes one scan at a time: give one CONFIG. Nothing was started.")
+        raise click.UsageError("This installation runs one scan at a time: give one CONFIG. Nothing was started.")
     return import_module(modules["scan"])
 
 
@@ -232,7 +236,7 @@ def run_one(
     held: ExitStack,
     stop: StopRequest | None = None,
 ) -> RunResult:
-    """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
+    """Run the scan, or the missing energies of `series`, with the terminal, the page and the documents beside it."""
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
@@ -262,17 +266,17 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
     if config is None or config.scan.energies is None:
         return None
     if documents is not None:
-        raise click.UsageError("--documents tells one scan: leave it out with scan.energies.")
+        raise click.UsageError("--documents describes a single scan: leave it out with scan.energies.")
     return config
 
 
 def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
-    """Take, or go on with, a scan of each energy, with the terminal and the page beside it."""
+    """Scan at each energy, or continue the series, with the terminal and the page beside it."""
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
 
     if request.discard:
-        raise click.UsageError("--discard does not go with scan.energies: leave it out.")
+        raise click.UsageError("--discard cannot be combined with scan.energies: leave it out.")
     with _shown(request, others, stop) as (sinks, ask):
         return run_energies(
             config, request.output, sinks, stop,

@@ -68,7 +68,7 @@ scan_options = together(
     option(
         "--frames",
         metavar="KINDS",
-        help="Of which kind frames are, whatever names and keys say: darks=0:5,flats=5:10+95:100. Others are views.",
+        help="Kinds of frames, overriding names and keys of the file: darks=0:5,flats=5:10+95:100. Others are views.",
     ),
     option(
         "--then",
@@ -84,9 +84,11 @@ scan_options = together(
         of_one_call=True,
         type=_PATH,
         metavar="FILE",
-        help="File of the scanner's maker beside the images (.xtekct, .log, .pca, .xml): distances, pixels, angles.",
+        help="File of the scanner's vendor beside the images (.xtekct, .log, .pca, .xml): distances, pixels, angles.",
     ),
-    option("--angles-unit", type=NameChoice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."),
+    option(
+        "--angles-unit", type=NameChoice(["deg", "rad"]), help="Unit of --angles-path, overriding the one in the file."
+    ),
 )
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""
 
@@ -95,9 +97,13 @@ light_options = together(
         "--photons-per-count",
         excludes={"spectra": "of several energies the dose is counted in frames"},
         type=POSITIVE,
-        help="X-ray photons at the sample that make a count.",
+        help="Number of X-ray photons at the sample per count.",
     ),
-    click.option("--dose-in", metavar="MATERIAL", help="With it: the absorbed dose in a material or formula."),
+    click.option(
+        "--dose-in",
+        metavar="MATERIAL",
+        help="With --photons-per-count: report the absorbed dose in this material or formula.",
+    ),
 )
 """What `light_asked` takes."""
 
@@ -106,7 +112,7 @@ def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAs
     """The light options; None without --photons-per-count. UsageError for a dose without photons."""
     if photons_per_count is None:
         if dose_in is not None:
-            raise click.UsageError("--dose-in goes with --photons-per-count.")
+            raise click.UsageError("--dose-in needs --photons-per-count.")
         return None
     from beamline.projections.scan_statistics import LightAsked  # here: it loads matplotlib and numba
 
@@ -132,7 +138,7 @@ def column(value: str) -> float | None:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
+        raise ValueError(f"{value!r} is neither a column number (0: centre of the first) nor auto")
     return number
 
 

@@ -98,7 +98,7 @@ class Terminal:
             self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
-        """Show a request to the operator without the progress bar, and wait until `put` returns."""
+        """Print a request to the operator without the progress bar, and wait until `put` returns."""
         with self._lock:
             self._bar.stop()
             self._asking = True
@@ -180,7 +180,7 @@ def events_shown(as_json: bool) -> Iterator[Sink]:
 
 
 class Answer:
-    """What a command says: events while it works, then its facts to programs, or lines to people.
+    """The output of a command: events while it works, then its result as facts for programs or lines for people.
 
     Attributes:
         sink: of events.
@@ -196,7 +196,7 @@ class Answer:
 
     @property
     def seconds(self) -> float:
-        """Since the command began."""
+        """Seconds since the command began."""
         return self.clock.now() - self._begun
 
     def counting(self, stage: str) -> Callable[[int, int], None]:
@@ -204,14 +204,14 @@ class Answer:
         return counting(stage, self.sink, self.clock)
 
     def done(self, facts: object, *lines: str) -> None:
-        """Send the event `done` with its facts; people get the lines when the work has ended."""
+        """Send the event `done` with its facts; for people the lines are printed when the work has ended."""
         self.sink(Done(facts, time=self.clock.now()))
         self.lines = lines
 
 
 @contextmanager
 def answering(as_json: bool) -> Iterator[Answer]:
-    """The answer of a command; in its end the lines are printed, unless stdout is for JSON."""
+    """A context with the output of a command; at its end the lines are printed, unless stdout is for JSON."""
     with events_shown(as_json) as sink:
         answer = Answer(sink)
         yield answer
@@ -221,7 +221,7 @@ def answering(as_json: bool) -> Iterator[Answer]:
 
 @contextmanager
 def closed_terminal_ignored() -> Iterator[None]:
-    """Ignores errors from a closed terminal, so that the work goes on."""
+    """A context that ignores errors from a closed terminal, so that the work continues."""
     try:
         yield
     except OSError as error:
@@ -236,14 +236,14 @@ def rates(frame: FrameStored) -> str:
 
 
 def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
-    """n/N, rate and the time left, where they are known; else that it has begun."""
+    """n/N, rate and remaining time, if known; else that the work has begun."""
     if not (done.of and done.per_s) or done.eta_s is None:
         return "begun"
     return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
 
 
 def trials(done: TrialReached, what: str = "trials") -> str:
-    """n/N, trials/min, the time left if known, and the running one."""
+    """n/N, trials/min, remaining time if known, and the running trial."""
     parts = [f"{done.n}/{done.of}"]
     if done.eta_s is not None:
         parts += [f"{done.per_min:.1f} {what}/min", f"{_clock_time(done.eta_s)} left"]
@@ -251,7 +251,7 @@ def trials(done: TrialReached, what: str = "trials") -> str:
 
 
 def fit(at: FitReached) -> str:
-    """n/N, rate, views, Gaussians (iterations have none), residuals and time left."""
+    """n/N, rate, views, Gaussians (none for iterations), residuals and remaining time."""
     word = at.unit or ("steps" if at.n_gaussians else "iterations")
     parts = [f"{at.step}/{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
     parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
@@ -324,7 +324,7 @@ ENDS_WITHIN = 3.0  # s
 
 
 class PageBeside:
-    """A sink that serves the page of a run from a process of its own, as long as the context lasts.
+    """A sink that serves the page of a run from a separate process, within the context.
 
     Args:
         say: takes the addresses, a line each. They hold the tokens, so that they belong into no log.

@@ -21,7 +21,7 @@ Name = Annotated[str, Field(min_length=1, max_length=80)]
 
 
 class MotorSection(Section):
-    """A motor of its own, any stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
+    """A separate motor, of any kind of stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
 
     speed_deg_s: Annotated[float, Field(gt=0)] | None = None
     """null: the stage's max_speed_deg_s."""
@@ -48,7 +48,7 @@ class MotorSection(Section):
 
 
 class StageMover(MotorSection):
-    """A motor that takes the sample out of the beam for flats, between two places."""
+    """A motor that moves the sample out of the beam for flats, between two positions."""
 
     kind: Literal["stage"]
     in_deg: float
@@ -79,7 +79,7 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter with nothing but names: simulated without an effect on the light, or changed by the operator."""
+    """A filter that has only names: simulated without an effect on the light, or changed by the operator."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Field(min_length=1)]
@@ -105,7 +105,7 @@ class MotorFilter(MotorSection):
         return self
 
     def connect(self, clock: Clock, url: str | None = None) -> PlacedStage:
-        """As that of `StageMover`."""
+        """Connect the motor; see `StageMover.connect`."""
         return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
 
 
@@ -117,18 +117,18 @@ class FoundFilter(Section):
         places: Mapping[str, float | str]
 
     def connect(self, clock: Clock) -> ConnectedFilter:
-        """As that of `StageMover`."""
+        """Connect the filter; see `StageMover.connect`."""
         raise NotImplementedError
 
 
 def refuse_equal(places: Mapping[str, float | str]) -> None:
-    """Raise ValueError if two places have the same value."""
+    """Raise ValueError if two positions have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("two places have the same value and cannot be told apart; give each its own")
+        raise ValueError("two positions have the same value; give each a different one")
 
 
 class BeamMonitorSection(Section):
-    """Keys that all beam monitors share. The kinds are in folders of `beamline.config`, by their BEAM_MONITORS."""
+    """Keys that all beam monitors share. Each kind is listed in BEAM_MONITORS of a folder of `beamline.config`."""
 
     unit: str
     scale: PositiveFloat = 1.0
@@ -153,12 +153,12 @@ class BeamMonitorSection(Section):
 
     @property
     def resumes_at(self) -> float:
-        """Intensity in `unit` from which a paused scan resumes."""
+        """Intensity in `unit` above which a paused scan resumes."""
         return self.resume_above or 1.1 * (self.pause_below or 0.0)
 
     @property
     def counterpart(self) -> str | None:
-        """Name of its simulated counterpart, at the port sim:// with this name; None: it has none."""
+        """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
         return None
 
     @property
@@ -167,7 +167,8 @@ class BeamMonitorSection(Section):
 
     @abstractmethod
     def connect(self, clock: Clock, url: str | None = None) -> BeamMonitor:
-        """The beam monitor, or its simulated counterpart at `url`. DeviceError: it cannot be opened."""
+        """Connect the beam monitor, or its simulated counterpart at `url`. Raises DeviceError if it cannot be
+        opened."""
 
 
 class NoBeamMonitor(Section):
@@ -175,7 +176,7 @@ class NoBeamMonitor(Section):
 
     @property
     def counterpart(self) -> None:
-        """There is nothing to simulate."""
+        """None: this monitor is not simulated."""
 
     @property
     def simulated(self) -> bool:
@@ -183,7 +184,7 @@ class NoBeamMonitor(Section):
 
 
 class StageOutputShutter(Section):
-    """A shutter on a digital output of the stage's controller, where that has outputs that can be set."""
+    """A shutter on a digital output of the stage's controller, if the controller has outputs that can be set."""
 
     kind: Literal["stage_output"]
     output: PositiveInt
@@ -201,7 +202,7 @@ class FoundShutter(Section):
         kind: str
 
     def connect(self, clock: Clock) -> ConnectedShutter:
-        """The shutter, connected. Nothing moves. Raises DeviceError: it does not answer."""
+        """Connect the shutter. Nothing moves. Raises DeviceError if it does not answer."""
         raise NotImplementedError
 
 
@@ -225,7 +226,7 @@ class _Monochromator(Section):
 
 
 class SceneMonochromator(_Monochromator):
-    """Sets the energy of the simulated beam; it begins at that of the scene."""
+    """Sets the energy of the simulated beam, which starts at that of the scene."""
 
     kind: Literal["simulated"]
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
@@ -233,7 +234,7 @@ class SceneMonochromator(_Monochromator):
 
 
 class HandMonochromator(_Monochromator):
-    """The operator is asked to set it."""
+    """A monochromator that the operator sets on request."""
 
     kind: Literal["manual"]
 
@@ -245,14 +246,14 @@ class FoundMonochromator(_Monochromator):
 
     @property
     def stops(self) -> bool:
-        """Whether it can be stopped."""
+        """Whether the monochromator can be stopped."""
         raise NotImplementedError
 
     def connect(self, clock: Clock) -> ConnectedMonochromator:
-        """The device, connected. Nothing moves. Raises DeviceError: it does not answer."""
+        """Connect the monochromator. Nothing moves. Raises DeviceError if it does not answer."""
         raise NotImplementedError
 
     def halt(self, clock: Clock) -> None:
-        """Stop it. Raises DeviceError."""
+        """Stop the monochromator. Raises DeviceError."""
         with closing(self.connect(clock)) as connected:
             connected.stop()

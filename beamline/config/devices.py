@@ -83,7 +83,7 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
 
     @property
     def options(self) -> DcamOptions:
-        """In the driver's terms."""
+        """The keys as settings of the driver."""
         options: DcamOptions = read_from(self, DcamOptions)
         return options
 
@@ -101,12 +101,12 @@ class PluggedCamera(Section):
     readout: str = "standard"
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        """What the camera will say of its timing. ValueError for what it would refuse."""
+        """The timing that the camera will report. Raises ValueError for settings that it would refuse."""
         driver = CAMERAS[self.kind]
         return driver.timing_of(read_from(self, driver.Settings), wanted)
 
     def connect(self, clock: Clock) -> Camera:
-        """Its driver, connected; see `CameraDriver`."""
+        """Connect the driver of the camera; see `CameraDriver`."""
         driver = CAMERAS[self.kind]
         return driver(read_from(self, driver.Settings), clock)
 
@@ -125,7 +125,7 @@ else:
 
 
 class Simple(Section):
-    """A device with nothing to set: simulated, or manual (the operator is asked to do it)."""
+    """A device without settings: simulated, or manual (the operator is asked to act)."""
 
     kind: Literal["simulated", "manual"]
 
@@ -165,7 +165,7 @@ class DeviceSection(Section):
         camera, high = self.camera, self.stage.settings.wiring.active_high
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
             raise ValueError(
-                f"stage.active_high {str(high).lower()} does not go with camera.trigger_polarity "
+                f"stage.active_high {str(high).lower()} contradicts camera.trigger_polarity "
                 f"{camera.trigger_polarity}: the simulated cable has no inverter, and every exposure would begin at "
                 f"its pulse's end; set trigger_polarity {'positive' if high else 'negative'}"
             )

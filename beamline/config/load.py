@@ -59,7 +59,9 @@ def load(
     try:
         text = text_in(path, SETTINGS)
     except FileNotFoundError:
-        raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
+        raise ConfigError(
+            f"{path} does not exist; `beamline config init > my.yaml` creates a configuration to edit."
+        ) from None
     except OSError as error:
         if (kind := kind_of_data(path)) is not None:
             raise ConfigError(
@@ -86,20 +88,20 @@ def load(
 
 
 def takes_text(keys: Sequence[str]) -> bool:
-    """Whether a key of the configuration takes any text, and nothing else but null."""
+    """Whether a key of the configuration accepts any text, and nothing else but null."""
     legal = declared_at(schema(), tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
     return "string" in kinds and kinds <= {"string", "null"}
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """The configuration with other values, without its file and the environment. ConfigError as `load`."""
+    """The configuration with other values, without its file and the environment. Raises ConfigError as `load`."""
     name = "the configuration"
     return _validated(override(read(resolved_yaml(config), name), overrides, {}, takes_text), name)
 
 
 def at_energies(config: Config) -> tuple[Config, ...]:
-    """The scan of each of `scan.energies`; of a configuration without them, itself.
+    """The configuration of a scan at each of `scan.energies`; a configuration without them itself.
 
     The n-th of N scans begins n / N of a step later, or has another seed, so that all views together see more angles.
     """
@@ -119,15 +121,14 @@ def at_energies(config: Config) -> tuple[Config, ...]:
 
 
 def override_of(key: str, value: object) -> str:
-    """The override that sets a key to a plain value, a NumPy scalar or a path. ConfigError: another kind of value."""
+    """The override that sets a key to a plain value, a NumPy scalar or a path. Raises ConfigError for other types."""
     plain = value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
     plain = list(plain) if isinstance(plain, tuple) else plain
     try:
         text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True)
     except yaml.YAMLError:
         raise ConfigError(
-            f"{key}: a configuration cannot hold {value!r}; expected a number, a text, a list or a group. Nothing "
-            "was started."
+            f"{key}: {value!r} is not allowed; expected a number, a text, a list or a group. Nothing was started."
         ) from None
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 
@@ -194,7 +195,7 @@ def plan_of(config: Config) -> ScanPlan:
 
 
 def scene_mapping(config: Config) -> dict[str, Any]:
-    """The simulated scene as plain values, read from its file where the configuration names one.
+    """The simulated scene as plain values, read from its file if the configuration names one.
 
     Raises:
         ConfigError: the file is not there, or is no group of keys.

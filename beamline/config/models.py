@@ -65,7 +65,7 @@ class RandomAngles(_Span):
 
 
 class InterlacedAngles(_Span):
-    """The fixed angles taken in several passes, each pass in the gaps that the earlier ones left."""
+    """The fixed angles in several passes, each pass in the gaps of the earlier ones."""
 
     scheme: Literal["interlaced"]
     passes: Views
@@ -149,7 +149,7 @@ class StorageSection(Section):
 
 
 class StopWhen(Section):
-    """When the views are enough, by what the live volume predicts; where both limits are given, both must be met."""
+    """Limits at which the views suffice, as predicted from the live volume; if both are given, both must be met."""
 
     psnr_gain_per_10_views: PositiveFloat | None = None
     """dB that ten more views may still add; null: any."""
@@ -178,9 +178,13 @@ class ReconSection(Section):
     @model_validator(mode="after")
     def _somebody_looks(self) -> Self:
         if self.stop_when is not None and not self.live:
-            raise ValueError("stop_when needs live: true, because the live reconstruction tells when views are enough")
+            raise ValueError(
+                "stop_when needs live: true, because the live reconstruction decides when the views suffice"
+            )
         if self.stop_when is not None and (self.method == AUTO or not streams(self.method)):
-            raise ValueError(f"stop_when needs a method whose volume grows while views come, as r2; got {self.method}")
+            raise ValueError(
+                f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
+            )
         return self
 
 
@@ -221,7 +225,7 @@ class Config(Section):
             odd = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
                 f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} real. Make all "
-                "simulated or none. `beamline scan CONFIG --rehearse` takes a real configuration with simulated devices"
+                "simulated or none. `beamline scan CONFIG --rehearse` runs a real configuration with simulated devices"
             )
         if any(simulated.values()) and self.simulation is None:
             raise ValueError(
@@ -245,7 +249,7 @@ class Config(Section):
         if n > 1 and self.scan.mode is Mode.FLY:
             raise ValueError(
                 f"scan.frames_per_view {n}: each frame of a fly scan has its own angle; set scan.mode to step, or "
-                "take more views, which hold as much light"
+                "plan more views, which collect as much light"
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(
@@ -270,7 +274,7 @@ class Config(Section):
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
         if several and self.recon.stop_when is not None:
-            raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
+            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(

@@ -39,7 +39,7 @@ class MonitorBase(Section):
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
-        """The checks whose warnings make the scan take a view again."""
+        """The checks whose warnings make the scan repeat a view."""
         return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 
@@ -69,7 +69,7 @@ else:
 
 
 def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
-    """All checks, with the limits that the configuration gives them."""
+    """All checks, with the limits of the configuration."""
     return tuple(replace(check, **dict(getattr(monitor, check.name, ()))) for check in CHECKS)
 
 
@@ -93,5 +93,5 @@ else:
 
 
 def reference_limits(section: ReferencesBase) -> ReferenceLimits:
-    """The limits that the configuration gives."""
+    """The limits for darks and flats from the configuration."""
     return ReferenceLimits(**{limit.name: getattr(section, limit.name) for limit in fields(ReferenceLimits)})

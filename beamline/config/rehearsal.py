@@ -18,7 +18,7 @@ _LONGEST = 60  # characters of a sample's name before the mark, which ends the r
 
 
 def rehearsal(config: Config, simulation: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The plain values of the same scan with simulated devices; a simulated configuration as it is.
+    """The plain values of the same scan with simulated devices; a simulated configuration is unchanged.
 
     All that plan, stage and camera settings say stays. The rotation axis is that of the scene, so it is searched.
 

@@ -25,7 +25,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 class Section(BaseModel):
-    """A frozen group of keys. It refuses unknown keys, and `yes` for a number.
+    """A frozen group of keys, which rejects unknown keys, and `yes` for a number.
 
     What a validator of a group says begins with the key that is to be looked at, whose line the message then has.
     """
@@ -49,7 +49,7 @@ def declared(settings: type[Any]) -> dict[str, Any]:
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
-    """The driver's settings from a section with their keys."""
+    """The driver's settings from a section with the same keys."""
     return from_flat(
         settings, {field.name: _inside(field, getattr(section, _name(field))) for field in flat_fields(settings)}
     )
@@ -102,7 +102,7 @@ def _declared(field: FlatField) -> tuple[Any, Any]:
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:
-    """A section with more keys, (type, default) each, as pydantic.create_model takes a field.
+    """A section with further keys, (type, default) each, as pydantic.create_model takes a field.
 
     Their docstrings are not looked for: pydantic would search every loaded module, which takes most of the import.
     """

@@ -27,20 +27,22 @@ _IDENTITY = ("model", "serial", "device", "axis", "channel")
 
 
 def keep_found_settings(stage: RotationStage, folder: Path | None = None) -> None:
-    """Keep the found settings on disk; those that an earlier program left there are restored instead."""
+    """Store the found settings on disk; settings stored there by an earlier program are restored instead."""
     if isinstance(stage, RestoresSettings):
         stage.keep_found_settings(FoundOnDisk(file_of(stage.describe(), folder or state_folder() / "stages")))
 
 
 def file_of(said: Mapping[str, object], folder: Path) -> Path:
-    """File for the stage with this description: named by its serial number, or by its port if it reports none."""
+    """File for the settings of the stage with this description: named by its serial number, or by its port if it
+    reports none.
+    """
     which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
     name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
     return folder / f"{name}-{crc32(json.dumps(which).encode()):08x}.json"
 
 
 class FoundOnDisk:
-    """Implements `drivers.stages.kept.SettingsStore`. A disk that does not take them loses only this protection."""
+    """Implements `drivers.stages.kept.SettingsStore`. If the disk refuses, only this protection is lost."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -85,11 +87,12 @@ class StageSection(Section):
 
     @property
     def settings(self) -> StageSettings:
-        """What the driver is opened with."""
+        """The settings for opening the driver."""
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
-        """Its driver, connected at the port, or at `url`; see `StageDriver`. A real one's settings are kept on disk."""
+        """Connect the driver at the port, or at `url`; see `StageDriver`. Settings of a real stage are stored on
+        disk."""
         stage = STAGES[self.kind](url or self.port, self.settings, clock)
         try:
             if not (url or self.port).lower().startswith("sim://"):
@@ -100,7 +103,7 @@ class StageSection(Section):
         return stage
 
     def halt(self, clock: Clock) -> None:
-        """Stop it; see `StageDriver`."""
+        """Stop the stage; see `StageDriver`."""
         STAGES[self.kind].halt(self.port, self.settings, clock)
 
 

@@ -31,7 +31,7 @@ class Tree:
     origins: Mapping[KeyPath, str]
 
     def origin(self, path: KeyPath) -> str:
-        """The origin of the value at `path`, or of the nearest group around it."""
+        """The origin of the value at `path`, or of the nearest enclosing group."""
         while path not in self.origins and path:
             path = path[:-1]
         return self.origins[path]
@@ -45,9 +45,11 @@ def read(text: str, name: str) -> Tree:
     """
     data, origins = _parsed(text, name)
     if data is None:
-        raise ConfigError(f"{name}: is empty; `beamline config init` prints a complete example. Nothing was started.")
+        raise ConfigError(
+            f"{name}: the file is empty; `beamline config init` prints a complete example. Nothing was started."
+        )
     if not isinstance(data, dict):
-        raise ConfigError(f"{name}:1: holds no `key: value` lines; `beamline config init` prints a complete example.")
+        raise ConfigError(f"{name}:1: has no `key: value` lines; `beamline config init` prints a complete example.")
     return Tree(data, origins)
 
 
@@ -86,10 +88,12 @@ def _line(node: yaml.Node) -> int:
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
     if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
-        raise ConfigError(f"{name} holds more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
+        raise ConfigError(
+            f"{name} has more than {_MOST_VALUES} values: this cannot be a configuration. Nothing was started."
+        )
     if isinstance(node, yaml.ScalarNode):
         if "\0" in node.value:
-            raise ConfigError(f"{name}:{_line(node)}: a text holds a NUL character. Nothing was started.")
+            raise ConfigError(f"{name}:{_line(node)}: a text contains a NUL character. Nothing was started.")
         # Python neither reads nor writes very long numbers.
         if node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS:
             raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")
@@ -118,7 +122,7 @@ def override(
     environment: Mapping[str, str],
     is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
 ) -> Tree:
-    """The tree with BEAMLINE_SECTION__KEY variables and then `section.key=value` overrides put over it.
+    """The tree overridden by BEAMLINE_SECTION__KEY variables and then by `section.key=value`.
 
     Values are YAML; those of text keys are the text as it stands, where it is not quoted as YAML. A variable without a
     double underscore is ignored.
@@ -172,7 +176,7 @@ _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
-    """One line for each fault, in the order of the model's keys; one fault a key.
+    """One line for each fault, in the order of the model's keys; one fault per key.
 
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.

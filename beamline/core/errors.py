@@ -67,7 +67,7 @@ class AlarmError(BeamlineError):
 
 
 def refuse_wrong_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Raise ConfigError for an argument of another type than the function declares.
+    """Raise ConfigError for an argument whose type differs from the declared one.
 
     Args:
         values: by name, such as `locals()` in the function's first line.
@@ -84,7 +84,7 @@ INTERRUPTED = 130
 
 
 def exit_code(error: BaseException) -> int:
-    """The exit code of a command that ends with `error`; 1 is a defect."""
+    """The exit code of a command that ends with `error`; 1 means a defect of the program."""
     if isinstance(error, BeamlineError):
         return error.exit_code
     if isinstance(error, DeviceError):
@@ -137,7 +137,7 @@ def damaged(error: BaseException) -> bool:
 
 
 def is_defect(error: BaseException) -> bool:
-    """Whether the error is a defect of the program, whatever the input."""
+    """Whether the error is a defect of the program rather than of its input."""
     return exit_code(error) == BeamlineError.exit_code and not isinstance(error, BeamlineError)
 
 
@@ -170,8 +170,9 @@ def user_message(error: BaseException) -> str:
 
 
 def leave_traceback(error: BaseException, folder: Path) -> Path | None:
-    """The new file with the traceback of a defect: in `folder`, or in the folder for temporary files. None if neither
-    can be written to. An error that already has such a file keeps it."""
+    """A new file with the traceback of a defect: in `folder`, or in the folder for temporary files; None if neither is
+    writable. An error that already has such a file keeps it.
+    """
     if (left := getattr(error, "traceback_file", None)) is not None:
         return Path(left)
     text = "".join(traceback.format_exception(error))

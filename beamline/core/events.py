@@ -32,7 +32,7 @@ def _spread(of: Callable[[Any], Mapping[str, Any]] | None = None, **of_field: An
 @dataclass_transform(frozen_default=True, field_specifiers=(field, _spread))
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened; each kind is a frozen dataclass. A field that has its default is not written.
+    """Something that happened; each kind is a frozen dataclass. Fields with their default value are not written.
 
     Attributes:
         event: its kind, as a JSON line names it.
@@ -78,7 +78,7 @@ Sink = Callable[[Event], None]  # Takes events
 
 
 def event_of(values: Mapping[str, Any]) -> Event:
-    """The event of a JSON line of another process. ValueError: no kind of event has these values."""
+    """The event in a JSON line of another process. Raises ValueError if no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
         spread: dict[str, Any] = {
@@ -103,7 +103,7 @@ _LATEST = 2.0**34  # s since the Unix epoch: the year 2514, which the calendars 
 
 
 def event_in(line: str | bytes) -> dict[str, Any] | None:
-    """The values of an event in a line of a log; None where it is none.
+    """The values of an event in a line of a log; None if the line is no event.
 
     Whoever can write to the folder of a run wrote it: values of the fields that its kind has are of their types; fields
     may lack or be unknown, as of another version of this program.
@@ -165,7 +165,7 @@ def _is_plain(value: Any, kind: Any) -> bool:
 
 
 def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
-    """The complete lines in the first bytes of a log; one that is too long for an event is empty."""
+    """The complete lines in the first bytes of a log; a line too long for an event is empty."""
     within = False
     while most > 0 and (line := file.readline(min(LONGEST, most))):
         most -= len(line)
@@ -271,7 +271,7 @@ class RuleBroken(Event, event="flag"):
 
 
 class Warned(Event, event="warning"):
-    """Something is not as it should be, and the work goes on."""
+    """Something needs attention, and the work continues."""
 
     message: str
     state: str | None = None
@@ -304,7 +304,7 @@ class SlicesDrawn(Event, event="slices"):
 
 
 class EnoughReached(Event, event="enough"):
-    """The views so far are enough: the others would add `mean` dB, between `low` and `high`."""
+    """The views so far suffice: further views would add `mean` dB, between `low` and `high`."""
 
     n_views: int
     planned: int
@@ -324,7 +324,7 @@ class Counted(Event, event="progress"):
 
 
 class PhaseReached(Event, event="progress"):
-    """A phase of a work begins (n is 0), or n of so many `counted` are done. None: not known."""
+    """A phase of the work begins (n is 0), or n of so many `counted` are done. None: unknown."""
 
     stage: str
     counted: str
@@ -384,7 +384,7 @@ class ScanDone(Event, event="scan_done"):
 
 
 class ReconStarted(Event, event="recon_started"):
-    """Line integrals are ready, and the method begins. again: a live fit starts anew because its axis has moved.
+    """Line integrals are ready, and the method begins. again: a live fit restarts because its axis has moved.
 
     more: of a finished scan, values by name; `axis_confident` is None where the axis was given.
     """
@@ -447,18 +447,19 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended well. result: a `RunResult`; read from the line of another process, its values by name."""
+    """A run has ended successfully. result: a `RunResult`; read from the line of another process, its values by
+    name."""
 
     folder: Path
     result: Any = _spread(RunResult.run_values)
 
 
 class Done(Listed, event="done"):
-    """A command has ended well. values: what it found or wrote."""
+    """A command has ended successfully. values: what it found or wrote."""
 
 
 class VolumeDone(Event, event="done"):
-    """A reconstruction of this process has ended well; the event of another process is read as `Done`.
+    """A reconstruction of this process has ended successfully; the event of another process is read as `Done`.
 
     record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """

@@ -33,7 +33,7 @@ STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, 
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
-    """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
+    """Create a folder `<UTC time>_<sample>` in `runs`; if that exists, a number is appended."""
     stem = f"{time.strftime(STAMP, time.gmtime(seconds))}_{sample}"
     runs.mkdir(parents=True, exist_ok=True)
     for number in count(1):
@@ -45,17 +45,17 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
 
 
 def parts_of(run: Path) -> list[Path]:
-    """The folders of a run's parts, in order: its own, and one for each time that it was resumed."""
+    """The folders of a run's parts, in order: its own, and one for each time it was resumed."""
     return [run, *(part for _, part in sorted(_numbered(run).items()))]
 
 
 def run_of(folder: Path) -> Path:
-    """The folder of the run to which a folder belongs: itself, or that around a later part."""
+    """The folder of the run that contains a folder: itself, or the one around a later part."""
     return folder.parent if folder in parts_of(folder.parent)[1:] else folder
 
 
 def create_part(run: Path) -> Path:
-    """Make the folder of a new part, after the others."""
+    """Create the folder of a new part, after the others."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)
     folder.mkdir(mode=OURS)
     return folder
@@ -97,7 +97,7 @@ _DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF 
 
 
 def kind_of_data(path: Path) -> str | None:
-    """What kind of data a file holds by its first bytes, for a sentence; None for another one."""
+    """The kind of data in a file, judged by its first bytes, for a sentence; None if unknown."""
     try:
         with path.open("rb") as file:
             return _DATA.get(file.read(4))
@@ -115,7 +115,7 @@ def is_link(path: Path) -> bool:
 
 
 def same_file(first: os.stat_result, second: os.stat_result) -> bool:
-    """Whether two looks were at the same file or folder.
+    """Whether two stat results are of the same file or folder.
 
     Some network file systems give a file a new inode number at each look. Then device, owner, mode, size and the times
     at which content and inode changed are compared; no program can set the second of these.
@@ -125,7 +125,7 @@ def same_file(first: os.stat_result, second: os.stat_result) -> bool:
 
 
 def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
-    """The place of a regular file at a relative path below a folder, for a library that opens it by its name.
+    """The path of a regular file at a relative path below a folder, for a library that opens it by its name.
 
     For what other people wrote: the folder itself may be a link, nothing below it. OSError as `require_regular`, and
     where there is no file.
@@ -141,7 +141,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
 
 
 def is_below(folder: Path, name: str) -> bool:
-    """Whether `require_below` accepts the file: no link, no pipe, and not another user's."""
+    """Whether `require_below` accepts the file: it is no link, no pipe, and not another user's."""
     try:
         return require_below(folder, name).is_file()
     except OSError:
@@ -149,8 +149,8 @@ def is_below(folder: Path, name: str) -> bool:
 
 
 def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
-    """The file that `require_below` finds, open to be read. Where the system can, nobody can put a link or a pipe in
-    its place meanwhile: each folder on the way is opened in the one before.
+    """Open for reading the file that `require_below` finds. Where the system can, nobody can put a link or a pipe in
+    its place meanwhile: each folder on the way is opened relative to the one before.
 
     A caller reads at most `largest` bytes, as the file may grow.
     """
@@ -175,13 +175,14 @@ def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
 
 
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
-    """The content of the file that `open_below` opens, of so many bytes at most."""
+    """The content of the file that `open_below` opens, at most so many bytes."""
     with open_below(folder, name, largest) as file:
         return file.read(min(largest, os.fstat(file.fileno()).st_size))
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:
-    """The content of a text file of so many bytes at most. OSError as `require_regular`, and for what is no UTF-8.
+    """The content of a text file of at most so many bytes. Raises OSError as `require_regular`, and for text that is
+    not UTF-8.
 
     A byte-order mark, which some editors write, tells UTF-16, and is no part of the text.
     """
@@ -209,7 +210,7 @@ def broken_link(path: Path) -> str:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise DataError unless a new file or folder may get the name `path`.
+    """Raise DataError unless a new file or folder can be created at `path`.
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
@@ -225,7 +226,9 @@ def refuse_existing(path: Path) -> None:
 
 @contextmanager
 def named_on_failure(path: Path) -> Iterator[None]:
-    """An OSError while the block writes `path` becomes a DataError with the path, which the system leaves out."""
+    """A context that converts an OSError while writing `path` to a DataError with the path, which the system leaves
+    out.
+    """
     try:
         yield
     except OSError as error:
@@ -235,7 +238,7 @@ def named_on_failure(path: Path) -> Iterator[None]:
 
 
 def replaceable(path: Path) -> Path:
-    """The file itself that may be replaced or made under the name `path`: the target, where that is a link.
+    """The file to replace or create for `path`: the target, if that is a link.
 
     DataError where the target is not there.
     """
@@ -263,7 +266,7 @@ def bring_to_disk(path: Path) -> None:
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary name beside `path`, for a file or a folder. At the end of the block it is brought to the disk and
+    """A context with a temporary name beside `path`, for a file or a folder. At its end that is flushed to the disk and
     renamed to `path`; an error removes it. Leftovers of a killed program for the same `path` are removed first.
 
     Args:
@@ -321,7 +324,8 @@ def _remove_left(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file from memory as `whole_file` does, and compare what is read back. DataError if it is not the same."""
+    """Write a file from memory as `whole_file` does, and verify it by reading it back. Raises DataError if it
+    differs."""
     data = content.encode() if isinstance(content, str) else content
     with whole_file(path, replace=replace) as partial:
         partial.write_bytes(data)
@@ -331,7 +335,7 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it, if it is there."""
+    """Remove a file, or a folder with its content, if it exists."""
     if path.is_dir():
         shutil.rmtree(path)
     else:

@@ -13,7 +13,7 @@ _MARK = b"splatline"  # in the first line of each one's __init__.py
 
 
 def package_problem(home: str) -> str:
-    """A sentence with advice if Python finds another module by the name of one of our packages; "" if not.
+    """A sentence with advice if Python imports another module by the name of one of this project's packages; "" if not.
 
     Args:
         home: the folder that holds our packages.
@@ -51,7 +51,9 @@ def _way_out(name: str, origin: str) -> str:
 
 
 def clashing_distributions() -> dict[str, tuple[str, ...]]:
-    """Other distributions in this environment that bring a package or module by a name of ours, with these names."""
+    """Other distributions in this environment with a package or module of the same name as one of this project, with
+    these names.
+    """
     from importlib.metadata import distributions
 
     owners = {}

@@ -12,7 +12,7 @@ _SAY_EVERY = 0.2  # s between events on the progress of a phase
 
 
 class Phases:
-    """Phases without gaps, so that their seconds add up to the time since the start.
+    """Consecutive phases without gaps, so that their seconds add up to the time since the start.
 
     Args:
         sink: gets an event `progress` of the stage "phase" as each begins, and some on its progress.

@@ -12,7 +12,7 @@ _SAME = 1e-3  # share by which an angle may be off half a turn or a turn in radi
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """The range of values that instruments have.
+    """The plausible range of a quantity of an instrument.
 
     Attributes:
         others: units that are mistaken for this one, each with its factor to this one.
@@ -37,7 +37,7 @@ the longest hutches, and the longest exposures that a ring lasts."""
 
 
 def doubt(name: str, value: float | None) -> str:
-    """A sentence on a value that no instrument has, with the unit that may be meant; empty for a plausible value."""
+    """A sentence on an implausible value, with the unit that may be meant; empty for a plausible value."""
     known = RANGES[name]
     if value is None or known.low <= value <= known.high or not value > 0:
         return ""

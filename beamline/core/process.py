@@ -103,7 +103,7 @@ class ChildProcess:
 
     @property
     def code(self) -> int | None:
-        """Exit code of the process; None while it runs."""
+        """Exit code of the process; None while it is running."""
         return self._process.poll()
 
     def wait(
@@ -145,7 +145,7 @@ class ChildProcess:
         return ending
 
     def tell(self, line: str) -> None:
-        """Write a line to the stdin of a process with a tether. OSError: it has ended."""
+        """Write a line to the stdin of a process with a tether. Raises OSError if it has ended."""
         assert self._process.stdin is not None
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
@@ -157,7 +157,7 @@ class ChildProcess:
             os.write(self._process.stdin.fileno(), b".")
 
     def end(self, grace: float = 0.0) -> None:
-        """Ask the process to end; kill it if it still runs after `grace` real s."""
+        """Ask the process to end; kill it if it is still running after `grace` s of real time."""
         if self.running:
             self._end(grace, lambda: False)
             self._reader.join(_LAST_LINES)
@@ -187,7 +187,7 @@ class ChildProcess:
         return self._silent_since, 0.0
 
     def let_go(self) -> None:
-        """Close the stdin of a tethered process, which sees the same when our process ends."""
+        """Close the stdin of a tethered process, as happens when this process ends."""
         if self._process.stdin is not None:
             with suppress(OSError):  # a line that the process did not take
                 self._process.stdin.close()
@@ -202,7 +202,8 @@ class ChildProcess:
 
 
 def at_end_of(pipe: int, act: Callable[[], object]) -> None:
-    """Call `act`, in a thread of its own, when the file descriptor `pipe` ends: the process at its other end is dead.
+    """Call `act` in a separate thread when the file descriptor `pipe` reaches its end: the process at its other end is
+    dead.
 
     Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
     """
@@ -248,7 +249,7 @@ class EndsWithParent:
 
 
 def with_our_path() -> dict[str, str]:
-    """Our environment, for a child process with the same imports."""
+    """The environment for a child process with the same imports."""
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     # The path contains the working folder if we were started by `python -m`.
     path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in given)]

@@ -75,5 +75,5 @@ class RunResult:
         return {name: value for name, value in vars(self).items() if name not in without}
 
     def run_values(self) -> dict[str, Any]:
-        """Values of the event `done`, by name, of a run that has ended well."""
+        """Values of the event `done`, by name, of a run that has ended successfully."""
         return {name: value for name, value in vars(self).items() if name not in ("sample", "status")}

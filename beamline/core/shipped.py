@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def config_folder() -> Path:
-    """The folder of the configurations that come with the package: installed, or beside the checkout's packages."""
+    """The folder of the configurations that come with the package: installed, or beside the packages of a checkout."""
     installed = Path(__file__).parents[1] / "configs"
     return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
 

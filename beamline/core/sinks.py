@@ -110,7 +110,7 @@ Warn = Callable[[str], None]  # Takes a sentence about something that is wrong t
 
 
 class Note(str):
-    """A sentence about what was done, with nothing wrong: it becomes an event `state`, not a warning."""
+    """A sentence about what was done, where nothing is wrong: it becomes an event `state`, not a warning."""
 
 
 def event_of_sentence(text: str, now: float) -> Event:
@@ -160,7 +160,7 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
 
 
 class Warnings:
-    """Sends each warning or note on as an event, once, and keeps it in `messages` for the report."""
+    """Sends each warning or note as an event, once, and collects it in `messages` for the report."""
 
     def __init__(self, sink: Sink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
@@ -176,7 +176,7 @@ _PATIENCE = 10.0  # s
 
 
 class Announcer:
-    """Passes events to sinks in a thread of its own. Leaving the context waits until all events have been passed on.
+    """Passes events to sinks in a separate thread. Leaving the context waits until all events have been passed on.
 
     It waits for `_PATIENCE` s at most: a terminal or pipe that nobody reads takes no event, and must not keep the
     program from ending. A sink that raises (a closed pipe, a full disk) gets no further events; the others get a

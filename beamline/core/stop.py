@@ -29,7 +29,7 @@ _PRINTING = 0.2  # s that a message to the terminal may delay the stop
 
 @contextmanager
 def stop_signals(stop: StopRequest) -> Iterator[None]:
-    """Within the context the first Ctrl-C requests a stop, the second an abort.
+    """A context in which the first Ctrl-C requests a stop, the second an abort.
 
     SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
     other signals that would end the process request a stop. Ctrl-Z suspends nothing: the shutter would stay open, and
@@ -84,7 +84,9 @@ class StopOnSignal:
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """Within the context SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C: no partial file stays."""
+    """A context in which SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C, so that no partial file
+    remains.
+    """
     with _caught(dict.fromkeys(_asking_to_end(), signal.default_int_handler)):
         yield
 
@@ -138,7 +140,7 @@ class ScanAborted(ScanStopped):
 
 
 class Cause(Enum):
-    """Cause of a pause, which lasts until the cause is over."""
+    """Cause of a pause, which lasts as long as the cause."""
 
     BEAM = "beam"
     SPACE = "space on the disk"
@@ -146,7 +148,7 @@ class Cause(Enum):
 
 
 class PauseRequest:
-    """A request to pause a scan, from any thread: until somebody resumes it, or until its causes are over."""
+    """A request to pause a scan, from any thread: until it is resumed, or until its causes are over."""
 
     def __init__(self) -> None:
         self._by_operator = ""
@@ -173,7 +175,7 @@ class PauseRequest:
         self._by_operator = ""
 
     def no_beam(self, reason: str, since: float) -> None:
-        """Report that the beam is missing, perhaps since that time (s since the Unix epoch)."""
+        """Report that the beam is missing, optionally since a given time (s since the Unix epoch)."""
         with self._lock:
             self._unlit_since = min(self._unlit_since, since)
         self.hold(Cause.BEAM, reason)
@@ -186,7 +188,7 @@ class PauseRequest:
         self._held_by.pop(by, None)
 
     def take_unlit_since(self) -> float:
-        """The time since which frames may lack beam, returned once; inf if none do."""
+        """The time since which frames may lack beam, returned once; inf if no frame does."""
         with self._lock:
             since, self._unlit_since = self._unlit_since, math.inf
         return since
@@ -229,7 +231,7 @@ class StopRequest:
         self.stopping = True
 
     def stop_as_enough(self, reason: str) -> None:
-        """As `stop`, but without hurry, because the views are enough."""
+        """Stop as by `stop`, but without hurry, because the views suffice."""
         self._enough = not self.stopping
         self.stop(reason, by_itself=True)
 

@@ -13,7 +13,7 @@ def degrees(angle: float) -> str:
 
 
 def size(n_bytes: float) -> str:
-    """Bytes in decimal units, three digits."""
+    """A number of bytes as text in decimal units, with three digits."""
     for unit in ("B", "kB", "MB", "GB"):
         if n_bytes < 999.5:
             return f"{n_bytes:.3g} {unit}"
@@ -22,7 +22,7 @@ def size(n_bytes: float) -> str:
 
 
 def rounded(value: float, *, up: bool = False) -> float:
-    """A positive value to three digits, down (or up), so that an advised limit holds; other values as they are."""
+    """A positive value rounded down (or up) to three digits, so that an advised limit holds; other values unchanged."""
     if not 0 < value < math.inf:
         return value
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
@@ -58,7 +58,7 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
-    """Rows of cells as lines with aligned columns; `to`: "<" the left, ">" the right."""
+    """Rows of cells as lines with aligned columns; `to`: "<" aligns left, ">" right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(f"{cell:{to}{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
@@ -66,13 +66,13 @@ def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV, a line each."""
+    """Rows of cells as CSV, one line per row."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
 
 
 def frames_text(frames: Iterable[int]) -> str:
-    """Frames of a file as `frame 3` or `frames 3, 7`."""
+    """Rows of a file as `frame 3` or `frames 3, 7`."""
     numbers = [str(int(frame)) for frame in frames]
     return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(numbers)

@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class VoxelKind(Enum):
-    """Quantity that the voxels hold."""
+    """The physical quantity of the voxels."""
 
     ATTENUATION = "attenuation"
     """Linear attenuation coefficient, of views in transmission."""
@@ -26,5 +26,5 @@ class VoxelKind(Enum):
 
     @classmethod
     def of_unit(cls, unit: str) -> VoxelKind:
-        """The kind whose voxels have this unit; attenuation where a file says another one."""
+        """The kind of voxels with this unit; attenuation if no kind has the unit that a file states."""
         return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION

@@ -44,7 +44,7 @@ class Spectra:
     attenuation: NDArray[np.float64]
 
     def at(self, energy_kev: float) -> NDArray[np.float64]:
-        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError outside the table."""
+        """Attenuation [material] in 1/mm, interpolated in energy. Raises ConfigError outside the table."""
         if not self.energies[0] <= energy_kev <= self.energies[-1]:
             raise ConfigError(
                 f"{self.path} has energies from {self.energies[0]:g} to {self.energies[-1]:g} keV; a scan was made at "
@@ -54,7 +54,7 @@ class Spectra:
 
 
 def read_spectra(path: Path) -> Spectra:
-    """A CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
+    """Read a CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
 
     Raises:
         DataError: the file cannot be read, or is no such table.
@@ -94,7 +94,7 @@ _ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger o
 
 @dataclass(frozen=True, eq=False)
 class EnergyScans:
-    """Scans of one sample, one at each energy: a source of views, where `SourceOptions` is one of a single scan.
+    """Scans of one sample, one at each energy: a source of views, where `SourceOptions` is that of a single scan.
 
     Attributes:
         scans: the first one's rotation axis is used for the others, unless it is told, and its facts are in the report.
@@ -112,11 +112,11 @@ class EnergyScans:
         return self.scans[0].path
 
     def open(self, *, follow: bool = False) -> ScanSource:
-        """The first scan."""
+        """Open the first scan."""
         return self.scans[0].open(follow=follow)
 
     def refuse(self, method: Method, given: Collection[str]) -> None:
-        """Raises ConfigError for a method of one scan, or of other materials, and for options of one volume."""
+        """Raise ConfigError for a method of one scan, or of other materials, and for options of one volume."""
         if not method.traits.by_energy:
             raise ConfigError(f"{method.name} takes one scan. Choose another method. Nothing was read.")
         for name in (name for name in OF_ONE_VOLUME if name in given):
@@ -130,7 +130,7 @@ class EnergyScans:
             )
 
     def require_alike(self, selection: Selection) -> None:
-        """Raises ConfigError as `attenuation_of`."""
+        """Raise ConfigError as `attenuation_of`."""
         attenuation_of(self, selection)
 
     def prepare(
@@ -147,7 +147,7 @@ def prepare_energies(
     check: Callable[[Geometry], object] = lambda geometry: None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
-    """As `prepare_projections`, of all scans: the views in the pixels of the first one, with their energies.
+    """`prepare_projections` of all scans: the views in the pixels of the first one, with their energies.
 
     The rotation axis of the first scan is used for the others, unless it is told. Views of another pixel size, as a
     lens gives it at another energy, are interpolated.
@@ -289,7 +289,7 @@ def _with_views(prepared: PreparedProjections, views: EnergyViews) -> PreparedPr
 
 
 def views_of(prepared: PreparedProjections) -> EnergyViews:
-    """The views of several energies, as `recon.fit_materials` takes them."""
+    """The views of several energies in the form that `recon.fit_materials` expects."""
     assert prepared.energies is not None
     energies, data = prepared.energies, prepared.projections.data
     return EnergyViews(data, prepared.geometry, energies.of_view, energies.cross_sections, prepared.shares)

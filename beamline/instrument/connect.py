@@ -62,7 +62,7 @@ _STATE = "What was acquired so far is in the file"
 
 
 def ask_operator(request: str) -> None:
-    """Ask the operator at the terminal, and wait for Enter. DeviceError: there is no terminal, or no confirmation."""
+    """Ask the operator at the terminal, and wait for Enter. Raises DeviceError without a terminal or a confirmation."""
     if not sys.stdin.isatty():
         advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
         raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)
@@ -102,7 +102,7 @@ TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
 
 
 def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> CooledCamera:
-    """The driver of the configured camera, connected. `memory`: of the frames that it gives.
+    """Connect the configured camera. `memory` is used for its frames.
 
     Raises:
         DeviceError: no library, no camera, or it does not count its frames.
@@ -112,7 +112,7 @@ def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = Non
 
 
 def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_stop: Callable[[], None]) -> None:
-    """Wait for a cold sensor and tell the operator how cold it is.
+    """Wait until the sensor is cold, and report its temperature to the operator.
 
     Args:
         seconds: at most.
@@ -135,7 +135,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
 
 
 def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
-    """The beam monitor that is configured; a simulated one shows a steady intensity.
+    """Connect the configured beam monitor; a simulated one shows a constant intensity.
 
     Raises:
         DeviceError: its port does not open.
@@ -170,7 +170,7 @@ class ConnectedDevices:
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
-        """See Simulated.truth; None at a real instrument."""
+        """See Simulated.truth; None for a real instrument."""
         return None if self.simulated is None else self.simulated.truth
 
     def __enter__(self) -> Self:
@@ -225,7 +225,9 @@ def connect(
 
 @contextmanager
 def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
-    """The configured stage without the rest of the instrument. Nothing moves. DeviceError: it does not answer."""
+    """Connect the configured stage without the rest of the instrument. Nothing moves. Raises DeviceError if it does not
+    answer.
+    """
     if config.simulation is not None:
         with connect(config, clock) as instrument:
             yield instrument.devices.stage
@@ -236,7 +238,7 @@ def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[Rotation
 
 
 def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:
-    """The limits and timing of the devices by the configuration and the data sheet alone: for dry runs.
+    """The limits and timing of the devices from the configuration and the data sheet alone: for dry runs.
 
     A simulated scene is read, too, so that its faults are reported now.
 

@@ -53,7 +53,7 @@ IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the 
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """Facts about a simulated scene that an instrument cannot know."""
+    """The true values of a simulated scene, which an instrument cannot know."""
 
     # truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
     # camera's rows
@@ -69,7 +69,7 @@ class SimulatedScene:
 def simulated_devices(
     config: Config, simulation: SimulationSection, clock: Clock, opened: ExitStack
 ) -> tuple[Devices, SimulatedScene]:
-    """Every device of the configuration, connected, and what is known of the simulated scene.
+    """Every device of the configuration, connected, and the true values of the simulated scene.
 
     Args:
         opened: takes what closes them.
@@ -221,7 +221,7 @@ def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
 
 
 def simulated_beam_monitor(name: str, config: BeamMonitorSection, clock: Clock) -> str:
-    """The url of the simulated counterpart with this name, which shows a steady intensity."""
+    """The URL of the simulated counterpart with this name, which shows a constant intensity."""
 
     modules = in_folders("simulators.wires", "BEAM_MONITORS")
     wire = import_module(modules[name]).matching(config, clock)

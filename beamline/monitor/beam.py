@@ -51,7 +51,7 @@ class BeamState:
 
 @dataclass(frozen=True)
 class LightOverScan:
-    """Light of the views in air, as logarithm of what the beam has lost since the flats.
+    """Light of the views in air, as the logarithm of the fraction lost since the flats.
 
     Attributes:
         views: with air so far.
@@ -79,8 +79,8 @@ class LightOverScan:
         return LightOverScan(self.views + 1, first, recent, least, most, (self.rows[0] if self.views else row, row))
 
     def in_words(self, limit: float, integrals: bool) -> str:
-        """The drift over the scan in words, of light or of `integrals`; "" where it is within the limit, a fraction of
-        the light.
+        """The drift over the scan in words, of light or of `integrals`; "" if it is within the limit, a fraction of the
+        light.
         """
         if self.views < 2 * LASTS:
             return ""

@@ -30,7 +30,7 @@ MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not k
 
 @dataclass(frozen=True, eq=False)
 class SampleChange:
-    """The change from the view before."""
+    """The change of a view from the one before."""
 
     gain: float  # relative change of the light, of all cells alike
     # across, down: displacement of the sample in pixels of the frame, to the right and downwards
@@ -175,5 +175,5 @@ class FrameScatter:
 
 
 def running_mean(so_far: NDArray[np.float32] | None, newest: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    """The mean of n arrays, from that of n - 1 and the n-th."""
+    """The mean of n arrays, from that of the first n - 1 and the n-th."""
     return newest if so_far is None or n == 1 else so_far + (newest - so_far) / np.float32(n)

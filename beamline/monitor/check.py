@@ -99,7 +99,7 @@ AGAIN = "`monitor.retake: true` in a configuration has a scan take such views ag
 
 
 def again_by(check: str) -> str:
-    """The same of warnings of a check."""
+    """The policy of a check with this reaction to warnings."""
     return f"`monitor.retake: [{check}]` in a configuration has a scan take such views again, after the last one."
 
 
@@ -109,7 +109,7 @@ def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.floa
 
 
 def at_edges(context: ScanContext) -> tuple[float, float]:
-    """Line integrals of matter at the left and the right edge of the field: a beam that weakens is none."""
+    """Line integrals of matter at the left and the right edge of the field, corrected for a weakening beam."""
     assert context.view is not None
     left, right = context.view.edges
     dimmer = 0.0 if math.isnan(context.dimmer) else context.dimmer
@@ -117,20 +117,20 @@ def at_edges(context: ScanContext) -> tuple[float, float]:
 
 
 def more_light(context: ScanContext, exposure: float) -> float:
-    """Light of an `exposure` (s) without a sample, over that of the flats, whose exposure may differ."""
+    """Light of an `exposure` (s) without a sample, relative to that of the flats, whose exposure may differ."""
     return exposure / context.flat_exposure
 
 
 @dataclass(frozen=True, eq=False)
 class Look(Generic[State]):
-    """Result of a look at one frame: the check's state after it, and its finding (None: nothing to report)."""
+    """Result of a check of one frame: the check's state after it, and its finding (None: nothing to report)."""
 
     state: State
     flag: Flag | None = None
 
 
 class Logged:
-    """A check whose alarms are written down and do nothing else, unless the configuration says otherwise."""
+    """A check whose alarms are only logged, unless the configuration says otherwise."""
 
     policy: ClassVar[Policy] = Policy.LOG
 
@@ -161,4 +161,4 @@ class Check(Protocol):
         """The state before the first frame."""
 
     def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[Any]:
-        """Look at the next frame. Costs O(pixels of the preview) at most."""
+        """Check the next frame. Costs at most O(pixels of the preview)."""

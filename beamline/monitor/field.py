@@ -117,7 +117,7 @@ class FieldOfViewCheck(Logged):
 
 
 def beyond_the_field(cut: Mapping[str, float]) -> str:
-    """A sentence for edges ("left", "right") that the sample goes on beyond, by the line integrals there."""
+    """A sentence for the edges ("left", "right") beyond which the sample extends, with the line integrals there."""
     return (
         f"The sample goes on beyond the {' and '.join(cut)} edge of the field (line integral {max(cut.values()):.2f} "
         "there)."

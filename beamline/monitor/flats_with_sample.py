@@ -46,7 +46,7 @@ class OddFrame:
 
 
 def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
-    """The fault of flats that all show the sample: they look like one view, and other views are brighter.
+    """The fault that all flats show the sample: they look like one view, and other views are brighter.
 
     In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
     """
@@ -82,7 +82,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
 
 
 def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
-    """The fault of flats that hold the sample, at an angle of no view or beside its place, too.
+    """The fault that flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
     as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
@@ -117,7 +117,7 @@ def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
 
 
 def nothing_seen(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
-    """Line integral below which views differ from flats and from one another, by noise alone; None: they differ."""
+    """Line integral below which views differ from flats and from one another only by noise; None if they differ."""
     depth = _depth_over_air(flats, darks, views)
     if depth is None:
         return None
@@ -156,7 +156,7 @@ def _depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group
 
 
 def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
-    """The views that have more light than with a closed shutter, and more than one value."""
+    """The views with more light than with a closed shutter, and more than one value."""
     base = _base(darks)
     light = [float(np.percentile(_cells(view, base), BRIGHT)) for view in views]
     least = UNLIT * max(light, default=0.0)
@@ -268,7 +268,7 @@ def _outshining(flats: Sequence[Group], darks: Sequence[Group], views: Group) ->
 
 
 def outshone(flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], views: Group) -> list[OddFrame]:
-    """Groups of flats that are darker than views in places where other flats are not: something was in the beam.
+    """Groups of flats that are darker than views in places where other flats are not: an object was in the beam.
 
     Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
     """
@@ -348,7 +348,8 @@ def _beyond_noise(values: Places) -> float:
 
 
 def noise_of(values: Places) -> float:
-    """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
+    """Standard deviation of a place, estimated from its neighbours along the row: matter and beam change more
+    slowly."""
     change = np.diff(values, 2, axis=-1)
     change = change[np.isfinite(change)]
     return median_deviation(change) / 6**0.5 if change.size else 0.0

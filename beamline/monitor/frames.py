@@ -64,7 +64,7 @@ class SaturationCheck(Logged):
 
 @dataclass(frozen=True)
 class StuckState:
-    """Checksum and facts of the frame before.
+    """Checksum and metadata of the frame before.
 
     Attributes:
         checksum, angle: of it.
@@ -237,12 +237,12 @@ def _trimmed_mean(values: NDArray[np.float32]) -> float:
 
 @dataclass(frozen=True)
 class LostState:
-    """Empty state: the monitor itself keeps the last good view."""
+    """No state: the monitor itself keeps the last good view."""
 
 
 @dataclass(frozen=True)
 class LostCheck:
-    """Score: lost share of the light on nine tenths of the frame, against the last view with light.
+    """Score: lost fraction of the light on nine tenths of the frame, relative to the last view with light.
 
     The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
     that turns takes no light from all places at once.

@@ -110,7 +110,7 @@ class MotionState:
 
 @dataclass(frozen=True)
 class MotionCheck(Logged):
-    """Score: displacement of the sample in pixels, beyond its rotation; steps of the stage if it is a slip.
+    """Score: displacement of the sample in pixels, beyond its rotation; in steps of the stage if it is a slip.
 
     Only the view of the jump is flagged: later views are as good as earlier ones, but show another position.
     The defaults: half a pixel is what reconstructions from views at two positions begin to show (a doubled edge is as

@@ -53,8 +53,10 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A view laid on another: its shift across and down, which noise makes uncertain by `sigma`, and the remainder as
-    a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in the shift."""
+    """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
+    remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
+    the shift.
+    """
 
     across: float
     down: float

@@ -137,7 +137,7 @@ class ReferenceFault:
 
 @dataclass(frozen=True)
 class GroupVerdict:
-    """What the checks found of a group of references.
+    """The result of all checks on a group of references.
 
     Attributes:
         kind: DARK or FLAT.
@@ -164,7 +164,7 @@ Group = Sequence[ReferenceFrame]
 def judge(
     groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
 ) -> tuple[GroupVerdict, ...]:
-    """Judge groups of darks and flats, each by itself and beside the others.
+    """Check groups of darks and flats, each by itself and against the others.
 
     Args:
         groups: of one kind each, none empty, in the order of the file.
@@ -201,7 +201,7 @@ def _of_flats(
 
 
 def is_blank(group: Group) -> bool:
-    """Whether no pixel of its frames holds a number."""
+    """Whether no pixel of its frames has a finite value."""
     return all(np.isnan(reference.blocks).all() for reference in group)
 
 
@@ -231,7 +231,7 @@ def photons(flats: Group, darks: Group) -> float | None:
 
 
 def full_scale(largest: float) -> float:
-    """The saturation count of a detector by its largest count: the end of its 8, 10, 12, 14 or 16 bits."""
+    """The saturation count of a detector, estimated from its largest count: the end of its 8, 10, 12, 14 or 16 bits."""
     return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
 
 
@@ -395,7 +395,7 @@ def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
 
 
 def level(group: Group) -> float:
-    """Counts of the bright part of a frame: a beam may be narrower than the detector."""
+    """Counts in the bright part of a frame: a beam may be narrower than the detector."""
     return float(np.median([np.nanpercentile(reference.blocks, BRIGHT) for reference in group]))
 
 

@@ -34,7 +34,7 @@ def published(name: str, about: str, default: Any, unit: str = "") -> Any:
 
 @dataclass(frozen=True)
 class RunValues:
-    """The present values of a run, which control systems see. Numbers are NaN or -1 where they are not known.
+    """The current values of a run for control systems. Unknown numbers are NaN or -1.
 
     Names that tomoscan (APS) has are as there.
     """
@@ -77,7 +77,7 @@ class Severity(IntEnum):
 
 @dataclass(frozen=True)
 class Stamp:
-    """When a value was so, s since the Unix epoch, and its alarm."""
+    """When a value was measured, s since the Unix epoch, and its alarm."""
 
     time: float
     severity: Severity = Severity.NO_ALARM
@@ -99,7 +99,7 @@ class StampedValues:
     unread: str = ""
 
     def stamp(self, name: str) -> Stamp:
-        """The stamp of a value: INVALID where the value is not known, or is one of a file that cannot be read."""
+        """The stamp of a value: INVALID if the value is unknown, or from a file that cannot be read."""
         value, stamp = getattr(self.values, name), self.stamps.get(name, Stamp(self.began))
         if value == -1 or value != value:
             return replace(stamp, severity=Severity.INVALID, message="not known")
@@ -122,7 +122,7 @@ class StampedValues:
         return replace(self, values=values, stamps=stamps)
 
     def with_file(self, seen: Mapping[str, Any], angle: float, now: float) -> StampedValues:
-        """The same with what the file says at the time `now`.
+        """The same values with those of the file at the time `now`.
 
         Args:
             seen: see `page.run_files.Reader.state`.
@@ -163,7 +163,7 @@ def _severity(event: Event) -> Severity:
 
 
 class FollowedRun:
-    """The newest run of a folder, also one that begins later. Calls may come from any thread.
+    """The newest run of a folder, and each one that begins later. Calls may come from any thread.
 
     Args:
         now: a clock, s since the Unix epoch.
@@ -186,14 +186,14 @@ class FollowedRun:
                 self._reader = None
 
     def reader(self) -> Reader:
-        """Of the run's files. DataError: there is no run so far."""
+        """The reader of the run's files. Raises DataError if there is no run yet."""
         with self._lock:
             if self._reader is None:
                 raise DataError("There is no run so far.")
             return self._reader
 
     def look(self) -> StampedValues:
-        """The values now."""
+        """The current values."""
         with self._lock:
             with suppress(ConfigError, DataError):  # no run so far
                 self.stamped = self._read()
@@ -224,7 +224,7 @@ def _newest_angle(recording: Recording) -> float:
 
 
 def event_values(before: RunValues, event: Event) -> dict[str, Any]:
-    """The values that an event sets, by name; {} if it sets none. Numbers that are not known are NaN.
+    """The values that an event sets, by name; {} if it sets none. Unknown numbers are NaN.
 
     Raises:
         KeyError: the event lacks a field.

@@ -31,7 +31,7 @@ class ScanProgress:
 
 
 class Recording:
-    """A scan file of ours, opened for reading while it may still be written.
+    """A scan file of this program, opened for reading while it may still be written.
 
     Args:
         alone: it may be no link and draw on no file outside of its folder, since another user may have written it.
@@ -64,7 +64,7 @@ class Recording:
 
     @property
     def has_references(self) -> bool:
-        """Whether a picture has been divided by flats."""
+        """Whether pictures are divided by flats."""
         return self._dark_and_flat is not None
 
     def progress(self) -> ScanProgress:
@@ -129,7 +129,7 @@ class Recording:
     def picture(
         self, frame: int, region: TileRegion, *, corrected: bool
     ) -> tuple[NDArray[np.float32], TileRegion, int]:
-        """Part of a frame, binned to a tile: counts, or the share of the light that the sample lets through.
+        """Part of a frame, binned to a tile: counts, or transmission.
 
         Returns:
             Values, the region that they show, and their binning. Where references are missing `corrected` gives counts.

@@ -43,17 +43,17 @@ class Watched:
 
     @property
     def run(self) -> Path | None:
-        """The folder of the run, which has the volume of all parts; None: a scan file alone."""
+        """The folder of the run, which has the volume of all parts; None for a single scan file."""
         return None if self.folder is None else run_of(self.folder.resolve())
 
     @property
     def volumes(self) -> tuple[Path, ...]:
-        """Paths of the volumes that the run has."""
+        """Paths of the existing volumes of the run."""
         return tuple(self.run / name for name in (RECON, SNAPSHOT) if is_below(self.run, name)) if self.run else ()
 
 
 def watched(path: Path) -> Watched:
-    """The paths for a run folder, or a scan file. DataError if there is neither."""
+    """The paths for a run folder, or a scan file. Raises DataError if there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
@@ -101,7 +101,7 @@ class EventLog:
 
 
 class Reader:
-    """Opens scan and volume when they are there, and does all reading of HDF5 in one thread."""
+    """Opens scan and volume when they exist, and does all reading of HDF5 in one thread."""
 
     def __init__(self, what: Watched) -> None:
         self.what, self.events = what, EventLog(what.folder)
@@ -122,11 +122,13 @@ class Reader:
         self._thread.shutdown()
 
     def do(self, read: Callable[[Recording], _Result]) -> _Result:
-        """The result of `read`, called in the reading thread. NotReadyError, DataError: the file gives nothing."""
+        """The result of `read`, called in the reading thread. Raises NotReadyError or DataError if the file cannot be
+        read.
+        """
         return self._thread.submit(lambda: read(self._open())).result()
 
     def on_volumes(self, read: Callable[[Sequence[ShownVolume]], _Result]) -> _Result:
-        """The result of `read` on the newest volume alone, likewise. DataError: there is no volume."""
+        """The result of `read` for the newest volume only. Raises DataError if there is no volume."""
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ class TileRegion:
     last_col: int
 
     def inside(self, shape: tuple[int, int]) -> TileRegion:
-        """Its part inside a picture of this shape; at least one pixel."""
+        """The part of the region inside a picture of this shape; at least one pixel."""
         rows, cols = shape
         first_row, first_col = min(max(self.first_row, 0), rows - 1), min(max(self.first_col, 0), cols - 1)
         last_row, last_col = min(max(self.last_row, first_row + 1), rows), min(max(self.last_col, first_col + 1), cols)
@@ -96,13 +96,13 @@ register_url_convertor("number", _Number())
 
 
 def number_of(request: Request, name: str) -> int:
-    """A whole number of a query; 0 where it is not that."""
+    """Parse an integer of a query; 0 for any other text."""
     given = request.query_params.get(name, "0")
     return int(given) if given.isdecimal() and len(given) < 10 else 0
 
 
 def numbers_of(request: Request, name: str, n: int, what: str) -> list[float]:
-    """`n` real numbers of a query. DataError where it is not that; it says `what` was expected."""
+    """Parse `n` real numbers of a query. Raises DataError, naming the expected `what`, for any other text."""
     with suppress(ValueError):
         numbers = [float(word) for word in request.query_params.get(name, "").split(",")]
         if len(numbers) == n and all(abs(each) < 1e6 for each in numbers):
@@ -111,7 +111,7 @@ def numbers_of(request: Request, name: str, n: int, what: str) -> list[float]:
 
 
 def region_of(request: Request) -> TileRegion:
-    """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
+    """Parse `region=first_row,last_row,first_col,last_col`; the whole picture for any other text."""
     edges = request.query_params.get("region", "").split(",")
     if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):
         return TileRegion(*map(int, edges))

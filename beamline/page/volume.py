@@ -33,7 +33,7 @@ _Piece = tuple[NDArray[Any], TileRegion, int]
 
 
 def slices_of(path: Path, values: Any, held: int) -> ScaledSlices | CopiedSlices:
-    """Slices of the voxels in a file."""
+    """Open the slices of the voxels in a file."""
     if isinstance(values, VolumeScale) and 4 * math.prod((values, *values.coarser)[-1].shape) <= held:
         return ScaledSlices(values)
     return CopiedSlices(path, values, held)
@@ -108,7 +108,7 @@ class CopiedSlices:
         return True
 
     def part(self, axis: int, index: int, region: TileRegion) -> _Piece:
-        """A part of a slice with at least what the region shows; the region of this part, and its binning."""
+        """A part of a slice that contains the region; the region of this part, and its binning."""
         rows, cols = (n for i, n in enumerate(self._values.shape) if i != axis)
         shown, whole = region.inside((rows, cols)), TileRegion(0, rows, 0, cols)
         if axis == 0:
@@ -119,7 +119,7 @@ class CopiedSlices:
         return (values[shown.slices], shown, 1) if self.bin == 1 else (values, whole, self.bin)
 
     def sample(self) -> NDArray[Any]:
-        """Values that stand for all, flat; all of them where they are few."""
+        """A representative sample of the values, flat; all values if there are few."""
         step = max(1, math.isqrt(int(self._filled.sum()) * self._copy[0].size // _SAMPLE))
         return self._copy[:, ::step, ::step][self._filled].reshape(-1)
 
@@ -157,7 +157,7 @@ class VolumeFile:
 
 
 def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
-    """The one of these files that was written last; None where none exists."""
+    """The most recently written of these files; None if none exists."""
     files = []
     for path in candidates:
         with suppress(OSError):
@@ -167,7 +167,8 @@ def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
 
 @dataclass(frozen=True, eq=False)
 class VolumeTile:
-    """Values, the region of the slice that they show, their binning, and the share of its voxels that has been read."""
+    """Values, the region of the slice that they show, their binning, and the fraction of its voxels that has been
+    read."""
 
     values: F32
     region: TileRegion
@@ -182,7 +183,7 @@ def _fbp_of(path: Path, record: ReconRecord) -> Any:
 
 
 class ShownVolume:
-    """A volume file of any kind that is read here. All calls come from one thread (HDF5).
+    """A volume file of any readable kind. All calls come from one thread (HDF5).
 
     Args:
         held: bytes of the copy of a file without scales, see `slices_of`.
@@ -255,7 +256,7 @@ class ShownVolume:
         }
 
     def cut(self, axis: int, index: int, region: TileRegion, time: int = 0) -> VolumeTile:
-        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile. Of a series, at one of its times.
+        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile; for a time series, at one of its times.
 
         Raises:
             DataError: there is no such slice.

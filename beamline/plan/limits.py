@@ -24,7 +24,7 @@ class Scale:
 
     @classmethod
     def of(cls, to_counts: Callable[[float], int]) -> Scale:
-        """The scale of a stage, from its own conversion, with its direction and its zero."""
+        """The scale of a stage, from its own conversion: its direction and its zero."""
         zero = to_counts(0.0)
         per_count = 2 * math.pi / (to_counts(2 * math.pi) - zero)
         return cls(-zero * per_count, per_count)
@@ -123,7 +123,7 @@ MARGIN = 1.01
 
 @dataclass(frozen=True, eq=False)
 class PlanFacts:
-    """A plan with its computed speeds, times and sizes, which the checks look at."""
+    """A plan with its computed speeds, times and sizes, to be checked."""
 
     plan: ScanPlan
     views: Block
@@ -169,7 +169,7 @@ def violations(facts: PlanFacts) -> Iterator[str]:
 
 
 def remarks(facts: PlanFacts) -> Iterator[str]:
-    """One sentence for each remark."""
+    """One sentence for each remark on the plan."""
     plan, camera = facts.plan, facts.camera
     yield from _rounding(facts)
     period = facts.views.period

@@ -91,7 +91,7 @@ class ScanPlan:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A run of frames taken in one way; blocks follow one another in the file, row after row.
+    """A sequence of frames taken in one way; blocks follow one another in the file.
 
     Attributes:
         kind: what the frames show.
@@ -123,7 +123,7 @@ class Block:
 
     @property
     def left(self) -> int:
-        """Number of frames to take."""
+        """Number of frames still to take."""
         return self.n - len(self.stored)
 
 
@@ -186,7 +186,8 @@ def _require(views: int) -> None:
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """Equal steps of span / views from `start`; the end is excluded, because it is the start again (or its mirror).
+    """Equal steps of span / views from `start`; the end is excluded, because it is the start again (or its mirror
+    image).
 
     A negative span turns the other way.
     """
@@ -237,19 +238,19 @@ def interlaced(views: int, passes: int, start: float = 0.0, span: float = math.p
 
 
 def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """View k stands at start + span * frac(k * GOLDEN) (Köhler 2004): well spread whenever the scan ends."""
+    """View k is at start + span * frac(k * GOLDEN) (Köhler 2004): well spread whenever the scan ends."""
     _require(views)
     return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
 
 
 def one_way(angles: NDArray[np.float64]) -> bool:
-    """Whether views [view] follow each other in one direction: until the last one they see a sector."""
+    """Whether views [view] follow each other in one direction, so that until the last one they cover a sector."""
     steps = np.diff(angles)
     return bool((steps > 0).all() or (steps < 0).all())
 
 
 def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
-    """Degrees, one a line, in the order of acquisition; # starts a comment, empty lines count for nothing.
+    """Parse degrees, one per line, in the order of acquisition; # starts a comment, empty lines are ignored.
 
     Args:
         unknown: lines may hold nan, as the log of a scan has it for darks and flats.
@@ -276,19 +277,19 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Retake:
-    """A view to repeat: its frame in the file (-1: it gave none), and its trigger within the views."""
+    """A view to repeat: its frame in the file (-1 if it has none), and its trigger within the views."""
 
     row: int
     trigger: int
 
 
 def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
-    """At most so many of the views, evenly spread: gaps between them stay small."""
+    """At most so many of the views, evenly spread, so that gaps between them stay small."""
     return tuple(views[i] for i in spread(np.arange(len(views)), most))
 
 
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
-    """float64 [view] radians that the stage has turned past its trigger by the middle of each exposure.
+    """float64 [view] radians that the stage turns from the trigger to the middle of each exposure.
 
     0 for a step scan. A standing stage at this angle shows the same as the view of a fly scan.
     """

@@ -47,7 +47,7 @@ def work_out(
     preview_bin: int = 4,
     free_bytes: int | None = None,
 ) -> Timeline:
-    """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
+    """Compute blocks, times, bytes, and every violated limit; no device is asked, so a dry run is the same call.
 
     The duration is that of a stage that stands at its zero and goes back there at the end, without shutter and sample
     moves.
@@ -123,7 +123,7 @@ def _openings(blocks: Iterable[Block]) -> int:
 
 
 def taxi_angle(speed: float, acceleration: float, step: float) -> float:
-    """Run-up in radians: whole angular steps, at least half a one more than it takes to reach `speed`.
+    """Run-up in radians: whole angular steps, at least half a step more than reaching `speed` takes.
 
     ceil(accel distance / step + 0.5) steps, as tomoscan plans it; so the speed is steady at the first pulse.
     """
@@ -131,7 +131,7 @@ def taxi_angle(speed: float, acceleration: float, step: float) -> float:
 
 
 def move_seconds(distance: float, speed: float, acceleration: float) -> float:
-    """Time of a move with a trapezoid velocity profile (a triangle where the top speed is not reached)."""
+    """Duration of a move with a trapezoidal velocity profile (triangular if the top speed is not reached)."""
     distance = abs(distance)
     if distance < speed**2 / acceleration:
         return 2 * math.sqrt(distance / acceleration)
@@ -149,7 +149,7 @@ class FlyPass:
 
 
 def passes(block: Block) -> list[FlyPass]:
-    """The passes of a fly block: each train, in several pieces where frames in it are stored.
+    """The passes of a fly block: each train, in several pieces if its frames need to be stored in between.
 
     The stage starts and stops `taxi` beyond the first and the last angle.
     """
@@ -175,7 +175,7 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
 
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float, start: float = 0.0) -> float:
-    """Duration of a block with its moves; `start`: where the stage stands at first."""
+    """Duration of a block with its moves; `start`: the angle of the stage before it."""
     if not block.left:
         return 0.0
     tail = block.exposure + camera.readout

@@ -38,7 +38,7 @@ def rotation_axis(
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
-    """The axis in columns of the full detector, and how it was found; None where it was given.
+    """The rotation axis in columns of the full detector, and how it was found (None if the user gave it).
 
     Raises:
         DataError: no axis explains the views.
@@ -163,7 +163,7 @@ def locate_axis(
     *,
     all_there: bool = True,
 ) -> tuple[float, AxisEstimate]:
-    """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
+    """Find the rotation axis, in columns of the full detector, from a band of rows of views spread over `frames`.
 
     An estimate without a clear optimum gives way to what the file states. If it states nothing and the views are
     `all_there`, the estimate gives way to views held out; those of a part of the turn would mislead.
@@ -213,7 +213,7 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
 
 
 def stated_axis(source: ScanSource) -> float:
-    """The rotation axis that the file of a cone beam states, for views that still come.
+    """The rotation axis stated by the file of a cone-beam scan, for a scan that is still running.
 
     Raises:
         DataError: it states none.

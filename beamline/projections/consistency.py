@@ -59,7 +59,7 @@ _EVEN, _STEP, _IN_TURN = 0.5, 0.8, -0.5  # shares that a line and a step explain
 
 @dataclass(frozen=True)
 class Law:
-    """A law that holds for all views of a sample at rest, and what the views leave of it.
+    """A consistency condition of all views of a sample at rest, and the residual that the views leave in it.
 
     Attributes:
         tolerance: more is told of; by hardening, phase and scatter in scans at rest, and by the views' noise.
@@ -81,7 +81,7 @@ class Law:
 
 
 def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, warn: Warn) -> dict[str, str]:
-    """Warn of the laws that the views break; what the views leave of each law, in words, by its name.
+    """Warn of consistency conditions that the views violate; returns the residual of each in words, by name.
 
     Angles, heights, turned frames, masses and an axis that moments of the views disagree with. The laws hold for a
     parallel beam and a sample within the field; other scans are passed over. So is a part of the rows: those of Diamond
@@ -124,7 +124,8 @@ def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
 def compare_with_flats(
     source: ScanSource, selection: Selection, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
-    """Warn of views that are not of the light of their flats; how bright their air is beside these, in words.
+    """Warn of views whose light does not match their flats; returns in words how bright their air is relative to the
+    flats.
 
     Args:
         refused: a difference that no beam has is an error.
@@ -331,7 +332,7 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 
 def cut_sentence(sides: dict[str, float]) -> str:
-    """The warning of a sample that goes on beyond the field, by `FieldEdges.beyond`."""
+    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`."""
     return (
         f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "
         "absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "

@@ -33,11 +33,11 @@ _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
 
 class NoViewError(DataError):
-    """None of the views asked for can be used."""
+    """None of the requested views can be used."""
 
 
 class ScanCorrection:
-    """Reads frames of one scan as line integrals, in the rows and with the binning of a selection.
+    """Converts frames of one scan to line integrals, in the rows and with the binning of a selection.
 
     `at_once` corrects frames that are all there. `feed` takes them in batches as they come. It gives the same line
     integrals to the bit, as long as the references and the air columns stay the same. `outdated` says when they did
@@ -64,7 +64,7 @@ class ScanCorrection:
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
-            raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
+            raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
         elif selection.step(Preparation).by_current:
             current_scale(source)  # refuses a file without any
         self._named_unlit: set[int] = set()  # views without light that were named
@@ -74,7 +74,7 @@ class ScanCorrection:
 
     @property
     def photons(self) -> Photons | None:
-        """How pixels count photons; None: they do not, or logarithms are taken."""
+        """The photon statistics of the pixels; None if they do not count photons or if logarithms are taken."""
         return None if self._beam is None else self._beam.photons
 
     def at_once(
@@ -83,7 +83,7 @@ class ScanCorrection:
         rows: slice | None = None,
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
-        """Line integrals of `frames` (rows of the file), without those that hold no finite pixel: see `view_ids`.
+        """Line integrals of `frames` (rows of the file), without views that have no finite pixel: see `view_ids`.
 
         Args:
             frames: rows of the file, in the order they were taken.
@@ -106,7 +106,7 @@ class ScanCorrection:
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
     ) -> Projections:
-        """As `at_once`, to the bit, with no more than `batch` frames in memory; the scan is read twice.
+        """The same bits as `at_once`, with at most `batch` frames in memory; the scan is read twice.
 
         Args:
             out: float32 [frame, row, col], at least so many: takes the line integrals.
@@ -117,7 +117,7 @@ class ScanCorrection:
         """
         if self.photons is not None:
             raise DataError(
-                f"{self._source.path}: photons are counted, which needs all views in "
+                f"{self._source.path}: --noise counts needs all views in "
                 f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
         self._look_for_shadow(frames)
@@ -153,7 +153,7 @@ class ScanCorrection:
         return replace(merge_and_empty(kept, out[:at]), masked=masked)
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
-        """Line integrals of the next frames; None where there are none yet, since the newest view waits for the next.
+        """Line integrals of the next frames; None if there are none yet, since the newest view waits for its successor.
 
         Args:
             frames: rows of the file, those after the frames fed before; may be none where `last`.
@@ -176,38 +176,40 @@ class ScanCorrection:
         return part
 
     def newest(self) -> Projections | None:
-        """Line integrals of the newest view while it waits for the next, as if none came after it."""
+        """Line integrals of the newest view, which still waits for its successor, as if none followed."""
         part = None if self._stream is None else self._stream.provisional()
         return None if part is None else self._filters.apply(part, None)
 
     @property
     def done(self) -> dict[str, StepDone]:
-        """What each step did, by name."""
+        """What each correction step did, by the name of the step."""
         asked = self._selection.step(Preparation)
         return {asked.name: asked.done, **(self._beam.done if self._beam else {}), **self._filters.done}
 
     @property
     def outdated(self) -> bool:
-        """Views that were fed would be corrected otherwise now: by references that came later, or other air columns."""
+        """Whether views already fed would now be corrected differently: by references that came later, or other air
+        columns.
+        """
         if self._beam is None or self._stream is None:
             return False
         more = count_references(self._source) != self._beam.n_references
         return more or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """Something stands in the beam of all these views of a finished scan that `feed` took for matter."""
+        """Whether an object stands in the beam of all these views of a finished scan that `feed` took for sample."""
         unknown = self._shadow is None
         self._look_for_shadow(views)
         return unknown and self._shadow is not None and bool(self._shadow.any())
 
     def quiet(self) -> ScanCorrection:
-        """The same references, for a few views; it warns of nothing."""
+        """A correction with the same references for a few views, without warnings."""
         other = copy(self)
         other._warn, other._shadow = lambda sentence: None, None
         return other
 
     def renewed(self) -> ScanCorrection:
-        """A correction of the same views by all references that are there now."""
+        """A correction of the same views with all references recorded by now."""
         return ScanCorrection(self._source, self._selection, self._warn)
 
     def _read(
@@ -341,7 +343,7 @@ class ScanCorrection:
 
 
 def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: slice | None = None) -> int:
-    """Bytes that correcting so many frames at once takes, with the line integrals; `rows` as in `at_once`.
+    """Memory in bytes for correcting so many frames at once, line integrals included; `rows` as in `at_once`.
 
     Raises:
         ConfigError: the selection does not fit the scan.

@@ -30,7 +30,7 @@ PIXELS = 200  # a side of a picture, about
 
 
 def reasons(flags: FrameFlags) -> list[str]:
-    """A line for each check and level: frames, worst score, what it means; alarms first."""
+    """One line for each check and level: frames, worst score, meaning; alarms first."""
     lines = []
     for level in (Level.ALARM, Level.WARN):
         for i, entry in enumerate(flags.legend):
@@ -48,7 +48,7 @@ def reasons(flags: FrameFlags) -> list[str]:
 
 
 def worst_frames(source: ScanSource, flags: FrameFlags, most: int = MOST) -> list[FlaggedFrame]:
-    """The worst frames of each check and level in turn, alarms first, in the order of the file."""
+    """The worst frames of each check and level, alarms first, in the order of the file."""
     ranked = [
         _ranked(flags, i, entry, level) for level in (Level.ALARM, Level.WARN) for i, entry in enumerate(flags.legend)
     ]
@@ -59,7 +59,7 @@ def worst_frames(source: ScanSource, flags: FrameFlags, most: int = MOST) -> lis
 
 
 def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
-    """Means of darks, of the first and the last group of flats, and the ratio of these two, by title; binned.
+    """Mean dark, means of the first and the last group of flats, and the ratio of these two, by title; binned.
 
     At most four frames of a group are read. Empty for a scan without counts.
     """
@@ -150,11 +150,11 @@ class ReturnedView:
 
     @property
     def moved(self) -> bool:
-        """The sample stands elsewhere than in the first view, by more than `MOVED` pixels."""
+        """Whether the sample is displaced from the first view by more than `MOVED` pixels."""
         return max(abs(x) for x in (self.across, self.down, 0.0) if math.isfinite(x)) > MOVED
 
     def in_words(self) -> str:
-        """In words."""
+        """The displacement in words."""
         parts = [f"{self._length(x)} {way}" for x, way in ((self.across, "across"), (self.down, "down"))]
         sure = f" (± {self.sigma:.2g} px)" if math.isfinite(self.sigma) else ""
         moved = ", the sample has moved" if self.moved else ""
@@ -168,7 +168,7 @@ class ReturnedView:
 
 
 def returned_views(source: ScanSource) -> list[ReturnedView]:
-    """Each view on the way back, compared with the view of its angle; those without one are left out.
+    """Each view on the way back, compared with the view at the same angle; a view without a counterpart is left out.
 
     Empty for a scan without darks and flats, and where nobody says what pixels hold.
 

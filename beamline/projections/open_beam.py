@@ -37,7 +37,7 @@ _LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least a
 
 @dataclass(frozen=True, eq=False)
 class OpenBeam:
-    """What divides the views of a scan of counts.
+    """The open beam by which the views of a scan of counts are divided.
 
     Attributes:
         references: of the detector rows that are read, binned.
@@ -60,7 +60,7 @@ class OpenBeam:
 
     @classmethod
     def of(cls, source: ScanSource, selection: Selection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
-        """The open beam by the reference frames that the file has; groups with a fault only if no other is left.
+        """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
             read: detector rows that are read.
@@ -99,7 +99,7 @@ class OpenBeam:
         return cls(references, settings, photons, light, n, used, done)
 
     def correction(self, rows: slice, shadow: Mask | None) -> Correction:
-        """The correction of some of the rows read, binned.
+        """The correction for some of the rows read, binned.
 
         Args:
             shadow: bool [row, col] of all rows read, what stands in the beam of all views; None: nothing.
@@ -114,7 +114,8 @@ class OpenBeam:
         return Correction(references, settings, plain.masked | shadow[rows], self.photons)
 
     def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Mask | None:
-        """bool [row, col], what stands in the beam of all views, by some of these; None: they are too few to tell.
+        """bool [row, col], objects in the beam of all views, judged from some of these; None if they are too few to
+        tell.
 
         Args:
             first: the detector row at which the rows read begin.
@@ -134,7 +135,7 @@ class OpenBeam:
 
 
 def count_references(source: ScanSource) -> int:
-    """Darks and flats that the file has so far."""
+    """Numbers of darks and flats in the file so far."""
     return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
 
 
@@ -145,7 +146,7 @@ _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they 
 def photons_of(
     source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
 ) -> Photons | None:
-    """How the pixels of a scan count photons, as they are read (binned); None: their logarithms are to be taken.
+    """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
     of the largest group of darks.
@@ -185,7 +186,7 @@ def photons_of(
             if model.noise == "auto":
                 return None
             raise ConfigError(
-                f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
+                f"--noise counts: {source.path} does not show the counts per photon: {error}. Give --gain COUNTS."
             ) from error
     # A mean of n frames has n times as many photons a count, too; flats and darks are single frames.
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
@@ -195,7 +196,7 @@ def photons_of(
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons in a pixel of the open beam, the median of the flats."""
+    """Photons per pixel in the open beam, the median of the flats."""
     return _counts_of_light(references) / photons.gain
 
 
@@ -204,7 +205,7 @@ def _counts_of_light(references: References) -> float:
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:
-    """How counts become line integrals, in words; empty where they are logarithms."""
+    """How counts are converted to line integrals, in words; empty if by logarithms."""
     if photons is None:
         return ""
     light, readout = light_of(references, photons), photons.variance**0.5

@@ -77,7 +77,7 @@ def prepare_projections(
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
-    """Read, correct and align what `selection` asks for.
+    """Read, correct and align the views of `selection`.
 
     Args:
         source: a finished scan.
@@ -149,13 +149,13 @@ def _with_held_out(
 
 
 def refuse_spilled(source: ScanSource) -> None:
-    """Raise DataError for a scan whose views cannot lie on disk."""
+    """Raise DataError for a scan whose views cannot be stored on disk."""
     if source.emission is not None:
-        raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
+        raise DataError(f"{source.path}: an emission scan must fit into memory. Give more --memory, or --rows.")
 
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
-    """Raise what `prepare_projections` refuses before it reads a frame."""
+    """Raise the errors of `prepare_projections` that can be found without reading a frame."""
     if source.emission is None:
         _usable(source, selection, lambda sentence: None)
 
@@ -213,7 +213,7 @@ def _corrected(
     if 2 * projections.view_ids.size < used.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
-            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
+            "light, no finite pixel, or not the pixels that were written. These are too few for the scan: choose "
             "those that can be used with --views, or repeat the others."
         )
     return projections
@@ -271,7 +271,7 @@ def assemble(
     warn: Warn,
     on_disk: bool = False,
 ) -> PreparedProjections:
-    """Corrected views with their geometry, after a look at what correction had to repair.
+    """Corrected views with their geometry, after reporting the pixels that the correction repaired.
 
     Args:
         geometry: of these views.
@@ -292,9 +292,9 @@ def assemble(
         warn(passing_sentence(ranges, geometry.n_views))
     ids = projections.view_ids
     if ids.size < 2:
-        raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")
+        raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
     if not projections.data.any():
-        raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
+        raise DataError(f"{source.path}: the chosen views are zero everywhere: there is no sample in the beam.")
     axis_col, estimate = axis
     rows, (height, width) = rows_of(source, selection), geometry.detector_shape
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
@@ -344,7 +344,7 @@ def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> floa
 
 
 def report_defects(projections: Projections, warn: Warn) -> None:
-    """Tell of what correction had to repair, where it is more than a stray pixel in a thousand."""
+    """Report repaired pixels if there are more than one in a thousand."""
     unseen = areas(projections.masked)
     masked = float((projections.masked & ~unseen).mean())
     if unseen.mean() > 1e-3:

@@ -81,7 +81,7 @@ class PreparedProjections:
     laws: Mapping[str, str] = field(default_factory=dict)
 
     def stretched(self, volume: Volume) -> Volume:
-        """A volume of `geometry` at the heights of its slices."""
+        """A volume of `geometry`, resampled to the heights of its slices."""
         if self.stretch == 1:
             return volume
         grid, (z, y, x) = volume.grid, volume.grid.centre
@@ -90,16 +90,16 @@ class PreparedProjections:
 
     @property
     def kind(self) -> VoxelKind:
-        """What voxels of these views are."""
+        """The physical quantity of the voxels reconstructed from these views."""
         return VoxelKind.ATTENUATION if self.emission is None else VoxelKind.ACTIVITY
 
     @property
     def on_disk(self) -> bool:
-        """Line integrals lie on disk, where rays that weigh nothing were filled from their neighbours."""
+        """Whether line integrals are stored on disk, with rays of zero weight filled from their neighbours."""
         return isinstance(self.projections.data, np.memmap)
 
     def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
-        """The same views in some detector rows, which `geometry` is of; line integrals stay where they are."""
+        """The same views restricted to the detector rows of `geometry`; line integrals are not copied."""
 
         def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if array is None else array[..., rows, :]
@@ -120,7 +120,7 @@ class PreparedProjections:
         )
 
     def of_views(self, views: I64) -> PreparedProjections:
-        """Some of the views used, by number, in this order; those held out stay as they are."""
+        """Some of the views used, by number and in this order; held-out views are unchanged."""
 
         def some(array: Any) -> Any:
             return None if array is None else array[views]
@@ -145,22 +145,24 @@ class PreparedProjections:
 
     @property
     def leaves_slices(self) -> bool:
-        """Views of a parallel beam see beyond the slices of the volume, since they move along it or lean."""
+        """Whether views of a parallel beam see beyond the slices of the volume, because they are shifted along it or
+        tilted.
+        """
         moved = np.ptp(self.geometry.shifts[:, 1]) > 0
         return not self.geometry.is_cone and (bool(moved) or not self.geometry.is_straight)
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
-        """Weights [view, row, col] as `ray_factors` says, read-only."""
+        """Weights [view, row, col] from `ray_factors`, read-only."""
         factors = self.ray_factors(others)
         return None if factors is None else factors[...]
 
     @property
     def without_warnings(self) -> PreparedProjections:
-        """The same without what the monitor says of views: rays that were not measured weigh 0, all others as usual."""
+        """The same views without the warnings of the monitor: unmeasured rays have weight 0, all others weight 1."""
         return replace(self, view_weights=None, shares=None, shares_of=None)
 
     def ray_factors(self, others: int = 0) -> RayWeights | None:
-        """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
+        """Weights [view, row, col], computed only on request; None if all rays have weight 1.
 
         Args:
             others: views held out after these. Without weights of their own they weigh 1, as a usual ray of these does.
@@ -201,7 +203,7 @@ Views = tuple[F32, Geometry]
 
 
 def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
-    """Views used and views held out as one set, and the numbers of the views held out in it.
+    """Used and held-out views as one set, and the numbers of the held-out views in it.
 
     The two geometries are of the same set-up.
     """
@@ -215,7 +217,7 @@ def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) 
 def hold_out(
     prepared: PreparedProjections, one_in: int, *, most: int | None = None, advice: str
 ) -> PreparedProjections:
-    """One of `one_in` views held out, evenly spread; unchanged where the selection already left some out.
+    """Hold out every `one_in`-th view, evenly spread; unchanged if the selection already holds some out.
 
     Args:
         most: number of views held out at most.
@@ -230,14 +232,14 @@ def hold_out(
     count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
-        raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
+        raise ConfigError(f"{n} views are too few for held-out views; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     return with_views_held_out(prepared, held)
 
 
 def with_views_held_out(prepared: PreparedProjections, held: I64) -> PreparedProjections:
-    """The same with the views of these numbers held out, sorted."""
+    """The same views with those of these numbers, sorted, held out."""
     projections, counted = prepared.projections, prepared.projections.weights
     return replace(
         prepared.of_views(np.setdiff1d(np.arange(prepared.geometry.n_views), held)),

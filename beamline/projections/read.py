@@ -30,7 +30,7 @@ def read_binned(
     binning: int,
     progress: Callable[[int, int], None] = lambda n, total: None,
 ) -> NDArray[Any]:
-    """Frames [frame, row, col], binned by averaging while they are read; NaN stays out of the averages.
+    """Read frames [frame, row, col], averaged into bins; NaN is excluded from the averages.
 
     Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
     columns that do not fill a bin go.
@@ -50,7 +50,7 @@ def read_binned(
 
 
 def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
-    """Bytes that `read_binned` takes, with what it returns."""
+    """Memory of `read_binned` in bytes, its result included."""
     pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
     at_once = min(frames, max(1, BATCH_BYTES // max(1, pixels * itemsize))) * pixels
     if binning == 1:
@@ -70,8 +70,9 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
 
 
 def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> NDArray[np.bool_]:
-    """Which of the frames are left out: those that could not be read, and, by the selection, those that are not what
-    was written. Warnings name them."""
+    """Report which frames are left out: unreadable ones and, if the selection says so, those that differ from their
+    checksum. Each is named in a warning.
+    """
     lost = np.isin(frames, sorted(source.unreadable))
     if lost.any():
         first = int(frames[lost].min())
@@ -84,20 +85,20 @@ def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.in
     if damaged.any():
         taken = "left out" if used else "used as they are (--flags ignore)"
         warn(
-            f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
-            f"checksums: {taken}. Look for a good copy of {source.path}."
+            f"Frames {spans(np.sort(frames[damaged]).tolist())} differ from their "
+            f"checksums: {taken}. Look for an intact copy of {source.path}."
         )
     return lost | damaged if used else lost
 
 
 def spoilt_frames(source: ScanSource, use_damaged: bool) -> list[int]:
-    """Rows read so far that cannot be used: those that the file does not give, and those that are not as written."""
+    """Rows read so far that cannot be used: unreadable ones, and those that differ from their checksum."""
     return sorted({*source.unreadable} | (set() if use_damaged else source.damaged))
 
 
 @dataclass(frozen=True, eq=False)
 class ViewFilters:
-    """The filters of one scan, one after the other.
+    """The filters of one scan, in order.
 
     Attributes:
         filters: in their order.
@@ -131,16 +132,16 @@ class ViewFilters:
         return cls(filters, done, rows, selection.binning, source.shape[0])
 
     def read(self, rows: slice | None) -> slice:
-        """Detector rows to read for some binned rows (None: all), with the rows around that filters need."""
+        """Detector rows to read for some binned rows (None: all), with the margin that filters need."""
         return self._widened(rows)[0]
 
     def within(self, rows: slice | None) -> slice:
-        """The same, binned, as a part of what is read for all rows."""
+        """The same rows, binned, as a slice of what is read for all rows."""
         first, part = self.read(None).start, self.read(rows)
         return slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
-        """The views through all filters, in the rows that are wanted."""
+        """Apply all filters to the views, and return the requested rows."""
         if not self.filters or not views.view_ids.size:
             return views
         read, kept = self._widened(rows)

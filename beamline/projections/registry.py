@@ -29,7 +29,7 @@ REGISTRY: dict[str, str] = {
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
-    """Every step, in the order of the registry; those of other packages come last."""
+    """Every step, in the order of the registry; steps of other packages come last."""
     ours: list[type[PrepStep]] = [
         getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for cls, module in REGISTRY.items()
     ]
@@ -61,17 +61,17 @@ def all_steps() -> tuple[type[PrepStep], ...]:
 
 
 def in_order(selection: Selection) -> list[PrepStep]:
-    """Every step that there is as the selection has it, each after those that it follows."""
+    """Every step with the settings of the selection, each after those that it follows."""
     return [selection.step(kind) for kind in all_steps()]
 
 
 def geometry_steps(selection: Selection) -> list[GeometryStep]:
-    """The steps that can learn the geometry from the views, as the selection has them."""
+    """The steps that can find the geometry from the views, with the settings of the selection."""
     return [step for step in in_order(selection) if isinstance(step, GeometryStep)]
 
 
 def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """All steps with these values of their options, which are keyed as `key_of` says.
+    """All steps with these values of their options, keyed as in `key_of`.
 
     Raises:
         ValueError: options of a step that do not go together.
@@ -83,7 +83,7 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 
 
 def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
-    """What the file of a volume records of the steps, by name."""
+    """What a volume's file records of the steps, by name."""
     records: dict[str, Value] = {}
     options = {step.name: _options(step) for step in steps}
     for name in {**options, **done}:

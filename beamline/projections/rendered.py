@@ -45,12 +45,12 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             beyond = [what for name, what in _NOT_RENDERED.items() if f"{PARAMETERS}/{name}" in file]
         except KeyError as error:
             raise DataError(
-                f"{path} is no volume of `beamline recon`: {error.args[0]}. Nothing was looked at."
+                f"{path} is not a volume of `beamline recon`: {error.args[0]}. No frame was checked."
             ) from None
     if source.cone is not None:
         raise DataError(f"{source.path} is a cone-beam scan; views are compared with volumes of parallel beams only.")
     if source.row_pitch_mm is not None:
-        raise DataError(f"{source.path} has pixels that are not square; volumes are of square ones.")
+        raise DataError(f"{source.path} has pixels that are not square; volumes are compared only with square ones.")
     if beyond:
         raise DataError(
             f"{path} is of views with {' and '.join(beyond)}, which are not rendered here. Reconstruct this scan "

@@ -38,7 +38,7 @@ POLL = 0.1  # s between looks at a growing file
 
 @dataclass(frozen=True)
 class SkippedChecks:
-    """Counts of views with light so far, and of those that checks skipped.
+    """Number of views with light so far, and for how many of them each check was skipped.
 
     Attributes:
         views: their number.
@@ -53,7 +53,7 @@ class SkippedChecks:
     wider: int = 0
 
     def with_frame(self, context: ScanContext) -> SkippedChecks:
-        """After the next frame; the checks knew `context` of it."""
+        """The counts after the next frame; `context` is what the checks knew of it."""
         if context.view is None or context.grid is None:
             return self
         return SkippedChecks(
@@ -65,7 +65,9 @@ class SkippedChecks:
         )
 
     def in_words(self) -> tuple[str, ...]:
-        """Checks, views and reason, a text each. First views, which have no earlier ones, count only if all do."""
+        """The skipped checks, the views and the reason, one text each. First views, which lack predecessors, count only
+        if all do.
+        """
         alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
         reasons = (
             ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
@@ -78,7 +80,7 @@ class SkippedChecks:
 
 @dataclass(frozen=True, eq=False)
 class FrameVerdict:
-    """What the checks found in a frame, and the state of the scan up to it.
+    """The flags of a frame, and the state of the checks after it.
 
     Attributes:
         row: of the frame, in the file.
@@ -116,7 +118,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class ScanVerdict:
-    """What the monitor says of a scan as a whole.
+    """The verdict of the monitor on a whole scan.
 
     Attributes:
         n_frames: that were looked at.
@@ -145,7 +147,7 @@ class ScanVerdict:
 
     @property
     def clean(self) -> bool:
-        """No frame has an alarm, and darks and flats are without a fault."""
+        """Whether no frame has an alarm, and darks and flats have no fault."""
         return not self.alarmed and not self.references
 
 
@@ -157,7 +159,7 @@ def replay(
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[FrameVerdict]:
-    """Look at every frame, in the order of the file.
+    """Check every frame, in the order of the file.
 
     Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
     equal.
@@ -181,7 +183,7 @@ def replay(
 def frames_of(
     source: ScanSource, *, follow: Clock | None = None, should_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Frame, int]]:
-    """Every frame, in the order of the file, and how many the file has so far; arguments and errors as of `replay`.
+    """Every frame, in the order of the file, and how many the file has so far; arguments and errors as for `replay`.
 
     A view that was taken again later has the kind that it had when it came.
     """
@@ -202,14 +204,14 @@ def frames_of(
         assert follow is not None and writer is not None
         if why := writer.lost(follow.now(), n > done, lambda: source.finished):
             raise DataError(
-                f"{source.path} {why} and is not finished; its {n} frames were looked at. {next_step(source.path)}"
+                f"{source.path} {why} and is not finished; its {n} frames were checked. {next_step(source.path)}"
             )
         done = n
         follow.sleep(POLL)
 
 
 def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
-    """What the checks said of the frames, together with what is wrong with darks, flats and the file.
+    """The verdict on the frames, together with the faults of darks, flats and the file.
 
     Args:
         limits: of darks and flats; None: those of a new scan.
@@ -231,12 +233,12 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
 
 
 def judged_flags(source: ScanSource) -> FrameFlags:
-    """Flags as the monitor would have written them, of the frames that are there."""
+    """Flags of the frames recorded so far, as the monitor would have written them."""
     return FrameFlags.of_flags([judged.flags for judged in replay(source)])
 
 
 def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
-    """Flags by check and level, the worst level first, then those of most frames."""
+    """Flags by check and level, the worst level first, then by descending number of frames."""
     grouped: dict[tuple[str, Level], list[Flag]] = {}
     for flag in flags:
         grouped.setdefault((flag.check, flag.level), []).append(flag)
@@ -257,7 +259,7 @@ def counts_of(kinds: Iterable[Kind]) -> Mapping[str, Mapping[str, int]]:
 
 
 def context_of(source: ScanSource) -> ScanContext:
-    """What the checks must know of a file before its first frame.
+    """What the checks need to know of a file before its first frame.
 
     The period is known of our own fly scans only.
     """

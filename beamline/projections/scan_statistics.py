@@ -23,7 +23,7 @@ _BINS = 2**16  # between the least and the greatest value of real numbers; integ
 
 @dataclass(frozen=True, eq=False)
 class KindStatistics:
-    """Pixel values of the frames of a kind.
+    """Statistics of the pixel values of one kind of frame.
 
     Attributes:
         frames: that were looked at, of `of`.
@@ -55,7 +55,8 @@ def statistics_of(
     progress: Callable[[int, int], None],
     kinds: Sequence[FrameKind] = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION),
 ) -> list[KindStatistics]:
-    """Statistics of the frames of these kinds, as far as the scan has any. `progress`: frames read, of how many."""
+    """Statistics of the frames of these kinds that the scan has. `progress` is called with frames read and their
+    total."""
     chosen = {}
     for kind in kinds:
         rows = np.flatnonzero(source.image_key == kind)
@@ -117,7 +118,7 @@ def _of_kind(
 
 @dataclass(frozen=True)
 class LightAsked:
-    """What the user states of the light: photons for a count, and the material of a dose.
+    """What the user states about the light: photons per count, and the material for the dose.
 
     Attributes:
         photons_per_count: X-ray photons at the sample that make one count.
@@ -128,13 +129,13 @@ class LightAsked:
     material: str | None = None
 
     def refuse_impossible(self, source: ScanSource) -> None:
-        """Before any frame is read.
+        """Raise the errors that can be found without reading a frame.
 
         Raises:
             ConfigError: there are no darks and flats, or the scan does not state what a dose needs.
         """
         if not {FrameKind.DARK, FrameKind.FLAT} <= set(source.image_key):
-            raise ConfigError(f"{source.path} has no darks and flats, which tell the light.")
+            raise ConfigError(f"{source.path} has no darks and flats, which are needed to measure the light.")
         if self.material is not None:
             _gray(self.material, source, 0.0)
 
@@ -142,7 +143,7 @@ class LightAsked:
 def _gray(material: str, source: ScanSource, photons: float) -> float:
     """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse_impossible`."""
     if source.cone is not None:
-        raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
+        raise ConfigError(f"{source.path} is a cone-beam scan; --dose-in is for a parallel monochromatic beam.")
     if source.pixel_size_mm is None or source.energy_kev is None:
         missing = "pixel size" if source.pixel_size_mm is None else "energy"
         raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
@@ -155,7 +156,7 @@ def _gray(material: str, source: ScanSource, photons: float) -> float:
 
 @dataclass(frozen=True)
 class Light:
-    """What a view of a scan costs the sample.
+    """Photons and dose of one view of a scan.
 
     Attributes:
         views: of the scan.
@@ -170,11 +171,11 @@ class Light:
     material: str = ""
 
     def of(self, frames: int) -> dict[str, float]:
-        """What so many frames cost, by name."""
+        """Photons and dose of so many frames, by name."""
         return {"photons": self.photons * frames} | ({} if self.gray is None else {"gray": self.gray * frames})
 
     def in_words(self) -> list[str]:
-        """Sentences on all views."""
+        """Light and dose of all views, as sentences."""
         each = f"{self.photons:.4g} photons a pixel and view in the open beam"
         out = [f"{each}, {self.photons * self.views:.4g} in {self.views} views"]
         if self.gray is not None:
@@ -183,7 +184,7 @@ class Light:
 
 
 def dose_scale(light: Light | None) -> tuple[float, str]:
-    """The dose of a frame in gray, photons or frames, and the label of such an axis in a picture."""
+    """The dose per frame in gray, photons or frames, and the label of such an axis in a picture."""
     if light is None:
         return 1.0, "dose: frames that were exposed"
     if light.gray is None:
@@ -214,7 +215,7 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
 
 
 def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
-    """Light and dose of a view, from darks and flats that are read; None if nobody asked.
+    """Light and dose of a view, from darks and flats read for it; None if the user did not ask.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`, before any frame is read.
@@ -226,7 +227,7 @@ def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
 
 
 def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
-    """The statistics as a table of texts: a head, and a row for each kind."""
+    """The statistics as a table of texts: a header, and one row for each kind."""
     percent = tuple(f"{p:g} %" for p in PERCENT)
     head = ("kind", "frames", "min", *percent, "max", "mean", "std", "sum |v|", "saturated", "no data")
     rows = [
@@ -241,7 +242,7 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
 
 
 def histograms(statistics: list[KindStatistics]) -> bytes:
-    """Pixels against their values, a curve a kind, as PNG; at most 400 bins each."""
+    """Histograms of the pixel values, one curve for each kind, as PNG; at most 400 bins each."""
     figure, axes = one_panel(4.2)
     for each in statistics:
         step = max(1, -(-each.pixels.size // 400))

@@ -56,11 +56,11 @@ class Selection:
                 object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
-        """The step of a kind: the one given, else one that does what its defaults say."""
+        """The step of this class: the given one, or else one with default settings."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
     def with_steps(self, *steps: NamedStep) -> Selection:
-        """The same with these steps, each in place of another one of its kind."""
+        """The same selection with these steps, each replacing the one of its class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 
@@ -68,7 +68,7 @@ class Selection:
 def choose_views(
     source: ScanSource, frames: NDArray[np.int64], selection: Selection, period: float = math.pi
 ) -> NDArray[np.int64]:
-    """Indices into `frames` of the views that the selection names; at least two.
+    """Rows in `frames` of the views that the selection names; at least two.
 
     Args:
         period: radians after which views see the same rays, see `Geometry.period`.
@@ -89,7 +89,7 @@ def choose_views(
 
 
 def rows_of(source: ScanSource, selection: Selection) -> slice:
-    """The detector rows to read, cut to whole bins.
+    """The detector rows to read, cropped to whole bins.
 
     Raises:
         ConfigError: rows outside the detector, or bins larger than what is left.
@@ -97,7 +97,7 @@ def rows_of(source: ScanSource, selection: Selection) -> slice:
     height, width = source.shape
     first, end = selection.rows or (0, height)
     if not 0 <= first < end <= height:
-        raise ConfigError(f"--rows {first}:{end} do not lie in the detector's 0:{height}.")
+        raise ConfigError(f"--rows {first}:{end} is out of range: the detector has rows 0:{height}.")
     n = selection.binning
     if not 1 <= n <= min(end - first, width):
         raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
@@ -105,7 +105,7 @@ def rows_of(source: ScanSource, selection: Selection) -> slice:
 
 
 def check_axis(source: ScanSource, axis_col: float) -> None:
-    """Raises ConfigError where the axis lies outside the detector."""
+    """Raise ConfigError if the axis lies outside the detector."""
     if not -0.5 <= axis_col <= source.shape[1] - 0.5:
         raise ConfigError(
             f"The rotation axis, column {axis_col:g}, lies outside the detector's columns 0 to {source.shape[1] - 1}."
@@ -113,12 +113,12 @@ def check_axis(source: ScanSource, axis_col: float) -> None:
 
 
 def unbinned(column: float, binning: int) -> float:
-    """A binned column in columns of the full detector."""
+    """A binned column converted to columns of the full detector."""
     return column * binning + (binning - 1) / 2
 
 
 def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 where it is not known.
+    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
 
     Raises:
         ConfigError: a cone beam's pixel size is not known.
@@ -129,7 +129,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     if (cone := cone_of(source, selection)) is not None:
         if pitch is None:
             raise ConfigError(
-                f"{source.path} does not say its pixel size, which a cone beam needs: give --pixel-size-um (on the "
+                f"{source.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
                 "detector)."
             )
         # The central ray meets the middle of the detector, whatever rows are read.
@@ -141,7 +141,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
 
 
 def pivot_of(source: ScanSource, selection: Selection) -> float:
-    """The middle row of the detector, binned and counted from the first row used."""
+    """The middle row of the detector, binned and relative to the first row used."""
     middle, binning = (source.shape[0] - 1) / 2, selection.binning
     return (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
 
@@ -158,7 +158,7 @@ def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | N
 
 
 def pixel_size(source: ScanSource, selection: Selection) -> float | None:
-    """Pixel size in mm, from the selection or the file; None where neither states it.
+    """Pixel size in mm, from the selection or the file; None if neither states it.
 
     Raises:
         ConfigError: no detector has such pixels.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class NamedStep(Protocol):
-    """What a selection knows of a step; the protocols in `beamline.projections.protocols` say what it can do.
+    """What a selection knows of a step; its abilities are the protocols in `beamline.projections.protocols`.
 
     Attributes:
         name: of the step in events, and its key in `PreparedProjections.done`.
@@ -50,7 +50,7 @@ class Option:
 
 
 def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
-    """A field of a step that the option `name` sets; `rest` is as of `Option`. Its default is that of the option."""
+    """A field of a step that the option `name` sets; `rest` as for `Option`. Field and option share the default."""
     made = Option(name, help, default, **rest)
     return field(default=None if default is None else made.parse(default), metadata={"option": made})
 
@@ -61,15 +61,15 @@ def options_of(step: type[NamedStep]) -> dict[str, Option]:
 
 
 def key_of(option: str) -> str:
-    """The name of an option's value among those of a command."""
+    """The key of an option's value in the parameters of a command."""
     return option.lstrip("-").replace("-", "_")
 
 
 def positive(text: str) -> float:
-    """A finite number above 0. ValueError for anything else."""
+    """Check that the value is a finite number above 0; raises ValueError otherwise."""
     number = float(text)
     if not 0 < number < math.inf:
-        raise ValueError(f"{text} is not in the range x>0")
+        raise ValueError(f"{text} is not above 0")
     return number
 
 
@@ -90,7 +90,7 @@ class StepDone:
 
 @dataclass(frozen=True)
 class StepMemory:
-    """Bytes that a step takes at most, beside raw pixels, line integrals and volume.
+    """Peak memory of a step in bytes, beside raw pixels, line integrals and volume.
 
     Attributes:
         correcting: while views are corrected, a batch at a time.
@@ -102,6 +102,6 @@ class StepMemory:
 
     @classmethod
     def of_all(cls, steps: Iterable[StepMemory]) -> StepMemory:
-        """Memory of all steps, which act one after the other."""
+        """Memory of all steps, which run one after the other."""
         needs = list(steps)
         return cls(max(need.correcting for need in needs), max(need.alone for need in needs))

@@ -27,7 +27,7 @@ BandsDone = Callable[[int, int], None]  # (n, N): so many bands of rows are corr
 def warn_of_tilt(
     source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> None:
-    """Warn where the corrected rows of a parallel beam show a tilt that matters.
+    """Warn if the corrected rows of a parallel beam show a significant tilt.
 
     Args:
         frames: views that may be used.
@@ -55,7 +55,7 @@ def shown_tilt(
     size: tuple[int, int],
     progress: BandsDone,
 ) -> TiltEstimate:
-    """The tilt that corrected views show, by the bands of rows that can be corrected.
+    """The tilt measured in corrected views, from the bands of rows that can be corrected.
 
     Args:
         size: number of bands, and rows of each.
@@ -81,12 +81,12 @@ def shown_tilt(
             heights.append(first + (height - 1) / 2)
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
-        raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
+        raise ValueError(f"{len(means)} bands of rows; at least {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
 
 
 def tilt_text(tilt: float, uncertainty: float) -> str:
-    """Degrees with their uncertainty, as many digits as that has."""
+    """Degrees with their uncertainty, rounded to its digits."""
     sigma = math.degrees(uncertainty)
     digits = min(max(1 - math.floor(math.log10(max(sigma, 1e-4))), 2), 4)
     return f"{math.degrees(tilt):.{digits}f} ± {sigma:.{digits}f} degrees"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Parts of flagged frames whose rays weigh less.
+    """Regions of flagged frames in which rays have reduced weight.
 
     Attributes:
         frames: int64 [region], rows of the file.
@@ -37,7 +37,7 @@ class Regions:
     resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
-        """Whether a ray of these views weighs less."""
+        """Mark which rays of these views have reduced weight."""
         return bool(self._of(view_ids).any())
 
     def _of(self, view_ids: I64) -> NDArray[np.bool_]:
@@ -96,7 +96,7 @@ class UsableViews:
         return replace(self, frames=frames, left_out=self.left_out + self.frames.size - frames.size)
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
-        """[view] weights of some rows of the file; None where they all weigh the same."""
+        """[view] weights of some rows of the file; None if all weights are equal."""
         if self.weights is None or np.ptp(self.weights[rows]) == 0:
             return None
         return self.weights[rows]
@@ -143,7 +143,9 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
 
 
 def gap_sentence(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
-    """ " leave 12° without a view" where the views left have such a gap, which those before had not; else empty."""
+    """ " leave 12° without a view" if the remaining views have such a gap that the views before did not have; else
+    empty.
+    """
     period = np.pi if source.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
@@ -156,7 +158,7 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
 
 
 def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
-    """The regions of warnings and alarms in frames of this shape; rays in those of an alarm weigh nothing."""
+    """The regions of warnings and alarms in frames of this shape; rays in an alarm region have weight 0."""
     from beamline.storage.rules.treatment import boxes_of, flagged_in_part
 
     if flags.regions is None:
@@ -178,7 +180,7 @@ def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
 
 
 def part_numbers(jumps: I64, rows: I64) -> I64:
-    """Number [row] of the part to which each of these rows of the file belongs; jumps ascend."""
+    """Number [row] of the part that contains each of these rows of the file; jumps ascend."""
     return np.searchsorted(jumps, rows, side="right").astype(np.int64)
 
 

@@ -31,7 +31,7 @@ from recon.base.geometry import Geometry
 
 
 def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
-    """The views that the selection names, as scan and options state them, before any frame is read.
+    """The geometry of the selected views, as scan and options state it, before any frame is read.
 
     An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
 
@@ -67,7 +67,7 @@ def with_rays(source: ScanSource, selection: Selection, geometry: Geometry) -> t
 
 @dataclass(eq=False)
 class ViewGeometry:
-    """The geometry of views: the stated angles, and what steps find out and change.
+    """The geometry of views: stated angles, and what the steps find and change.
 
     Attributes:
         stated_axis: the column of the rotation axis before calibration.
@@ -95,7 +95,7 @@ class ViewGeometry:
         return {**{name: motion.done for name, motion in self.moved.items()}, **self.rays, **calibrated}
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
-        """Let each step find where the sample was; those of the `usable` views that can still be used."""
+        """Let each step find the sample position; returns the `usable` views that remain usable."""
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
             motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
@@ -105,7 +105,7 @@ class ViewGeometry:
         return usable
 
     def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
-        """Learn the geometry from these views, where that is asked for."""
+        """Calibrate the geometry from these views, if that is requested."""
         for step in geometry_steps(self.selection):
             if step.geometry:
                 phases.enter("calibration", "steps")
@@ -113,7 +113,7 @@ class ViewGeometry:
                 self.learnt[step.name] = learnt
 
     def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views, before calibration."""
+        """The geometry of views without calibration."""
         geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
@@ -132,7 +132,7 @@ _OF_A_CIRCLE = angle_order.RULE, "axis"  # rules on what vectors of each view ta
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
-    """The views of a finished scan that may be used, by the flags of the monitor.
+    """The usable views of a finished scan, by the flags of the monitor.
 
     Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
 
@@ -158,14 +158,14 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raises DataError for the errors among the findings, with what to do about each."""
+    """Raise DataError for the errors among the findings, with a remedy for each."""
     reasons = [finding.message for finding in findings if finding.severity == "error"]
     if reasons:
         raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
 
 
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
-    """Why the frames of a scan that is still growing cannot be corrected."""
+    """Reasons why the frames of a running scan cannot be corrected yet."""
     checked = () if selection.step(Preparation).accepted else (references_usable,)
     rules = (quantity_stated, references_present, *checked)
     return [finding for rule in rules for finding in rule(source)]

@@ -25,7 +25,7 @@ _SHOWN = 40  # most characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
-    """Origin of a fit or a slab: checksum of the data, geometry and settings.
+    """The origin of a fit or a slab: checksum of its data, geometry and settings.
 
     Args:
         prepared: line integrals and geometry; views held out do not matter.
@@ -69,7 +69,7 @@ def _difference(current: Value, stored: Value) -> str:
 
 @dataclass(frozen=True)
 class CheckpointOptions:
-    """Files of a fit's state.
+    """The checkpoint files of a fit: where to write, and which to resume from.
 
     Attributes:
         path: to write; None: no checkpoint.
@@ -84,7 +84,7 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raises DataError before any work: the checkpoint to write exists, or the one to resume from is missing.
+        """Raise DataError before any work if the checkpoint to write exists, or the one to resume from is missing.
 
         The checkpoint may replace the one that the fit resumes from.
         """
@@ -94,7 +94,7 @@ class CheckpointOptions:
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
-        """The state to resume from; None if a fit begins anew.
+        """The state to resume from; None if the fit starts anew.
 
         Args:
             origin: of the fit, see `origin_of`.
@@ -111,23 +111,24 @@ class CheckpointOptions:
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
-                f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
+                f"--resume {self.resume} has {reached.step} steps already, more than the {steps} requested: give at "
                 f"least {reached.step} with --steps, or start anew without --resume."
             )
         if steps != kept.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
             plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
-            warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
+            warn(f"The checkpoint is of a fit {plans}: the learning rates continue at the same step of the new plan.")
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Keep the state. If the disk refuses, warn, return the reason, and let the fit go on; "" if it was kept."""
+        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on
+        success."""
         if self.path is None:
             return ""
         try:
             write_checkpoint(self.path, Checkpoint(state, origin, steps))
         except DataError as error:
-            warn(f"A checkpoint was left out: {error}")
+            warn(f"A checkpoint could not be written: {error}")
             return str(error)
         return ""
 
@@ -144,7 +145,7 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
         for name, values in kept.state.items():
             # The last loss and the best of views held out may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
-                raise ValueError(f"{name} of the checkpoint holds values that are not finite")
+                raise ValueError(f"{name} of the checkpoint has values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):
             raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
     except ValueError as error:
@@ -153,11 +154,11 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
 
 
 def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], of: str) -> None:
-    """Raises DataError if a file has another origin, with the differences; `of` names the content of the file."""
+    """Raise DataError with the differences if a file has another origin; `of` names the content of the file."""
     others = differences(now, before)
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} is of another {of}: {listed}. Give the options that it was made with, or start anew without "
+            f"{path} belongs to another {of}: {listed}. Give the options that it was made with, or start anew without "
             "--resume. Nothing was touched."
         )

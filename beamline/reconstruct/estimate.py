@@ -27,7 +27,8 @@ _SHARED = 1.3  # from which the text says so
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(Need):
-    """What a reconstruction will take. Its seconds are without reading and correction; without scratch it is at once.
+    """Estimated time, memory and disk of a reconstruction. Seconds exclude reading and correction; no scratch means it
+    runs in memory.
 
     Attributes:
         busy: the seconds over those of a machine on which nothing else runs.
@@ -73,7 +74,7 @@ class Estimate(Need):
 
 
 def estimate(options: ReconOptions, rates: Rates, busy: float = 1.0) -> Estimate:
-    """Estimate for a finished scan; for a partial volume, of the missing slabs. Nothing is run. Frames
+    """Estimate a reconstruction of a finished scan; for a partial volume, of the missing slabs. No method runs; frames
     are read only to find a region around the sample.
 
     Args:

@@ -31,7 +31,7 @@ from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
 
 class FollowState(Enum):
-    """State of the fit of a growing scan."""
+    """State of the fit of a running scan."""
 
     WAITS_FOR_REFERENCES = auto()
     WAITS_FOR_AXIS = auto()
@@ -59,38 +59,40 @@ class Cursor:
 
     @property
     def behind(self) -> bool:
-        """The file has frames that were not taken yet."""
+        """Whether the file has frames that the fit has not read yet."""
         return self.taken < self.frames
 
     @property
     def n_corrected(self) -> int:
-        """Views in `batches`."""
+        """Number of views in `batches`."""
         return sum(batch.view_ids.size for batch in self.batches)
 
     @property
     def view_ids(self) -> NDArray[np.int64]:
-        """Frames of the file of the views in `batches`."""
+        """Rows of the file of the views in `batches`."""
         return np.concatenate([batch.view_ids for batch in self.batches])
 
 
 @dataclass(frozen=True, eq=False)
 class FollowedViews:
-    """The views of a scan file that still grows, as the selection takes them."""
+    """The selected views of a scan file that is still growing."""
 
     source: ScanSource
     selection: Selection
 
     @property
     def n(self) -> int:
-        """Views in the file, those with a flag among them."""
+        """Number of views in the file, flagged ones included."""
         return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
 
     def usable(self) -> UsableViews:
-        """Those that are in the file and may be used."""
+        """The views in the file that may be used."""
         return usable_views(self.source, self.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames of the selection among these, by their place among all views taken, which later ones keep."""
+        """Which of these frames the selection uses, by their index among all views so far, which later views do not
+        change.
+        """
         taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
         chosen = parse_views(self.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
@@ -100,12 +102,12 @@ class FollowedViews:
         return geometry_of(self.source, self.selection, axis_col, np.zeros(1))
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, dict[str, StepDone]]:
-        """The geometry of views with the motion of the stage in their exposures, and what its steps did, by name."""
+        """The geometry of views with the stage's motion during exposures, and what its steps did, by name."""
         geometry = geometry_of(self.source, self.selection, axis_col, self.source.angles[view_ids])
         return with_rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
-        """[view] radians for the fit: in the middle of the exposure, of the middle row. The fit knows no motion."""
+        """[view] radians for the fit: mid-exposure, middle row. The fit ignores motion."""
         geometry, _ = self.geometry(axis_col, view_ids)
         return np.asarray(geometry.angles + geometry.skew * (geometry.detector_shape[0] - 1) / 2)
 
@@ -114,7 +116,7 @@ _FIRST_VIEWS = 12  # fewer views do not determine an axis
 
 
 class AxisSearch:
-    """Searches the rotation axis each time the views have grown by half, and once more at the end.
+    """Repeats the search for the rotation axis each time the views have grown by half, and once at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.
@@ -130,7 +132,7 @@ class AxisSearch:
         self._next = _FIRST_VIEWS
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Look for the axis in these views (frames of the file), if it is time. While views come, only a clear optimum
+        """Search the axis in these views (rows of the file), if it is time. While the scan runs, only a clear optimum
         counts.
 
         Raises:
@@ -161,7 +163,7 @@ _FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
 def planned_views(
     source: ScanSource, selection: Selection, axis_col: float | None, taken: Sequence[NDArray[np.int64]]
 ) -> Geometry:
-    """Geometry of the views so far and of the further views in the plan.
+    """Geometry of the views so far and of those still to come by the plan.
 
     Args:
         taken: frames of the views so far, in batches.
@@ -172,10 +174,10 @@ def planned_views(
     if cone_of(source, selection) is not None:
         raise ValueError("its beam is a cone")
     if source.part_starts.size > 1:
-        raise ValueError("it goes on with a run that ended early, so that views come out of their order")
+        raise ValueError("it resumes a run that ended early, so that its views are not in the planned order")
     angles = source.plan.get("angles_deg")
     if angles is None or axis_col is None:
-        raise ValueError("its file does not say which views are planned")
+        raise ValueError("its file does not state the planned views")
     places = parse_views(selection.views, np.zeros(len(angles)))
     last = max(int(ids[-1]) for ids in taken)
     n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
@@ -198,7 +200,7 @@ class EnoughViews:
         self.next_look = _FIRST
 
     def look(self, data: NDArray[np.float32], planned: Geometry) -> Gain | None:
-        """The gain by the further views; None if it is not (yet) known.
+        """The predicted gain of further views; None if it is unknown.
 
         Args:
             data: line integrals [view, row, col] so far.
@@ -216,7 +218,7 @@ class EnoughViews:
         return Gain.of(n, planned.n_views, before + self._samples) if before else None
 
     def met(self, gain: Gain) -> bool:
-        """Whether the views so far are enough."""
+        """Whether the views so far suffice."""
         return self._goal.met(gain)
 
 
@@ -230,7 +232,8 @@ def report_gain(
     clock: Clock,
     warn: Warnings,
 ) -> bool:
-    """Report the gain by further views, and whether those so far are enough. False: there is no more to ask.
+    """Report the gain of further views, and whether those so far suffice. Returns False if nothing further can be
+    asked.
 
     Args:
         taken: frames of the views so far, in batches.
@@ -239,7 +242,7 @@ def report_gain(
     try:
         planned = planned_views(views.source, views.selection, axis_col, taken)
     except ValueError as error:
-        warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
+        warn(f"The gain of further views cannot be predicted: {error}. The scan is not stopped early.")
         return False
     gain = enough.look(data, planned)
     if gain is None:

@@ -48,7 +48,7 @@ from recon.warm_up import warm_up
 def progress_events(
     sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
 ) -> Callable[[Progress], None]:
-    """A listener that passes progress on as events, with `per_s` (steps) and `eta_s`; None where they are not known.
+    """A listener that forwards progress as events, with `per_s` (steps) and `eta_s`; None if unknown.
     `seconds`: time of the fit, if no number of steps is planned. `waiting`: views that it has not learnt yet.
     """
     first: Progress | None = None
@@ -72,7 +72,7 @@ def progress_events(
 
 
 def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
-    """A listener that passes the number of kernels compiled so far on as events."""
+    """A listener that forwards the number of kernels compiled so far as events."""
     begin = clock.now()
 
     def compiled(n: int) -> None:
@@ -83,7 +83,7 @@ def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
 
 
 def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
-    """Report what each correction did to the views; "" is not reported."""
+    """Report what each correction did to the views; an empty text is not reported."""
     for state, message in messages.items():
         if message:
             sink(StateEntered(state, message, time=clock.now()))
@@ -109,7 +109,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A reconstruction: its views, as a source of views gives them, and how the volume is made of them.
+    """A reconstruction: its views from a source of views, and how the volume is computed from them.
 
     Attributes:
         options: with the rows that show the region, and the seconds that are left for the method.
@@ -134,17 +134,17 @@ class Job:
 
     @property
     def grid(self) -> Grid:
-        """Grid of the volume; of a region alone for a direct method."""
+        """Grid of the volume; for a direct method, only that of the requested region."""
         grid = Grid.matching(self.prepared.geometry)
         return self.region.grid_of(grid) if self.region is not None and self.options.method.traits.direct else grid
 
     @property
     def method(self) -> Method:
-        """The method that makes the volume of these views."""
+        """The method that reconstructs the volume from these views."""
         return self.last_round or self.options.method_for(self.prepared.geometry)
 
     def say(self, text: str, state: str = "slab") -> None:
-        """Report the progress of a slab, or another state."""
+        """Report progress of a slab, or another state."""
         self.channels.sink(StateEntered(state, text, time=self.channels.clock.now()))
 
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
@@ -153,7 +153,7 @@ class Job:
 
 @contextmanager
 def refused(options: ReconOptions, by: str = "") -> Iterator[None]:
-    """Turn a ValueError into a DataError that names the file."""
+    """Convert a ValueError to a DataError that names the file."""
     try:
         yield
     except ValueError as error:
@@ -161,7 +161,7 @@ def refused(options: ReconOptions, by: str = "") -> Iterator[None]:
 
 
 def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock: Clock) -> None:
-    """Compile the kernels of this process, once on a machine, and report it; cluster workers compile their own.
+    """Compile the kernels in this process, once per machine, and report it; cluster workers compile their own.
 
     The time must count neither in the run nor in the estimated time left.
     """
@@ -185,7 +185,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct within a budget, in slabs, or at once; returns the volume, and the views as it used them."""
+    """Reconstruct within a time budget, in slabs, or at once; returns the volume, and the views as used."""
     prepared = job.prepared
     if job.options.budget is not None:
         return _within_budget(job, job.options.budget)
@@ -206,16 +206,16 @@ def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstr
 
 
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
-    """The volume with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
+    """The volume with the standard deviation of each voxel; if that was stopped, without it and with a warning."""
     if made.ending.early:
-        job.channels.warn("The error bars were left out, as the reconstruction was stopped.")
+        job.channels.warn("There are no error bars, because the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
     given = made.volume, method, job.prepared, job.options
 
-    why = "as they were stopped"
+    why = "their computation was stopped"
     try:
         if job.slabs:
             deviation = deviation_by_slabs(*given, job.slabs, decided.made, control, job.say)
@@ -224,7 +224,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
     except ValueError as error:  # hours may be in the volume
         deviation, why = None, str(error)
     if deviation is None:
-        job.channels.warn(f"The error bars were left out: {why}. The volume is whole.")
+        job.channels.warn(f"There are no error bars: {why}. The volume is complete.")
         return made
     factors = method_on_voxels(method, decided.made).traits.error_bars
     assert factors is not None
@@ -265,7 +265,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
         asked = method.gaussians
     if isinstance(asked, int) and resume is None and started_from < asked:
         job.channels.warn(
-            f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more."
+            f"The fit started from {started_from} Gaussians, not from {asked}: the sample is too small for more."
         )
     if method.traits.held_out:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})

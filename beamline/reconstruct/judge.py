@@ -41,7 +41,7 @@ def judge(
     clock: Clock,
     in_parts: bool = False,
 ) -> VolumeLooks:
-    """Measure a volume, lost_matter it with its views and with FBP, and tell `sink` of each warning.
+    """Compare a volume with its views and with FBP, and send each warning to `sink`.
 
     Looks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
 
@@ -66,7 +66,7 @@ def judge(
 
 
 class VolumeLooks:
-    """Checks of one volume, in their order, and their results; arguments as of `judge`.
+    """The checks of one volume, in order, and their results; arguments as for `judge`.
 
     Attributes:
         volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
@@ -101,7 +101,7 @@ class VolumeLooks:
 
     @property
     def waited_for(self) -> bool:
-        """Whether the reconstruction was stopped, so that the user waits for its end."""
+        """Whether the user stopped the reconstruction and waits for its end."""
         return self.made.ending.early
 
     @property
@@ -113,28 +113,28 @@ class VolumeLooks:
         return not self.waited_for and self.context.leaves(projections * self.all_rays)
 
     def warn(self, sentence: str) -> None:
-        """Send and keep a warning; an empty one is ignored."""
+        """Send and record a warning; an empty one is ignored."""
         if sentence:
             self.sink(event_of_sentence(sentence, self.clock.now()))
             self.warnings.append(sentence)
 
     @property
     def left_out_text(self) -> str:
-        """A sentence on the checks left out, and why; empty without any."""
+        """A sentence on the skipped checks and the reason; empty if none was skipped."""
         if not self.left_out:
             return ""
         why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"
         return f"Left out, as {why}: {', '.join(self.left_out)}."
 
     def measured(self, volume: Volume, seconds: float) -> dict[str, float]:
-        """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
+        """Figures of merit; without residuals for a region, since the views show more than the region."""
         grid, geometry = self.made.volume.grid, self.prepared.geometry
         is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
         figures = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
         return {**figures, "seconds": seconds}
 
     def look_at_residual(self) -> None:
-        """Measure the volume, and what it leaves in the views: of a volume that was fitted to them.
+        """Measure the volume and its residual in the views, for a volume that was fitted to them.
 
         A direct method leaves the blur of its filter in them, which tells nothing of what it hides.
         """
@@ -170,7 +170,7 @@ class VolumeLooks:
             self.left_out.append("the look for views that do not fit the volume")
 
     def compare_with_fbp(self) -> None:
-        """Put FBP of the same views first among the volumes, where it is wanted and does not take too long."""
+        """Put FBP of the same views first among the volumes, if it is wanted and fast enough."""
         made, prepared, phases = self.made, self.prepared, self.context.phases
         if self.direct or self.target.report is None or not has_direct_method(prepared.geometry):
             return
@@ -187,7 +187,7 @@ class VolumeLooks:
         self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}
 
     def compare_regions(self) -> None:
-        """SNR and CNR of all volumes by the regions of one: the truth, else FBP of the views, else none of them.
+        """SNR and CNR of all volumes in regions of one reference: the truth, else FBP of the views, else none.
 
         Regions of the volume itself would give each method others.
         """
@@ -200,7 +200,7 @@ class VolumeLooks:
                 self.metrics[name] |= contrast_by(mask, volume)
 
     def compare_air(self) -> None:
-        """The level of air of each volume, where the views show it, over the noise of FBP there."""
+        """The level of air in each volume, if the views show air, relative to the noise of FBP there."""
         if self.stray is None or BASELINE not in self.volumes:
             return
         _, noise = self.stray.level(self.volumes[BASELINE])
@@ -209,7 +209,7 @@ class VolumeLooks:
                 self.metrics[name]["air"] = self.stray.level(volume)[0] / noise
 
     def look_for_lost_mass(self) -> bool:
-        """Compare weak matter with that of FBP; whether some was lost."""
+        """Compare weakly absorbing matter with that in FBP; returns whether some was lost."""
         lost = False
         if BASELINE not in self.volumes or len(self.volumes) == 1:
             return lost
@@ -223,7 +223,7 @@ class VolumeLooks:
         return lost
 
     def decide_whether_fbp_is_kept(self, in_parts: bool) -> None:
-        """Whether the volume is in doubt, so that FBP is kept beside it where that is possible."""
+        """Decide whether the volume is in doubt, so that FBP is stored beside it if possible."""
         doubtful = self.look_for_lost_mass() or bool(self.hiding)
         if not doubtful or len(self.volumes) == 1:
             return

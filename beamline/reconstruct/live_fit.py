@@ -54,7 +54,8 @@ _SHADED = "Something stands in the beam of all views, though not of the flats: a
 
 
 class ScanFollower:
-    """A scan's file and the volume that grows with it. The caller decides when to look, to fit and to finish."""
+    """Follows the file of a running scan and updates the volume. The caller decides when to read, to fit and to
+    finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self.source = source
@@ -76,26 +77,26 @@ class ScanFollower:
 
     @property
     def axis_col(self) -> float | None:
-        """The rotation axis in pixels of the file; None while it is unknown."""
+        """The rotation axis in pixels of the file; None while unknown."""
         return self._axis.col
 
     @property
     def n_views_taken(self) -> int:
-        """Views that have fed the fit."""
+        """Number of views that the fit has used."""
         return self._cursor.n_corrected + (self._cursor.newest is not None)
 
     @property
     def waiting(self) -> int:
-        """Views in the file that no step of the fit has learnt yet."""
+        """Number of views in the file that the fit has not used yet."""
         return self._uncorrected + (0 if self._fit is None else self._fit.n_unlearnt)
 
     @property
     def has_volume(self) -> bool:
-        """Whether there is a model, with enough views for a volume after a stop."""
+        """Whether there is a model with enough views for a volume, should the fit stop now."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
 
     def take_new_frames(self, ended: bool) -> bool:
-        """Look at the file; feed the fit with at most one batch of new views. True if the file has grown."""
+        """Read the file and feed the fit with at most one batch of new views. Returns whether the file has grown."""
         assert self.state is not FollowState.ENDED
         n = self.source.refresh()
         grown = n > self._cursor.frames
@@ -199,10 +200,12 @@ class ScanFollower:
             self._fit.add_views(newest.data, self._angles(newest.view_ids))
 
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
-        """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
+        """Read the remaining frames of a scan that has ended; after a stop, only those that a volume needs."""
         while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
-                self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.views.n} views.")
+                self._warn(
+                    f"Stopped: the volume is reconstructed from the first {self.n_views_taken} of {self.views.n} views."
+                )
                 return
             self.take_new_frames(ended=True)
 
@@ -222,7 +225,7 @@ class ScanFollower:
         return fit
 
     def correct_again(self, usable: UsableViews, why: str) -> None:
-        """Line integrals by all references and air columns, in place of those that the model has learnt from.
+        """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
 
         Does nothing if the views are of one part, references and air columns are unchanged, and nothing stands in the
         beam of all views. `why` is reported, unless views are unlearned.
@@ -250,7 +253,7 @@ class ScanFollower:
         self._fit.replace_views(again.data, kept if gone else None)
 
     def advance(self, seconds: float) -> bool:
-        """Fit for a while; False if there is nothing to fit yet."""
+        """Fit for a while; returns False if there is nothing to fit yet."""
         if self._fit is None:
             return False
         progress = self._fit.advance(seconds)
@@ -279,7 +282,7 @@ class ScanFollower:
         self._sink(StateEntered("behind", message, time=self._clock.now()))
 
     def ask_whether_enough(self) -> None:
-        """With a goal, report the gain by further views, and once that the views so far are enough."""
+        """If a goal is set, report the gain of further views, and once that the views so far suffice."""
         if self._enough is None or self._cursor.n_corrected < self._enough.next_look:
             return
         taken = [batch.view_ids for batch in self._cursor.batches]
@@ -288,7 +291,7 @@ class ScanFollower:
             self._enough = None
 
     def draw_slices(self, pause: float | None = None) -> None:
-        """Draw slices of the views so far, if there are new ones, and `pause` s have passed (None: at once).
+        """Draw slices of the views so far, if there are new ones and `pause` s have passed (None: now).
 
         Before the axis is known they are about the middle of the detector.
         """
@@ -299,12 +302,12 @@ class ScanFollower:
             self._slices.draw((*self._cursor.batches, *newest), self.axis_col, pause)
 
     def write_snapshot(self) -> None:
-        """Write the present volume and its picture, in place of the last ones."""
+        """Write the current volume and its picture, replacing the last ones."""
         assert self._fit is not None
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def prepared(self) -> PreparedProjections:
-        """All views, corrected for good, as the fit has learnt them. No other is taken after it.
+        """All views, with their final correction, as the model was fitted to them. No view is added afterwards.
 
         Raises:
             DataError: a scan without two views that can be used.
@@ -316,14 +319,14 @@ class ScanFollower:
         steps = in_order(self._options.selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
-                f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
+                f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
         self.correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
         return self._prepared(self.axis_col, usable)
 
     def last_round(self, seconds: float, snapshot_every: float) -> LastRound:
-        """The end of the fit, to be run on the prepared views: a round over all of them and sweeps, with snapshots."""
+        """The end of the fit, to be run on the prepared views: one pass over all of them and sweeps, with snapshots."""
         assert self._fit is not None
         last = self._clock.now()
 

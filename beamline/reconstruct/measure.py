@@ -30,8 +30,8 @@ _VOLUME_PATHS = ("entry/data/data", "volume", "data")
 
 
 def read_truth(spec: str) -> NDArray[np.float32]:
-    """The volume [z, y, x] that `spec` names: FILE or FILE:first:end (slices), where FILE is any volume file
-    (.npz, .npy, HDF5, TIFF, NIfTI, Zarr).
+    """Read the reference volume [z, y, x] named by `spec`: FILE or FILE:first:end (slices), where FILE is any volume
+    file (.npz, .npy, HDF5, TIFF, NIfTI, Zarr).
 
     Raises:
         ConfigError: no such file, or slices outside it.
@@ -39,12 +39,12 @@ def read_truth(spec: str) -> NDArray[np.float32]:
     """
     match = re.fullmatch(r"(?P<path>.+?)(:(?P<first>\d*):(?P<end>\d*))?", spec)
     if match is None or not Path(match["path"]).exists():
-        raise ConfigError(f"--truth {spec}: there is no such file. Expected FILE or FILE:first:end.")
+        raise ConfigError(f"--truth {spec}: the file does not exist. Expected FILE or FILE:first:end.")
     path = Path(match["path"])
     try:
         data, _ = whole_volume(path, _volume_in(path))
     except DataError as error:
-        raise DataError(f"--truth {path} holds no volume that can be read: {error}") from error
+        raise DataError(f"--truth {path} contains no readable volume: {error}") from error
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
     if not 0 <= first < end <= data.shape[0]:
         raise ConfigError(f"--truth {spec}: slices {first}:{end} do not lie in 0:{data.shape[0]}.")
@@ -63,7 +63,7 @@ def _volume_in(path: Path) -> str | None:
 
 
 def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
-    """The truth on the volume's `grid`; a truth that is `binning` times finer is averaged.
+    """The reference volume on `grid`; a reference that is `binning` times finer is averaged.
 
     Raises:
         ConfigError: the shapes do not fit.
@@ -85,7 +85,8 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a reference, less their rims, to judge volumes of the same sample; None without them.
+    """Dense and empty regions of a reference, without their rims, to assess volumes of the same sample; None if there
+    are none.
 
     They are those of `metrics.sampled` of the volume.
     """
@@ -93,7 +94,7 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
 
 
 def contrast_by(mask: NDArray[np.int8] | None, volume: Volume) -> dict[str, float]:
-    """SNR and CNR of a volume by `regions`; empty without them."""
+    """SNR and CNR of a volume in `regions`; empty without regions."""
     if mask is None:
         return {}
     snr, cnr = metrics.snr_cnr(metrics.sampled(volume.data), mask)
@@ -101,7 +102,7 @@ def contrast_by(mask: NDArray[np.int8] | None, volume: Volume) -> dict[str, floa
 
 
 def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.float32], Geometry] | None) -> float:
-    """Approximate share of all rays in the residual of `measure`."""
+    """Approximate share of all rays used for the residual in `measure`."""
     views = min(geometry.n_views, _RESIDUAL_VIEWS) + (0 if held_out is None else held_out[1].n_views)
     rows, cols = geometry.detector_shape
     in_bands = geometry.rows_show_slices and grid == Grid.matching(geometry)
@@ -144,7 +145,7 @@ def measure(
 
 
 def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
-    """The residual of a cylinder of one density that fills the slices, as of `measure`: the density that leaves least.
+    """The residual, as in `measure`, of a uniform cylinder that fills the slices, with the density of least residual.
 
     A volume that leaves more shows nothing of the sample yet.
     """
@@ -165,7 +166,7 @@ def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
 
 
 def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
-    """Figures of merit of a volume file: against a truth, and by regions that somebody has drawn.
+    """Figures of merit of a volume file: against a reference volume, and in regions drawn by the user.
 
     Args:
         truth: as of `read_truth`.
@@ -186,11 +187,11 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
         if masks is not None:
             labels, _ = whole_volume(masks)
             if not np.isin(labels, (0, 1, 2)).all():
-                raise ValueError(f"{masks} holds other labels than 0 (not used), 1 (dense) and 2 (empty)")
+                raise ValueError(f"{masks} has other labels than 0 (not used), 1 (dense) and 2 (empty)")
             regions = np.array([-1, 1, 0], np.int8)[labels.astype(np.intp)]
             values["snr"], values["cnr"] = metrics.snr_cnr(volume, regions)
     except ValueError as error:
-        raise DataError(f"{path} cannot be measured so: {error}.") from error
+        raise DataError(f"{path} cannot be measured: {error}.") from error
     return {name: float(value) for name, value in values.items()}
 
 
@@ -200,7 +201,7 @@ def squares_left(
     resolution: ViewResolution,
     measured: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[view] squares of A x - G p, with the views at the resolution of voxels, and of p, over the rays measured.
+    """[view] sums of squares of A x - G p, at voxel resolution, and of p, over the measured rays.
 
     The data residual is the root of the sum of the first over that of the second, for every command that states one.
 
@@ -247,12 +248,12 @@ def _residual(
         squared, total = squared + left.sum(), total + own.sum()
         progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
-        raise ValueError("projections are all zero, so there is nothing to explain")
+        raise ValueError("all projections are zero, so no residual can be computed")
     return float(np.sqrt(squared / total))
 
 
 def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) -> list[slice]:
-    """Bands of rows that represent all: all rows, unless the detector is large; one band if rows are not slices.
+    """Bands of rows that represent the detector: all rows, unless it is large; one band if rows are not slices.
 
     Args:
         matter: that the rows show [row]; bands lie at equal shares of it.

@@ -39,7 +39,7 @@ _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are n
 
 @dataclass(frozen=True)
 class ReconMemory:
-    """Bytes that a reconstruction needs.
+    """Memory of a reconstruction in bytes.
 
     Attributes:
         geometry: of the views, binned, of all scans.
@@ -67,12 +67,12 @@ class ReconMemory:
 
     @property
     def volume(self) -> int:
-        """Of the result, which may be several volumes."""
+        """Memory of the result, which may be several volumes."""
         return 4 * volumes_of(self.method) * math.prod(Grid.matching(self.geometry).shape)
 
     @property
     def at_once(self) -> int:
-        """With everything in memory."""
+        """Memory with everything in memory at once."""
         work = self._work(self.method, self.geometry, self._grid(self.rows))
         return self.raw + self.line_integrals + max(work, self.steps.correcting, self._alone)
 
@@ -83,11 +83,11 @@ class ReconMemory:
 
     @property
     def view(self) -> int:
-        """While one view is corrected."""
+        """Memory while one view is corrected."""
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """A slab of so many slices of its own, with its views and weights; figures of the volume need less."""
+        """Memory of a slab with so many slices of its own, with its views and weights; figures of merit need less."""
         halo = self.method.traits.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
@@ -104,7 +104,7 @@ class ReconMemory:
 
     @property
     def figures(self) -> int:
-        """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
+        """Memory of the figures of merit for a volume on disk, without that of the program; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
         looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
         most = max(odd, _REGION * min(math.prod(Grid.matching(self.geometry).shape), _REGIONS), *looks)
@@ -112,12 +112,12 @@ class ReconMemory:
 
     @property
     def least(self) -> int:
-        """The least memory that suffices."""
+        """The smallest memory that suffices."""
         return max(self.parts.values())
 
     @property
     def parts(self) -> dict[str, int]:
-        """Bytes of each part that must fit alone, by what an error calls it."""
+        """Bytes of each part that must fit alone, by its name in an error."""
         views = f"{self.geometry.n_views} views of {self.geometry.detector_shape[1]} columns"
         return {
             f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
@@ -127,7 +127,7 @@ class ReconMemory:
         }
 
     def height(self, memory: int) -> int:
-        """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
+        """Slices of the largest slabs of equal height that fit the memory, which must be at least `least`."""
         for parts in range(1, self.rows // _ROWS + 2):
             height = math.ceil(self.rows / parts / _ROWS) * _ROWS
             if self.slab(height) <= memory:
@@ -139,12 +139,14 @@ class ReconMemory:
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
-    """The method for so many slices `of` a volume; slabs, with the slices that they share, have so many `in_all`."""
+    """The method for so many slices `of` a volume; `in_all` is the number of slices of all slabs, overlaps counted
+    twice.
+    """
     return method.for_part(slices / of, slices / in_all) if isinstance(method, DividedMethod) else method
 
 
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
-    """The needs of a reconstruction of the chosen views of all scans, before any frame is read.
+    """Memory for reconstructing the chosen views of all scans, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -169,7 +171,7 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
 
 
 def memory_of(options: ReconOptions) -> int:
-    """Bytes that this process may use, and each worker on this machine or job of Slurm."""
+    """Memory in bytes allowed for this process, and for each worker on this machine or Slurm job."""
     if options.memory is not None:
         return options.memory
     free = free_memory()
@@ -177,7 +179,7 @@ def memory_of(options: ReconOptions) -> int:
 
 
 def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raises DataError, before these views are corrected, where they are too few for several volumes."""
+    """Raise DataError, before these views are corrected, if they are too few for several volumes."""
     method = options.method
     if not method.traits.several or not isinstance(method, CostedMethod):
         return
@@ -190,7 +192,7 @@ def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geomet
 
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
-    """Raises ConfigError for a method and for options that need everything in memory."""
+    """Raise ConfigError for methods and options that need everything in memory."""
     refuse_few_views(source, options, needs.geometry)
     if (traits := options.method.traits).several:
         fewer = int(needs.rows * memory / needs.at_once)
@@ -218,7 +220,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
 
 
 def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning: int) -> None:
-    """Raises DataError if the smallest slab does not fit, with a remedy."""
+    """Raise DataError, with a remedy, if the smallest slab does not fit."""
     if needs.least <= memory:
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
@@ -230,12 +232,13 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
 
 
 def cluster() -> Any:
-    """The module of the feature: `check_cluster`, `refuse_unusable`, `memory_of_each` and `connected` take its spec.
+    """The module of the cluster feature: `check_cluster`, `refuse_unusable`, `memory_of_each` and `connected` take its
+    spec.
 
     Raises:
         ConfigError: this installation has none.
     """
     modules = in_folders("beamline.features", "WORKERS")
     if "cluster" not in modules:
-        raise ConfigError("--cluster: this installation has no workers. Leave it out. Nothing was started.")
+        raise ConfigError("--cluster: the cluster feature is not installed. Leave it out. Nothing was started.")
     return import_module(modules["cluster"])

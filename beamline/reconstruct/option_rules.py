@@ -15,7 +15,7 @@ from recon.base.choices import AUTO
 
 @dataclass(frozen=True)
 class OptionRule:
-    """Which methods or value an option belongs to, and what it excludes or needs.
+    """The methods or the value that an option belongs to, and what it excludes or requires.
 
     Attributes:
         setting: of the methods with this setting, by its path in Python, such as `fit.loss`.
@@ -35,7 +35,7 @@ class OptionRule:
 
     @property
     def of_methods(self) -> bool:
-        """Only some methods take it."""
+        """Whether only some methods have the option."""
         return bool(self.setting or self.trait)
 
 
@@ -112,7 +112,7 @@ RULES: Mapping[str, OptionRule] = {
 
 
 def takers(rule: OptionRule) -> tuple[str, ...]:
-    """Names of the methods that take an option of methods."""
+    """Names of the methods that have an option."""
     from recon.methods import taking, with_trait  # here: not every command needs methods
 
     if rule.setting:
@@ -136,7 +136,7 @@ def contradiction(
     *,
     one_method: bool = False,
 ) -> str:
-    """Why options do not go together, or one lacks another that it needs; "" where they do.
+    """Why options contradict each other, or which required option is missing; "" if they agree.
 
     Args:
         rules: of all options, by name.
@@ -159,7 +159,7 @@ def contradiction(
 def of_other_methods(
     rules: Mapping[str, OptionRule], given: Collection[str], method: str, *, stated: bool = True
 ) -> str:
-    """Which option given is of other methods than this one; "" where none is.
+    """Which given option belongs to other methods than this one; "" if none does.
 
     Args:
         stated: somebody chose the method; else it is the default.

@@ -44,29 +44,29 @@ from recon.voxels.fbp import Filter
 
 @runtime_checkable
 class SeveralScans(Protocol):
-    """A source of views, where `SourceOptions` is one of a single scan."""
+    """A source of several scans, where `SourceOptions` is that of a single scan."""
 
     @property
     def scans(self) -> tuple[SourceOptions, ...]:
-        """The facts of the first one are in the report."""
+        """The scans; the report shows the facts of the first."""
 
     @property
     def path(self) -> Path | str:
         """Path of the first scan."""
 
     def open(self, *, follow: bool = False) -> ScanSource:
-        """The first scan."""
+        """Open the first scan."""
 
     def refuse(self, method: Method, given: Collection[str]) -> None:
-        """Raises ConfigError where the scans do not go with the method or the options of these names; opens none."""
+        """Raise ConfigError if the scans do not fit the method or these options; opens no file."""
 
     def require_alike(self, selection: Selection) -> None:
-        """Raises ConfigError where the scans state what does not go together; reads no frame."""
+        """Raise ConfigError if the metadata of the scans disagree; reads no frame."""
 
     def prepare(
         self, selection: Selection, warn: Warn, check: Callable[[Geometry], object], phases: Phases | None
     ) -> PreparedProjections:
-        """As `prepare_projections`, of all scans; `check` gets the geometry of each.
+        """`prepare_projections` of all scans; `check` gets the geometry of each.
 
         Raises:
             ConfigError: scans that do not go together. DataError: a scan cannot be read.
@@ -74,12 +74,12 @@ class SeveralScans(Protocol):
 
 
 def scans_of(source: SourceOptions | SeveralScans) -> tuple[SourceOptions, ...]:
-    """The scans, or the one that there is."""
+    """All scans of the source, or its single one."""
     return source.scans if isinstance(source, SeveralScans) else (source,)
 
 
 def views_of_others(source: SourceOptions | SeveralScans, selection: Selection) -> int:
-    """Views of the scans after the first one, before any frame is read; 0 where there is one scan."""
+    """Number of views in the scans after the first, before any frame is read; 0 for a single scan."""
     views = 0
     for each in scans_of(source)[1:]:
         with each.open() as scan:
@@ -88,7 +88,7 @@ def views_of_others(source: SourceOptions | SeveralScans, selection: Selection) 
 
 
 def with_as_many_views(geometry: Geometry, views: int) -> Geometry:
-    """So many views like these."""
+    """The same geometry with so many views."""
     return geometry if views == geometry.n_views else geometry.select(np.resize(np.arange(geometry.n_views), views))
 
 
@@ -96,14 +96,14 @@ _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 
 
 def report_beside(output: Path) -> Path:
-    """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
+    """The report of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
     return output.with_name(REPORT) if output.stem == "recon" else output.with_suffix(".html")
 
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. Where the
-    file `output` is not to be `written`, its folder is only worked in.
+    """Paths of the results. `report` is None if none is wanted; `replace` overwrites older results. If `written` is
+    False, the folder of `output` serves as scratch only.
     `names`: of volumes that get a file each, OUTPUT's stem + _NAME; empty: there is one file, `output` itself."""
 
     output: Path
@@ -114,13 +114,13 @@ class OutputPaths:
 
     @property
     def outputs(self) -> tuple[Path, ...]:
-        """The files of volumes, in their order."""
+        """The files of volumes, in order."""
         stem, suffix = self.output.stem, self.output.suffix
         return tuple(self.output.with_name(f"{stem}_{name}{suffix}") for name in self.names) or (self.output,)
 
     @property
     def partial(self) -> Path:
-        """The file of a volume in slabs, while it is made."""
+        """The file of a volume made in slabs, until it is finished."""
         return self.output.with_name(f"{self.output.stem}.partial.h5")
 
     @property
@@ -129,15 +129,15 @@ class OutputPaths:
         return self.output.with_name(f"{self.output.stem}.live.png")
 
     def refuse_partial(self) -> None:
-        """Raise DataError if there are slabs of an earlier call."""
+        """Raise DataError if slabs of an earlier call exist."""
         if os.path.lexists(self.partial):
             raise DataError(
-                f"{self.partial} exists: it keeps the slabs of a call that was stopped. Go on from it with --resume "
+                f"{self.partial} exists: it has the slabs of an interrupted call. Continue it with --resume "
                 f"{self.partial}, or move it away. Nothing was touched."
             )
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work if a result exists, or its folder cannot be written to."""
+        """Raise DataError before any work if a result exists, or its folder is not writable."""
         if not self.replace:
             for path in (*self.outputs, self.report):
                 if path is not None:
@@ -152,13 +152,14 @@ class OutputPaths:
             ) from error
 
     def takes_a_second(self, grid: Grid) -> bool:
-        """The output is a file of ours, and its disk has room for a second volume of this size."""
+        """Whether the output is a file of this program, and its disk has room for a second volume of this size."""
         room = shutil.disk_usage(self.output.parent).free > _ROOM * 4 * math.prod(grid.shape)
         return self.written and room and self.output.suffix.lower() in RECON_SUFFIXES
 
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
-        """Raise DataError before the work if the disk has no room for a volume of so many bytes and temporary files of
-        `meanwhile` bytes."""
+        """Raise DataError before any work if the disk has no room for a volume of so many bytes and `meanwhile` bytes
+        of temporary files.
+        """
         free = shutil.disk_usage(self.output.parent).free
         if n_bytes + meanwhile > free:
             work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
@@ -170,7 +171,7 @@ class OutputPaths:
 
 @dataclass(frozen=True)
 class FollowTiming:
-    """How a scan is followed; all in s.
+    """Intervals for following a scan, in s.
 
     Attributes:
         poll: between looks at the file while there is nothing to fit.
@@ -189,7 +190,7 @@ class FollowTiming:
 
 @dataclass(frozen=True)
 class ReconOptions:
-    """The options of a reconstruction; those of `beamline recon` say more in its help.
+    """The options of a reconstruction; the help of `beamline recon` explains them further.
 
     Attributes:
         method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
@@ -236,7 +237,7 @@ class ReconOptions:
 
     @property
     def given(self) -> frozenset[str]:
-        """Names of the options, as `option_rules` has them, whose values differ from their defaults."""
+        """Names of the options, as in `option_rules`, whose values differ from their defaults."""
         usual = {each.name: each.default for each in fields(self)}
         run = {name for name, rule in RULES.items() if _at(self, rule.value) not in (None, usual.get(rule.value))}
         unset = type(self.method)()
@@ -249,19 +250,19 @@ class ReconOptions:
         return frozenset(run | of_method | ({"time"} if self.method.traits.in_time else set()))
 
     def refuse_contradictions(self) -> None:
-        """Raises ConfigError for values that do not go together, or that the method would silently ignore."""
+        """Raise ConfigError for values that contradict each other, or that the method would silently ignore."""
         given = self.given
         if why := contradiction(RULES, given, one_method=True) or of_other_methods(RULES, given, self.method.name):
             raise ConfigError(why)
 
     @property
     def becomes_output(self) -> bool:
-        """Whether a volume made in slabs becomes the output without a copy."""
+        """Whether a volume made in slabs is renamed to the output without a copy."""
         alone = self.region is None and not self.uncertainty
         return alone and self.target.written and can_become(self.target.output)
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
-        """Bytes on the disk for the result, and for temporary files, of a volume of so many bytes."""
+        """Bytes on disk for the result, and for temporary files, of a volume of so many bytes."""
         if not in_slabs:
             return volume * self.target.written * (1 + self.uncertainty), 0
         compared = self.target.report is not None and not self.method.traits.direct
@@ -274,8 +275,8 @@ class ReconOptions:
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:
-        """The same with the rows that show the region, which is found where it is the one around the sample; the same
-        options where all of the volume is wanted.
+        """The same options with the rows that show the region, which is found first if it is the one around the sample;
+        unchanged if the whole volume is wanted.
 
         Raises:
             ConfigError, DataError: see `region.selection_around` and `sample_box.box_around_sample`.
@@ -292,7 +293,7 @@ class ReconOptions:
 
     @property
     def partial_path(self) -> Path:
-        """Where slabs are kept while others are made."""
+        """Where finished slabs are stored while others are made."""
         return self.target.partial if self.partial is None else self.partial
 
     def method_for(self, geometry: Geometry) -> Method:
@@ -303,12 +304,12 @@ class ReconOptions:
 
     @property
     def stops_early(self) -> bool:
-        """Whether the method ends early by views held out."""
+        """Whether held-out views may end the method early."""
         return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
 
     @property
     def streaming(self) -> FitMethod:
-        """The method for a followed scan.
+        """The method for a scan that is followed while it runs.
 
         Raises:
             ConfigError: it needs the whole scan.

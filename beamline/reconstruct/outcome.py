@@ -94,12 +94,12 @@ class ReportContext:
 
 
 def label_of(method: str) -> str:
-    """A method's name for people."""
+    """The name of a method for people."""
     return by_name(method).label
 
 
 def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
-    """Facts of an open scan; `flags` count in place of the file's."""
+    """Facts of an open scan; `flags` replace those of the file."""
     counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
@@ -150,7 +150,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
 
 
 def as_text(value: object) -> str:
-    """A value as text for people; the file holds the exact value."""
+    """A value as text for people; the file has the exact value."""
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
@@ -160,7 +160,7 @@ _NAMED = 5  # odd views, at most
 
 
 def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
-    """Slices that views at heights of their own see over less of the half turn than others."""
+    """Slices that are seen over less of the half turn than others, because views have different heights."""
     if geometry.is_cone or not geometry.is_straight or not geometry.shifts[:, 1].any():
         return np.zeros(0, np.intp)
     heights = Grid.matching(geometry).coordinates()[0]
@@ -168,7 +168,7 @@ def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
 
 
 def partly_seen_warning(geometry: Geometry) -> str:
-    """The warning that few views see some slices; empty if all are seen alike."""
+    """The warning that some slices are seen by few views; empty if all are seen equally."""
     some = partly_seen(geometry)
     if not some.size:
         return ""
@@ -179,7 +179,7 @@ def partly_seen_warning(geometry: Geometry) -> str:
 
 
 def lost_mass_warning(made: Reconstruction, beside_fbp: LostMatter) -> str:
-    """The warning that a volume has lost weak matter that FBP shows; empty if it has not."""
+    """The warning that a volume has lost weakly absorbing matter that FBP shows; empty if it has not."""
     if beside_fbp.lost is None:
         return ""
     z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
@@ -211,7 +211,8 @@ _COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
 
 
 def hiding_warning(made: Reconstruction, structure: Unexplained) -> str:
-    """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
+    """The warning that the residual of a volume has structure; empty if it has none, or if the volume was not
+    fitted."""
     if structure.share <= UNEXPLAINED_LIMIT or by_name(made.method).traits.direct:
         return ""
     others = " and ".join(name for name in _COMPARED if name != made.method)
@@ -235,7 +236,7 @@ def _crossing_sentence(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.
 
 
 def stray_mass_warning(made: Reconstruction, stray: StrayMass) -> str:
-    """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
+    """The warning that a volume has mass where views show none; empty if it has little, and for direct methods."""
     if stray.share <= STRAY_LIMIT or by_name(made.method).traits.direct:
         return ""
     return (
@@ -245,7 +246,7 @@ def stray_mass_warning(made: Reconstruction, stray: StrayMass) -> str:
 
 
 def needles_warning(made: Reconstruction, geometry: Geometry) -> str:
-    """The warning that a model is made of needles; empty if it is not, or if there is no model."""
+    """The warning that the Gaussians of a model are needle-shaped; empty if they are not, or if there is no model."""
     if made.gaussians is None or not made.gaussians.n:
         return ""
     found = needles(made.gaussians, geometry)
@@ -263,7 +264,8 @@ def odd_views_warning(
     selection: Selection,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> str:
-    """The warning that parts of views are not in the volume; empty without such parts, and for direct methods.
+    """The warning that the volume does not explain parts of some views; empty without such parts, and for direct
+    methods.
 
     So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
     `progress` hears how many of how many views were compared.

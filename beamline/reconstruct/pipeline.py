@@ -50,7 +50,7 @@ _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 @contextmanager
 def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan that runs, or one that has ended, when its last view is there: its fit has learnt all views.
+    """The job of a scan that is followed while it runs, after its last view: its model has been fitted to all views.
 
     Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`; where the block fails
     the newest ones stay, else the picture.
@@ -72,7 +72,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 follower.draw_slices()
             else:
                 n = follower.n_views_taken
-                channels.warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
+                channels.warn(f"Stopped while the scan was running: the volume shows the first {count(n, 'view')}.")
             prepared = follower.prepared()
 
         def facts() -> ScanFacts:
@@ -138,7 +138,7 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
             return True
         if should_stop() and not follower.source.finished:
             if not follower.has_volume:
-                raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
+                raise KeyboardInterrupt("stopped before there were enough views for a volume; nothing was written")
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
@@ -156,7 +156,7 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
 
 @contextmanager
 def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan whose views are all there, with compiled kernels; slabs stay where the block fails.
+    """The job of a scan whose views are all recorded, with compiled kernels; slabs are kept if the block fails.
 
     Raises:
         ConfigError, DataError: the views, the memory or the disk do not suffice.
@@ -209,7 +209,7 @@ def _for_method(
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
-            "The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs."
+            "The volume fits into memory and is reconstructed without --cluster; a smaller --memory would make slabs."
         )
     if options.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
@@ -236,7 +236,7 @@ def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Ch
 def reconstruct_file(
     options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped
 ) -> ReconRecord:
-    """Reconstruct a scan that has ended, or while it runs. Returns the record of the volume, as the event `done` does.
+    """Reconstruct a finished or a running scan. Returns the record of the volume, as in the event `done`.
 
     A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`. One by a direct
     method is interrupted like all else, with nothing written; one in slabs keeps those that are finished.

@@ -75,12 +75,12 @@ class ReconPlan(Need):
 
     @property
     def line_integrals(self) -> int:
-        """Bytes of the views on disk."""
+        """Bytes of the line integrals on disk."""
         return self.needs.line_integrals if self.slabs else 0
 
 
 def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> ReconPlan:
-    """The plan before a frame is read.
+    """The plan before any frame is read.
 
     Args:
         needs: as `recon_memory_of` says.
@@ -110,7 +110,7 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
 
 
 def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepared: PreparedProjections) -> ReconPlan:
-    """The plan for the views as they were read.
+    """The plan for the views after reading.
 
     Args:
         plan: before they were.
@@ -134,7 +134,7 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
 
 
 def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
-    """Raise DataError and ConfigError for the geometry of all views, once the axis is known."""
+    """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.traits.several:
@@ -201,7 +201,7 @@ def _plan(
 def prepare_within(
     source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
-    """As `prepare_projections`, and the plan: of a volume in slabs line integrals lie on disk."""
+    """`prepare_projections`, and the plan: for a volume made in slabs, line integrals are stored on disk."""
     selection = options.selection
     try:
         needs = recon_memory_of(source, options)
@@ -233,12 +233,12 @@ def prepare_within(
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
-    """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
+    """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
     seconds = source.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
-    warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
+    warn(f"The file has no times of the views. They are assumed evenly spaced, {period} s apart, in the file's order.")
     return np.asarray(view_ids * float(period), np.float64)
 
 
@@ -283,7 +283,7 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(
-            "--follow takes views as they come, and fits for --seconds after the end: leave out --views, but for "
+            "--follow uses views as they are recorded, and fits for --seconds after the end: leave out --views, except "
             "every:K, and --steps."
         )
     try:
@@ -297,8 +297,8 @@ def _require_finished(source: ScanSource, options: ReconOptions) -> None:
     if source.finished or options.unfinished:
         return
     raise DataError(
-        f"{source.path} is not finished. {next_step(source.path)} --unfinished takes the {source.image_key.size} "
-        "frames that are there as they are. Nothing was written."
+        f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
+        "frames recorded so far. Nothing was written."
     )
 
 
@@ -313,4 +313,6 @@ def _check_device(device: str) -> None:
 def _require_hdf5(target: OutputPaths) -> None:
     """Raises ConfigError for a file that holds one volume."""
     if target.written and target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"-o {target.output}: several volumes go into HDF5 files; give a name that ends in .h5.")
+        raise ConfigError(
+            f"-o {target.output}: several volumes can only be written to HDF5; give a name that ends in .h5."
+        )

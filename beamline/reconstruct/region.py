@@ -27,7 +27,7 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Region:
-    """Voxels first:end along z, y and x of the whole volume by the same options.
+    """A box of voxels, first:end along z, y and x, of the whole volume with the same options.
 
     Attributes:
         requested: somebody asked for this box, which is refused where it lies beyond the volume; else it was found, and
@@ -43,7 +43,7 @@ class Region:
 
     @classmethod
     def parse(cls, text: str) -> Region:
-        """Of `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
+        """Parse `z0:z1,y0:y1,x0:x1`. Raises ValueError for any other text."""
         spans = [(int(first), int(end)) for first, end in re.findall(r"(?:^|,)(\d+):(\d+)(?=,|$)", text)]
         if len(spans) != 3 or text.count(",") != 2 or any(first >= end for first, end in spans):
             raise ValueError(
@@ -58,12 +58,12 @@ class Region:
 
 @dataclass(frozen=True)
 class AroundSample:
-    """Stands for the box around the sample, which `sample_box.box_around_sample` finds where the scan is read."""
+    """A placeholder for the box around the sample, which `sample_box.box_around_sample` finds when the scan is read."""
 
 
 @dataclass(frozen=True)
 class RegionOfRows:
-    """A region in the volume of the rows that are read for it.
+    """A region, relative to the volume of the rows that are read for it.
 
     Attributes:
         region: in the whole volume.
@@ -76,11 +76,11 @@ class RegionOfRows:
     z_offset: float
 
     def grid_of(self, grid: Grid) -> Grid:
-        """The region's box in the frame of these rows, whose volume has this grid."""
+        """The region's box on the grid of the volume of these rows."""
         return grid.part(*self.slices)
 
     def cut(self, volume: Volume) -> Volume:
-        """The region alone, in the frame of all rows, of the volume of these rows or of its own box."""
+        """Crop the region from a volume of these rows, or of its own box, in the frame of all rows."""
         grid, data = volume.grid, volume.data
         if grid.shape != tuple(part.stop - part.start for part in self.slices):
             grid, data = self.grid_of(grid), data[self.slices]
@@ -89,7 +89,8 @@ class RegionOfRows:
 
 
 def selection_around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
-    """The rows of the selection that show the region, and so many slices beside it; the axis is that of all rows.
+    """The selection with only the rows that show the region and a margin of so many slices; the axis is that of all
+    rows.
 
     Raises:
         ConfigError: a cone, or a region beyond the rows or the widest volume; options that may lean views or move them
@@ -110,7 +111,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
     slices = (rows.stop - rows.start) // side
     if end > slices:
-        raise ConfigError(f"--roi {region}: slices {first}:{end} do not lie in the volume's 0:{slices}.")
+        raise ConfigError(f"--roi {region}: slices {first}:{end} are out of range: the volume has slices 0:{slices}.")
     if region.requested:
         _refuse_beyond(region, _widest(source, selection), "the widest volume's")
     low, high = max(first - halo, 0), min(end + halo, slices)
@@ -119,7 +120,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
 
 
 def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
-    """Where the region lies in the volume of `geometry`, made from the selection of `selection_around`.
+    """The position of the region in the volume of `geometry`, made from the selection of `selection_around`.
 
     Raises:
         ConfigError: it lies outside.
@@ -173,7 +174,8 @@ _MARGIN, _COARSE = 0.04, 2  # of the volume's side; coarse voxels
 
 
 def box_around_sample(source: ScanSource, selection: Selection) -> Region:
-    """The box around all that absorbs, in voxels of the volume by this selection, with the sentence that says it.
+    """The box around everything that absorbs, in voxels of the volume of this selection, and a sentence that reports
+    it.
 
     A voxel may be of the sample where it lies in the shadow, from the first to the last pixel with matter, of nine
     tenths of the views (the visual hull of Laurentini 1994, of the convex shadows). Views are 72, binned. Where the
@@ -205,7 +207,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     there = np.flatnonzero(matter.any(axis=2).mean(axis=0) >= _SEEN)
     if not there.size:
         raise DataError(
-            f"{source.path}: --roi auto finds no matter that rises from the noise in {len(data)} views. Give the box, "
+            f"{source.path}: --roi auto finds no matter above the noise in {len(data)} views. Give the box, "
             "or leave it out. Nothing was written."
         )
     hull = _hull(matter[:, there], geometry, grid, coarse)

@@ -37,7 +37,9 @@ from recon.splatting.gaussians import Gaussians
 
 
 def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
-    """The arrays of a model for a file, by name: physical values, so that no other program needs our parameters."""
+    """The arrays of a model for a file, by name: physical values, so that other programs need not know the
+    parametrisation.
+    """
     return {
         "kernel": gaussians.kernel.value,
         "density_unit": gaussians.density_unit,
@@ -64,7 +66,7 @@ def write_result(
     clock: Clock,
     partial_volume: Path | None = None,
 ) -> ReconRecord:
-    """Judge the volume, write its file and the report, and send the event `done` with the record that is returned.
+    """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
     The record's voxels are read from the file where they are used; where no file is written it holds the volume.
 
@@ -295,7 +297,7 @@ def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
 
 
 def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
-    """How the axis was found, from the parameters of a reconstruction; None if it was given."""
+    """How the axis was found, from the parameters of a reconstruction; None if the user gave it."""
     if "axis_curve" not in parameters:
         return None
     return AxisEstimate(

@@ -45,7 +45,7 @@ def run_on(
     device: str = "cpu",
     reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
 ) -> Reconstruction:
-    """Run a method on these views, with those held out if it takes any, until it ends or is stopped.
+    """Run a method on these views, and the held-out views if it uses any, until it ends or is stopped.
 
     Raises:
         ValueError: the method does not take these views.
@@ -55,7 +55,7 @@ def run_on(
 
 
 def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geometry, DataUse]:
-    """Line integrals [view, row, col], geometry and use of the views as the method takes them."""
+    """Line integrals [view, row, col], geometry and use of the views in the form that the method expects."""
     data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
     if method.traits.held_out:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
@@ -112,7 +112,7 @@ def fit_within(
     clock: Clock,
     warn: Warn,
 ) -> tuple[BoundedMethod, Stop]:
-    """The fit with the seconds that its call leaves it, before measuring, report and writing; and when these begin.
+    """The fit with the seconds of its budget minus those of measuring, report and writing; and when these begin.
 
     If they are too few, `warn` is told the expected duration before the fit.
 
@@ -148,7 +148,7 @@ def fit_within(
 
 @contextmanager
 def warnings_told(warn: Warn) -> Iterator[None]:
-    """Within the context Python's warnings are passed on as sentences, without file and line."""
+    """A context in which Python's warnings are forwarded as sentences, without file and line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: warn(str(message))
@@ -159,7 +159,7 @@ Made = Mapping[str, Sequence[Any]]
 
 
 def refuse_impossible(options: ReconOptions) -> None:
-    """Raise ConfigError before any work where error bars cannot be made or written."""
+    """Raise ConfigError before any work if error bars cannot be computed or written."""
     methods = candidates_of(options.method)
     if not all(method.traits.error_bars for method in methods):
         raise ConfigError(
@@ -174,7 +174,7 @@ def refuse_impossible(options: ReconOptions) -> None:
 
 
 def refuse_views(method: Method, geometry: Geometry) -> None:
-    """Raise ConfigError before the work where these views allow no error bars."""
+    """Raise ConfigError before any work if these views do not allow error bars."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
             f"--uncertainty splits the views into two halves: at least {LEAST_VIEWS} views are needed, got "
@@ -182,13 +182,13 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
         )
     if isinstance(method, FitMethod) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty refits on voxels, and {method.name} has no finish there with --finish 0. Leave one of "
+            f"--uncertainty refits on voxels, and {method.name} with --finish 0 has no steps on voxels. Leave one of "
             "them out."
         )
 
 
 def made_by(method: Method, name: str) -> Method:
-    """The method itself, or the candidate of this name, if it chose one."""
+    """The method itself or, if it chose among candidates, the one of this name."""
     return {candidate.name: candidate for candidate in candidates_of(method)}.get(name, method)
 
 
@@ -196,7 +196,7 @@ def deviation_of(
     volume: Volume, method: Method, prepared: PreparedProjections, options: ReconOptions, decided: Made,
     control: RunControl,
 ) -> Volume | None:  # fmt: skip
-    """The standard deviation of each voxel of a volume in memory; None where `control` ended it.
+    """The standard deviation of each voxel of a volume in memory; None if `control` stopped it.
 
     Raises:
         ValueError: as `recon.error_bars.error_bars`.
@@ -217,7 +217,8 @@ def deviation_by_slabs(
     control: RunControl,
     say: Callable[[str], None],
 ) -> Volume | None:
-    """The same of a volume on disk, as an array on the disk of the output; None where `control` ended it.
+    """The standard deviation of each voxel, stored on the output's disk, of a volume on disk; None if `control` stopped
+    it.
 
     The slab with most matter comes first, and the others follow its decisions.
     """

@@ -39,7 +39,7 @@ RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruc
 
 @dataclass(frozen=True)
 class SlabWorkers:
-    """Reconstructs `count` slabs at a time, each by `run` in a thread of its own."""
+    """Reconstructs `count` slabs at a time, each by `run` in its own thread."""
 
     count: int
     run: RunMethod
@@ -55,7 +55,7 @@ def in_slabs(
     warn: Warn,
     workers: SlabWorkers | None = None,
 ) -> Reconstruction:
-    """A method's volume on disk, slab by slab; for a partial volume only the missing slabs.
+    """Reconstruct a volume on disk, slab by slab; for a partial volume only the missing slabs.
 
     The slab with most matter comes first; the others follow its decisions, so that slabs fit together.
     From slab to slab the volume fades. Each slab depends on the data and the first slab alone: a volume that was
@@ -152,7 +152,7 @@ class _SlabJob:
             partial = create_partial(path, record, self.slabs, made_from, kept)
             partial.add(n, slab.volume.data)
             return partial, list(numbers[at + 1 :])
-        raise DataError("The views are zero everywhere: there is nothing in the beam.")
+        raise DataError("The views are zero everywhere: there is no sample in the beam.")
 
     def made(
         self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool
@@ -206,7 +206,7 @@ def _add(partial: PartialVolume, n: int, made: Reconstruction | None, remark: st
 
 @contextmanager
 def keeping(path: Path) -> Iterator[None]:
-    """Remove the partial volume at `path` when the block has succeeded; otherwise keep it.
+    """A context that removes the partial volume at `path` on success, and keeps it otherwise.
 
     Raises:
         ScanStopped: instead of KeyboardInterrupt, where there are slabs to go on from.
@@ -217,7 +217,7 @@ def keeping(path: Path) -> Iterator[None]:
         if not path.is_file():
             raise
         raise ScanStopped(
-            f"The reconstruction was stopped; {path} keeps the slabs that are finished. The same call with --resume "
+            f"The reconstruction was stopped; {path} has the finished slabs. The same call with --resume "
             f"{path} makes the others."
         ) from error
     remove(path)
@@ -276,7 +276,7 @@ def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
-    """Numbers of the slabs, beginning with the slab whose rows hold most matter."""
+    """Numbers of the slabs, beginning with the slab whose rows show most matter."""
     data = prepared.projections.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
     matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]

@@ -64,7 +64,7 @@ class Snapshots:
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
-        """The volume as it stands, and its picture, in place of the last ones."""
+        """Write the current volume and its picture, replacing the last ones."""
         shown = fit.shown()
         (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
@@ -90,26 +90,26 @@ class Snapshots:
             self._write_picture()
         except DataError as error:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
-            self._warn(f"A snapshot was left out: {error}")
+            self._warn(f"A snapshot could not be written: {error}")
             return
         now = self._clock.now()
         written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
         self._sink(SnapshotWritten(*written, method, errors or None, time=now))
 
     def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str, unseen: Wedge | None) -> None:
-        """The picture with these slices by FBP, above those of the volume when it was last drawn, if there is one."""
+        """Write the picture with these slices by FBP above the last drawn slices of the volume, if there are any."""
         self._at, self._unseen = slices.at, unseen
         panels = _slice_panels(slices.images, slices.at, slices.pixel, self._unit, unseen)
         self._slices = (PictureRow(heading, panels),)
         try:
             self._write_picture()
         except DataError as error:
-            self._warn(f"A picture was left out: {error}")
+            self._warn(f"A picture could not be written: {error}")
             return
         self._sink(SlicesDrawn(self.picture_path, n_views, math.degrees(slices.covered), time=self._clock.now()))
 
     def remove(self) -> None:
-        """Remove the snapshot after the volume is delivered. The picture of the growing volume stays."""
+        """Remove the snapshot after the final volume is written. The live picture stays."""
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 
@@ -148,14 +148,14 @@ _DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
 
 @dataclass(frozen=True, eq=False)
 class PictureRow:
-    """Panels side by side, below a heading; "": none."""
+    """Panels side by side under a heading; "" for none."""
 
     heading: str
     panels: Sequence[_Panel]
 
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
-    """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
+    """The rows as PNG, without axes and layout, which would take ten times as long: it is drawn during the fit."""
     from PIL import Image, ImageDraw
 
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
@@ -190,7 +190,7 @@ def volume_rows(
     volume: Volume, view: F32, render: F32, heading: str, unit: str,
     drawn: tuple[Sequence[float] | None, Wedge | None] = (None, None),
 ) -> tuple[PictureRow, PictureRow]:  # fmt: skip
-    """Slices of a volume; the newest view, the same view of the volume, their difference.
+    """Slices of a volume; the newest view, the projection of the volume at its angle, their difference.
 
     Args:
         volume: so far, 1/unit.
@@ -345,7 +345,7 @@ class LiveSlices:
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
     def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float | None) -> None:
-        """Draw slices before the axis is known, of some of the views, corrected for this alone."""
+        """Draw slices before the axis is known, from some of the views, corrected only for this."""
         views = self._views.chosen(self._views.usable().frames)
         early = pause is not None and self._clock.now() < self._next
         if views.size < _FEWEST or early or int(views[-1]) == self._newest:

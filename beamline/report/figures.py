@@ -36,7 +36,7 @@ _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
 
 def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> GreyWindow:
-    """One range of grey values for all `arrays`: percentiles of their values together."""
+    """One range of grey values for all `arrays`: percentiles of all their values."""
     finite = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
     if finite.size == 0:
         return 0.0, 1.0
@@ -161,7 +161,8 @@ def orthogonal_slices(
 
 
 def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
-    """What each volume has more (red) or less (blue) than the first one, in the slice z of `orthogonal_slices`."""
+    """Where each volume is denser (red) or less dense (blue) than the first one, in the slice z of
+    `orthogonal_slices`."""
     from matplotlib.ticker import MaxNLocator
 
     (first, reference), *others = volumes.items()
@@ -184,7 +185,7 @@ def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = Voxe
 
 
 def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
-    """Each volume along a line through the sharpest edge of the last one, and how often its values occur.
+    """Profile of each volume through the sharpest edge of the last one, and a histogram of its values.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
     voxel. So single noisy voxels are no edges.
@@ -243,7 +244,7 @@ def _map(
 
 
 def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
-    """A slice through the bright voxels, with the directions of rays that no view shows as sectors about the axis."""
+    """A slice through the bright voxels, with the directions of missing rays as sectors about the axis."""
     from matplotlib.patches import Wedge as Sector
 
     at, grid = bright_centre(volume.data)[0], volume.grid
@@ -281,7 +282,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
 
 
 def round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    """The largest of 1, 2, 5 times a power of ten that does not exceed the length."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(n for n in (1, 2, 5) if n * power <= length * (1 + 1e-9)))
 
@@ -358,7 +359,7 @@ def panels(
     gap: float = _GAP,
     right: float = _GAP,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure whose panels [row][column] have places of their own, with room of one size for their labels.
+    """A figure with a fixed grid of panels [row][column], with equal room for their labels.
 
     A layout that measures labels takes as long as all that is drawn.
 

@@ -69,7 +69,7 @@ def write_report(path: Path, report: Report, *, replace: bool = False) -> None:
 
 
 def write_timed(path: Path, report: Report, label: str, elapsed: float) -> None:
-    """Write the page of a report once more, with the seconds of the whole command in the column of a method.
+    """Write the report page again, with the duration of the whole command in the column of a method.
 
     These are known when all else is written. Where the disk takes no more, the page stays as it is.
     """

@@ -77,7 +77,7 @@ def views_grew(made: Reconstruction) -> bool:
 
 
 def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
-    """The price of another dB: for a fit by fits of other lengths, for iterations by their own record.
+    """The cost of another dB: for a fit from fits of other lengths, for iterations from their own record.
 
     None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
     also for other rates than those of the fits that were measured, as after following a scan.
@@ -95,7 +95,7 @@ def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
 
 
 def price_text(made: Reconstruction) -> str:
-    """What a longer reconstruction would gain, as a sentence without its end; empty if it is not known."""
+    """What a longer reconstruction would gain, as a sentence without its end; empty if unknown."""
     if (price := price_of_decibel(made)) is None:
         return ""
     by_others = price.of == "volume"

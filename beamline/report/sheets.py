@@ -43,7 +43,7 @@ class SliceSheet:
         self._drawn: set[tuple[str, str]] = set()
 
     def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
-        """Adds a slice of the volume; of each family and method, only the first volume counts."""
+        """Add a slice of the volume; of each family and method, only the first volume is shown."""
         if family and (family, method) in self._drawn:
             return
         if not self._shown:

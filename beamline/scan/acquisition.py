@@ -29,7 +29,7 @@ DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block with its frames and missing triggers. again: it repeats views, whose loss is no failure."""
+    """A block with its frames and missing triggers. again: it repeats views, so losing them is no failure."""
 
     block: Block
     taken: BlockTally
@@ -184,7 +184,7 @@ class Acquisition:
             earlier = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, earlier))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
-            self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were taken again."))
+            self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 
     def _on_the_way_back(self, block: Block) -> Iterator[Frame]:
         """Views that are taken a second time, at the angles of the first ones. Nothing replaces anything."""
@@ -217,9 +217,7 @@ class Acquisition:
             if cold:
                 self._warm_up()
         if wrong := _wrong_shutter(kind, shutter.is_open()):
-            raise InstrumentError(
-                f"{shutter.name}: {wrong}. Check its interlock. What was taken before is in the file."
-            )
+            raise InstrumentError(f"{shutter.name}: {wrong}. Check its interlock. Earlier frames are in the file.")
 
     def _remembered_places(self, kind: FrameKind) -> dict[str, Callable[[], str]]:
         """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
@@ -320,7 +318,7 @@ class Acquisition:
             raise ReferencesError(self._refused)
         if self._stop.stopping:
             if self.n_frames == 0:
-                raise ScanAborted(f"Interrupted before anything was acquired: {self._stop.reason}.")
+                raise ScanAborted(f"Interrupted before the first frame: {self._stop.reason}.")
             raise ScanStopped(
                 f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file is complete as far as "
                 f"it goes.{self._discrepancies()}"

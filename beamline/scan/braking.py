@@ -25,7 +25,7 @@ BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not
 
 @dataclass(frozen=True)
 class Braking:
-    """A stage that was told to stop within a train, and stands."""
+    """A stage that was stopped during a train of triggers, and stands."""
 
     told: float  # time at which it was told, in s
     stood: float  # where it stands, in intervals beyond trigger 0
@@ -37,7 +37,7 @@ Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 
 
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
-    """The way to place frames that came until the stage stood: by its motion, by their number, or not at all."""
+    """How to assign frames that arrived during braking: by the stage's motion, by their number, or not at all."""
     steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
     fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last
@@ -48,7 +48,7 @@ def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) 
 
 
 def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
-    """The ledger after all frames were assigned to triggers, placed in this way."""
+    """The ledger after all frames were assigned to triggers in this way."""
     for i in range(len(frames)):
         entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
         ledger = ledger if entered is None else entered[0]
@@ -56,7 +56,7 @@ def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame],
 
 
 def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
-    """Place the frame where a constant deceleration has taken the stage by its time."""
+    """Assign the frame to the position that a constant deceleration reaches at its time."""
     train = ledger.train
     if ledger.last >= 0:
         last, phase, period = ledger.last, ledger.phase, ledger.period
@@ -75,7 +75,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 
 def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
-    """Place the frame by the number of exposures since the last steady one."""
+    """Assign the frame by the number of exposures since the last one at constant speed."""
     if frame.time < braking.told or ledger.last < 0:
         return unassigned(ledger, braking, frame)
     exposures = ledger.unmatched + frame.framestamp - ledger.exposed
@@ -83,7 +83,7 @@ def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 
 def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
-    """Place no frame from the stop on: it belongs to no trigger."""
+    """Assign no frame after the stop to a trigger."""
     return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
 
 

@@ -103,7 +103,7 @@ def _not_private(folder: os.stat_result) -> str:
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, sink: Sink = lambda event: None
 ) -> Iterator[None]:
-    """Within the context, verbs for the run in this folder are obeyed; a warning if that is impossible.
+    """A context in which the scan of this folder obeys commands; warns if that is impossible.
 
     Raises:
         DataError: the disk does not take the folder for them.
@@ -129,7 +129,9 @@ def verbs_taken(
     try:
         requests = _Requests(place)
     except OSError as error:
-        raise DataError(f"{place} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
+        raise DataError(
+            f"{place} cannot be created ({error.strerror}). Nothing has moved, and no frame was recorded."
+        ) from error
     thread = threading.Thread(target=take_verbs, name="control", daemon=True)
     thread.start()
     try:
@@ -150,21 +152,21 @@ def _taken(request: Path) -> bool:
 
 
 def running(runs: Path) -> list[Path]:
-    """The runs in a folder whose scan is running, oldest first."""
+    """The runs in a folder whose scan is in progress, oldest first."""
     newest = ((run, parts_of(run)[-1]) for run in runs.glob("*/"))
     return sorted(run for run, part in newest if (part / CONTROL).is_dir() and held(part / SCAN))
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A verb that was sent to the scan of a part of a run, at a time of the monotonic clock."""
+    """A command sent to the scan of a part of a run, with its time on the monotonic clock."""
 
     part: Path
     verb: Verb
     since: float
 
     def state(self) -> State | None:
-        """The scan's state once the verb is done, or after 20 s; None before that. Returns at once.
+        """The scan's state once the command is done, or after 20 s; None before that. Returns at once.
 
         Raises:
             ConfigError: the scan has not answered for 5 s; the request is withdrawn.
@@ -183,7 +185,7 @@ class Asked:
 
 
 def ask(run: Path, verb: Verb) -> Asked:
-    """Send a verb to a running scan without waiting, so that the next verb can follow at once.
+    """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Raises:
         ConfigError: no scan runs there, or somebody else's.
@@ -194,7 +196,7 @@ def ask(run: Path, verb: Verb) -> Asked:
     try:
         folder = os.lstat(request.parent)
     except OSError:
-        raise ConfigError(f"no scan runs in {run}. Nothing was changed.") from None
+        raise ConfigError(f"no scan is running in {run}. Nothing was changed.") from None
     if sys.platform != "win32" and (fault := _not_private(folder)):
         raise ConfigError(
             f"{request.parent}: {fault}. Only the user who started a scan can control it. Nothing was changed."
@@ -204,13 +206,13 @@ def ask(run: Path, verb: Verb) -> Asked:
             os.close(os.open(request, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except OSError as error:
         raise DataError(
-            f"{run} cannot be told to {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
+            f"{run} does not accept {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
         ) from error
     return Asked(part, verb, time.monotonic())
 
 
 def tell(run: Path, verb: Verb) -> State:
-    """Send a verb to a running scan, and wait until it is done; returns the state. Errors: of `ask` and `Asked`."""
+    """Send a command to a running scan, and wait until it is done; returns the state. Raises as `ask` and `Asked`."""
     asked = ask(run, verb)
     while (state := asked.state()) is None:
         time.sleep(POLL)
@@ -218,7 +220,7 @@ def tell(run: Path, verb: Verb) -> State:
 
 
 def state_of(run: Path) -> State:
-    """The state of the scan in this folder, by the last line on it in its log of events."""
+    """The state of the scan in this folder, from the last entry in its log of events."""
     state = State.IDLE
     with suppress(OSError), open_below(run, EVENTS) as file:
         for line in whole_lines(file):

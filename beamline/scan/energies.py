@@ -38,7 +38,7 @@ from drivers.in_beam import Ask
 
 @dataclass(frozen=True)
 class SeriesRun:
-    """A finished series.
+    """A finished series of energies.
 
     Attributes:
         folder: of the series.
@@ -52,7 +52,7 @@ class SeriesRun:
 
 
 def is_series(folder: Path) -> bool:
-    """Whether a folder holds a series of energies."""
+    """Whether a folder contains a series of energies."""
     if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
         return False
     return load(folder / CONFIG, environment={}).scan.energies is not None
@@ -81,7 +81,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
 
 
 def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
-    """The scans at these paths, where the folder of a series stands for its scans; see `scans_in`."""
+    """The scans at these paths; the folder of a series stands for its scans, see `scans_in`."""
     return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [scan_file(path)]))
 
 
@@ -95,7 +95,7 @@ def run_energies(
     series: Path | None = None,
     ask: Ask | None = None,
 ) -> SeriesRun:
-    """Scan at each of `scan.energies`, one after the other, with devices that stay connected.
+    """Run a scan at each of `scan.energies` in turn; devices stay connected.
 
     Args:
         place: the folder in which the series gets its own; None: the configured one.
@@ -159,7 +159,7 @@ def _new_folder(config: Config, place: Path) -> Path:
 def _runs(series: Path, config: Config) -> list[Path | None]:
     """The newest run folder of each energy of a series; None: there is none."""
     if not is_series(series):
-        raise ConfigError(f"{series} is no folder of a series of energies. Nothing was changed.")
+        raise ConfigError(f"{series} is not the folder of a series of energies. Nothing was changed.")
     run_of_energy = dict[float | None, Path]()
     for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
         run_of_energy[load(run / CONFIG, environment={}).scan.energy] = run

@@ -42,7 +42,7 @@ NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 @dataclass
 class BlockTally:
-    """Frames and missing triggers of a block; filled in while the block is taken.
+    """Frames and missing triggers of a block; filled while the block is recorded.
 
     Attributes:
         frames: delivered, with and without a trigger.
@@ -164,7 +164,7 @@ class Exposures:
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
     def take(self, block: Block, first_row: int, taken: BlockTally) -> Iterator[Frame]:
-        """The block's frames, numbered from `first_row`; `taken` records what is missing.
+        """Record the block's frames, numbered from `first_row`; `taken` lists what is missing.
 
         A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
 
@@ -199,7 +199,7 @@ class Exposures:
             )
 
     def go(self, angle: float, *, until_stop: bool = True) -> bool:
-        """Move to `angle` at full speed and wait; False if a stop (or only an abort) cut the move short."""
+        """Move to `angle` at full speed and wait; returns False if a stop (or only an abort) interrupted the move."""
         limits = self._stage.limits
         distance = angle - self._stage.position()
         self._stage.start_move(angle, limits.max_speed)
@@ -450,14 +450,14 @@ class Exposures:
         return True
 
     def stand(self) -> None:
-        """Slow down and wait until the stage stands. InstrumentError: it does not stand."""
+        """Decelerate and wait until the stage stands. Raises InstrumentError if it does not."""
         limits = self._stage.limits
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
         self._stage.stop()
         while self._stage.moving():
             self._stop.refuse_abort()
             if self._clock.now() > deadline:
-                raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
+                raise InstrumentError(f"{self._stage.name}: it is still moving after a stop. Use its emergency stop.")
             self._clock.sleep(POLL)
 
     @property

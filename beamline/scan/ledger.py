@@ -34,7 +34,7 @@ EXTRA = -1  # the trigger of a frame that no trigger exposed
 
 
 class LedgerError(DataError):
-    """Triggers and frames do not agree; `missing` are the planned rows that have no frame."""
+    """Triggers and frames do not match; `missing` are the planned rows without a frame."""
 
     def __init__(self, message: str, missing: Sequence[int]) -> None:
         super().__init__(message)
@@ -71,7 +71,7 @@ class LedgerEntry:
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Triggers and frames matched so far: begins as `Ledger(train)`, goes on by `assign`, ends by `settle`.
+    """The matching of triggers and frames so far: `Ledger(train)`, then `assign` for each frame, then `settle`.
 
     Without faults every trigger has its frame and every frame its trigger.
     """
@@ -107,7 +107,7 @@ class Ledger:
 
 @dataclass(frozen=True)
 class DeliveredFrame:
-    """A frame as it comes from the camera: see `assign`."""
+    """A frame as received from the camera: see `assign`."""
 
     framestamp: int
     time: float
@@ -115,7 +115,7 @@ class DeliveredFrame:
 
 
 def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
-    """Enter the first of the waiting frames, using those after it; None: it must wait for further frames.
+    """Assign the first of the waiting frames, using those after it; None if it must wait for further frames.
 
     Args:
         frames: in the order in which they were exposed.
@@ -144,7 +144,7 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
 
 
 def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, LedgerEntry]:
-    """Enter a received frame: the ledger after it, and the frame's trigger and angle.
+    """Assign a received frame; returns the new ledger, and the frame's trigger and angle.
 
     Frames come in the order in which they were exposed.
 
@@ -203,7 +203,7 @@ def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool 
 
 
 def settle(ledger: Ledger, cut_short: bool = False) -> Ledger:
-    """Close the ledger: every trigger after the last frame is missing.
+    """Close the ledger: every trigger after the last frame is marked missing.
 
     Args:
         cut_short: the scan was stopped; triggers after the last frame were not waited for and do not count as missing.

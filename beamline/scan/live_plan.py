@@ -32,7 +32,8 @@ class LivePlan:
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Binning, and views left out, so that the live volume has at most 512 columns and half of the free memory.
+    """Choose binning and omitted views so that the live volume has at most 512 columns and fits half of the free
+    memory.
 
     Views are left out as long as 90 are used, then the binning grows.
 
@@ -55,7 +56,8 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that names an order of views with a better live volume before the end; empty if the plan has it."""
+    """A sentence that recommends an order of views with a better live volume before the end; empty if the plan has
+    it."""
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:
         return ()

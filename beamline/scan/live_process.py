@@ -65,7 +65,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
 
 
 def finished_command(config: Config) -> LiveCommand:
-    """The command `beamline recon SCAN` for the complete scan, by a method that needs all of it."""
+    """The command `beamline recon SCAN` for the complete scan, for a method that needs all views."""
     return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
 
 
@@ -165,7 +165,8 @@ class LiveReconstruction:
             self._sink(Warned(message))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
-        """Wait until it has compiled its kernels or ended, `stop` returns True, or a timeout (real s) is over.
+        """Wait until it has compiled its kernels or ended, `stop` returns True, or the timeout (s of real time) has
+        passed.
 
         A time-out is a warning: the scan need not wait for it.
         """
@@ -204,7 +205,7 @@ class LiveReconstruction:
         return self._done
 
     def close(self) -> None:
-        """End it if it still runs."""
+        """Terminate it if it is still running."""
         with self._changing:
             process, self._wanted = self._process, False
         if process is not None:

@@ -46,7 +46,7 @@ def all_of(plan: ScanPlan) -> ScanPlan:
 
 
 class EnergyNeeds(NamedTuple):
-    """Time (s) and space (bytes) that the scan of an energy (keV) needs."""
+    """Time (s) and disk space (bytes) of the scan at one energy (keV)."""
 
     kev: float
     duration: float
@@ -109,7 +109,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Sentences on values that no instrument has, as with a mistaken unit; empty if all are plausible."""
+    """Warnings of implausible values, as from a mistaken unit; empty if all are plausible."""
     optics, scan = config.optics, config.scan
     energies = (optics.energy_kev, scan.energy, *(scan.energies or ()))
     exposures = (scan.exposure_s, scan.darks.exposure_s, scan.flats.exposure_s)
@@ -193,7 +193,7 @@ def _lockable(worked: Timeline, folder: Path) -> Timeline:
 
 
 def refuse_violations(worked: Timeline) -> None:
-    """Raise ConfigError with every broken limit, if there is any."""
+    """Raise ConfigError with all violated limits, if there are any."""
     broken = worked.violations
     if len(broken) == 1:
         raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
@@ -202,26 +202,26 @@ def refuse_violations(worked: Timeline) -> None:
 
 
 def disk_of(folder: Path) -> Path:
-    """`folder`, or its nearest parent that exists: on the disk that will hold it.
+    """`folder`, or its nearest existing parent, which is on the same disk.
 
     Raises:
         ConfigError: a file stands in the way, or there is no such disk.
     """
     folder = folder.absolute()
     if link := broken_link(folder):
-        raise ConfigError(f"runs cannot go to {folder}: {link} Choose another folder; nothing was started.")
+        raise ConfigError(f"runs cannot be written to {folder}: {link} Choose another folder; nothing was started.")
     there = next((place for place in (folder, *folder.parents) if place.exists()), None)
     if there is None or not there.is_dir():
         problem = "no such disk" if there is None else f"a file at {there}"
         raise ConfigError(
-            f"runs cannot go to {folder}: there is {problem}. Choose another folder; nothing was started."
+            f"runs cannot be written to {folder}: there is {problem}. Choose another folder; nothing was started."
         )
     return there
 
 
 @dataclass(frozen=True, eq=False)
 class ReadyScan:
-    """A scan that may start."""
+    """A scan that is ready to start."""
 
     plan: ScanPlan
     timeline: Timeline
@@ -238,7 +238,7 @@ def preflight(
     remaining: Remaining = all_of,
     check_stop: Callable[[], None] = lambda: None,
 ) -> ReadyScan:
-    """Ask the devices for their limits, and compute the plan for them. Nothing moves.
+    """Read the limits of the devices, and compute the plan for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.
@@ -314,7 +314,9 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Facts for the file that need no plan; filter and energy as they stand. DeviceError: a device does not answer."""
+    """Metadata of the file that do not depend on the plan; filter and energy as currently set. Raises DeviceError if a
+    device does not answer.
+    """
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:

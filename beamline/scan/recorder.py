@@ -62,7 +62,7 @@ class Writer(Protocol):
 
 
 def room(timeline: Timeline) -> int:
-    """Frames that may wait to be written."""
+    """Number of frames that can wait to be written."""
     low, high = WAITING_FRAMES
     return min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
 
@@ -80,7 +80,7 @@ _Item = _Checked | BaseException | threading.Event | None
 
 @dataclass(frozen=True, eq=False)
 class Consequences:
-    """Effects of flags on a running scan.
+    """What flags do to a running scan.
 
     Attributes:
         react: told the flags of each frame.
@@ -95,7 +95,7 @@ _NONE = Consequences()
 
 
 class Recorder:
-    """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
+    """Records frames given to `put`: each is checked by the monitor, and written with its checksum and flags.
 
     Appended frames are flushed when no frame waits; otherwise the writer decides how often.
 
@@ -215,7 +215,7 @@ class Recorder:
 
     @property
     def alarmed_frames(self) -> int:
-        """Frames so far with an alarm of any check, without those that were taken again."""
+        """Frames so far with an alarm of any check, except those that were repeated."""
         return len(self._alarmed)
 
     @property
@@ -225,7 +225,7 @@ class Recorder:
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for it, with the trigger that each would be taken again by."""
+        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
         warned = self._frames(
             lambda flag: flag.level is Level.WARN and flag.check in self._consequences.retaken_warnings
         )
@@ -240,13 +240,13 @@ class Recorder:
         return {frame for flag in self._found if which(flag) for frame in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
-        """Announce frames that the timeline does not have; may be called while no frame waits."""
+        """Announce frames beyond the timeline; may be called while no frame waits."""
         self._retaking = True
         self._progress.expect_more(self.n_frames, n, seconds)
 
     @property
     def hangs(self) -> bool:
-        """Whether a frame is still being written; after `finish` this means that the disk does not answer."""
+        """Whether a frame is still being written; after `finish` this means that the disk does not respond."""
         return self._thread.is_alive()
 
     def _enqueue(self, item: Frame | threading.Event | None) -> None:

@@ -18,7 +18,7 @@ VIEWS = 4  # enough for a median
 
 
 class ReferenceLog:
-    """Statistics of the darks and flats of a scan, to judge them group by group."""
+    """Statistics of the darks and flats of a scan, to check them group by group."""
 
     def __init__(self) -> None:
         self._groups: list[list[ReferenceFrame]] = []
@@ -42,7 +42,7 @@ class ReferenceLog:
                 known[:] = [one for one in known if one.row != frame.replaces]
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """The faults of the groups so far, by the name of the group; a sentence or more each.
+        """The faults of the groups so far, by the name of the group, in one or more sentences each.
 
         Args:
             planned: blocks that are over by now; references without any frame are missing.

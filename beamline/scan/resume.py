@@ -68,7 +68,7 @@ class ResumableRun:
 
     @property
     def in_words(self) -> str:
-        """One line for people."""
+        """The run in one line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
             kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.end_references))
@@ -80,7 +80,7 @@ class ResumableRun:
         return replace(plan, stored=self.views, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
-        """Recover parts whose writer died, join the parts, and make the folder of the new one.
+        """Recover parts whose writer died, join the parts, and create the folder of the new part.
 
         Raises:
             ConfigError: plan, frames or devices are not what they were; nothing was changed.
@@ -101,20 +101,22 @@ class ResumableRun:
 
 
 class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
-    """A run has all frames, but a file was not closed or its parts are not joined; `recover_run` does both."""
+    """All frames of the run are recorded, but a file was not closed or the parts are not joined; `recover_run` does
+    both.
+    """
 
 
 class NothingMissing(ConfigError):  # noqa: N818 - likewise
-    """A run lacks nothing."""
+    """The run has all its frames."""
 
 
 class NoFrame(ConfigError):  # noqa: N818 - likewise
-    """A run holds no frame."""
+    """The run has no frame."""
 
 
 @contextmanager
 def open_for_resume(run: Path, given: Config | None = None) -> Iterator[ResumableRun]:
-    """Hold the run in this folder within the context, so that no other process can resume it.
+    """A context that locks the run in this folder, so that no other process can resume it.
 
     Args:
         given: a configuration that must be the run's.
@@ -125,7 +127,7 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
-        raise ConfigError(f"{run} is no folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
+        raise ConfigError(f"{run} is not the folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
     try:
         lock = WriterLock(run / CONFIG, exclusive=True)
     except OSError as error:
@@ -149,12 +151,12 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             if layout.COMMITTED not in file:
-                raise DataError(f"{part} is no scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
+                raise DataError(f"{part} is not a scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
             for other in (config, given):
                 if other is not None:
                     require_same_config(run, file["/entry/record/config"].asstr()[()], other)
             if not (angles := views_planned(file)):
-                raise DataError(f"{part} does not hold its plan: its views are not known. {_UNTOUCHED}")
+                raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
                 parts.append(part)
@@ -162,7 +164,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 views |= views_in(file)
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
-        raise NoFrame(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
+        raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     end_references = None
     if len(views) >= planned:
         with ExitStack() as opened:
@@ -193,7 +195,9 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:
-    """Refuse another configuration than that in a file of the run, whose first line is the version of the program."""
+    """Raise ConfigError if the configuration differs from that in a file of the run, whose first line is the program's
+    version.
+    """
     before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
     differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
     if differ is not None or len(before) != len(now):
@@ -217,7 +221,8 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
 
 
 def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
-    """A sentence on each device that is not the one which the newest run in this folder found at the same port."""
+    """One sentence for each device that differs from the one that the newest run in this folder found at the same
+    port."""
     differing: list[str] = []
     with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
         files = sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)
@@ -246,7 +251,7 @@ def _words(identity: Mapping[str, str]) -> str:
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
-    """Recover every part of a run, and join them where there are several: the joined file comes last.
+    """Recover every part of a run, and join several parts; the joined file comes last.
 
     Args:
         say: is told the room that each needs, before anything is written to it.
@@ -259,7 +264,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     """
     files, left_out = _files(run)
     if not files:
-        raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
+        raise DataError(f"{run} is not the folder of a run: it has no {SCAN}. {_UNTOUCHED}")
     done = [recover(part, say) for part in files]
     if len(parts := [one.path for one in done if one.frames]) > 1:
         changed = not is_joined(run / JOINED)

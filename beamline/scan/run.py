@@ -94,7 +94,9 @@ def run_scan(
             the file; the event `scan_done` says how much, and `failed` why.
     """
     if config.scan.energies is not None:
-        raise ConfigError("scan.energies asks for several scans, this runs one: set scan.energy. Nothing was started.")
+        raise ConfigError(
+            "scan.energies lists several scans, but this call runs one: set scan.energy. Nothing was started."
+        )
     began = time.monotonic()
     stop = stop or StopRequest()
     series = runs if isinstance(runs, ResumableRun) else None
@@ -161,7 +163,7 @@ def _clock(config: Config, series: ResumableRun | None) -> Clock | None:
 def _refuse_stop(stop: StopRequest) -> None:
     """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
     if stop.stopping:
-        raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
+        raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing has moved.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +247,9 @@ class _Run:
                 self.sink(StateEntered(self.states.state, message))
             except OSError as error:  # Windows, where a viewer holds it open
                 self.sink(
-                    Warned(f"{path} could not be renamed ({error.strerror}): the run gets no volume of all parts.")
+                    Warned(
+                        f"{path} could not be renamed ({error.strerror}): there is no volume of all parts of the run."
+                    )
                 )
 
     def _prepare_memory(self) -> None:
@@ -336,7 +340,7 @@ class _Run:
             self.sink(Warned(f"Views on the way back could not be compared: {error}"))
             return ()
         if moved := [view.in_words() for view in returned if view.moved]:
-            self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let it settle, fix it, or scan faster."))
+            self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let the sample settle, fix it, or scan faster."))
         return returned
 
     def _acquire(
@@ -447,7 +451,7 @@ class _Run:
 
 
 def wait_in_pause(recorder: Recorder) -> bool:
-    """Wait a moment, while paused, and look whether the disk works; whether Enter was pressed at the terminal."""
+    """Wait a moment during a pause, and check the disk; returns whether Enter was pressed at the terminal."""
     time.sleep(PAUSE_POLL)
     recorder.check()
     return enter_pressed()

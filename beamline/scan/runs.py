@@ -64,14 +64,14 @@ class Run:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """The folders of runs in a folder, newest first; also those of the energies of a series in it."""
+    """The folders of runs in a folder, newest first, including those of the energies of a series."""
     within = [path for path in folder.glob("*/") if not is_below(path, EVENTS) and (path / CONFIG).is_file()]
     runs = [run for place in (folder, *within) for run in place.glob("*/") if is_below(run, EVENTS)]
     return sorted(runs, key=lambda run: (_began(run), _numbered(run)), reverse=True)
 
 
 def newest(folder: Path) -> Path:
-    """The running scan of a folder, or else its newest run. ConfigError if there is none."""
+    """The running scan of a folder, or else its newest run. Raises ConfigError if there is none."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
         raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
@@ -79,7 +79,7 @@ def newest(folder: Path) -> Path:
 
 
 def describe(run: Path) -> Run:
-    """Read the facts of a run from its log, or from its files if the log ended early. No pixel is read."""
+    """Read the metadata of a run from its log, or from its files if the log is incomplete. Reads no pixel."""
     parts = parts_of(run)
     heads = [_head(part) for part in parts]
     frames: int | None = 0
@@ -108,7 +108,7 @@ HEAD = ("time (UTC)", "sample", "frames", "state", "size", "flags", "folder")
 
 
 def cells(run: Run) -> tuple[str, ...]:
-    """The row of a run under HEAD, each cell one line of printable text."""
+    """The row of a run in the table with header HEAD, one line of printable text for each cell."""
     from beamline.storage.flag_legend import counted
 
     frames = "not known" if run.frames is None else str(run.frames)

@@ -26,7 +26,7 @@ class State(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether no state may follow."""
+        """Whether this state is final."""
         return not NEXT[self]
 
 
@@ -44,13 +44,14 @@ NEXT: Mapping[State, frozenset[State]] = {
 
 
 class StateMachine:
-    """The state of one scan, in `state`. The sink takes the event `state`."""
+    """The state machine of one scan; `state` is the current state. Changes are sent to the sink as the event
+    `state`."""
 
     def __init__(self, sink: Sink = lambda event: None, state: State = State.IDLE) -> None:
         self._sink, self.state = sink, state
 
     def enter(self, state: State, message: str = "") -> None:
-        """Go to a state, with a message; staying in a state without a message emits nothing.
+        """Change to a state, with a message; staying in a state without a message emits nothing.
 
         Raises:
             ValueError: the state must not follow the present one; nothing has changed.

@@ -32,7 +32,7 @@ def _wait_in_pause() -> bool:
 
 @dataclass(frozen=True)
 class Supervision:
-    """Callbacks of the acquisition."""
+    """Callbacks of the acquisition that pause a scan."""
 
     # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no projection
     # should be taken; None: projections may be taken
@@ -53,7 +53,7 @@ class Supervision:
 
 @dataclass(frozen=True)
 class BeamLimits:
-    """Intensities at which a scan pauses and resumes, in the beam monitor's unit."""
+    """Beam intensities at which a scan pauses and resumes, in the beam monitor's unit."""
 
     pause_below: float  # a reading below it pauses the scan
     resume_above: float  # readings of at least so much mean that the beam is back
@@ -94,7 +94,7 @@ class BeamGuard:
 
 
 class SpaceGuard:
-    """Pauses a scan before its disk is full, until there is space for twice as much.
+    """Pauses a scan before its disk is full, until twice the limit is free.
 
     Args:
         reserve: bytes that must stay free for the frames that still come when the scan is to pause.
@@ -118,7 +118,7 @@ class SpaceGuard:
 
 @dataclass
 class Workload:
-    """Seconds that a recorder's threads have spent, by the clock and of the processor.
+    """Busy seconds of a recorder's threads, by wall clock and processor time.
 
     Checking a frame waits only for the processor. Its ratio of clock time to processor time, applied to writing, gives
     the writing time without the disk; the rest is waiting for the disk.
@@ -137,7 +137,7 @@ class Workload:
 
     @property
     def behind(self) -> tuple[str, str]:
-        """The cause of the wait, and a remedy: the disk if the writes waited longer than the checks took."""
+        """The cause of the backlog, and a remedy: the disk if writes waited longer than the checks took."""
         if self.disk > self.checking:
             return "the disk is behind", "a longer period_s or a faster disk"
         return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
@@ -168,7 +168,7 @@ class BacklogGuard:
 
 
 class AlarmReaction:
-    """Effects of the monitor's alarms on a scan.
+    """What the monitor's alarms do to a scan.
 
     Args:
         act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
@@ -207,7 +207,8 @@ LAST_WAIT = 3.0  # Longest wait in s for a reading in progress at the end of a s
 
 
 class BeamLog:
-    """Use as a context manager. Each reading is an event `beam`; failing readings are one warning until one succeeds.
+    """Context manager that logs the beam. Each reading is an event `beam`; consecutive failed readings give one
+    warning.
 
     Args:
         monitor: None: nothing is read.
@@ -232,7 +233,7 @@ class BeamLog:
         return tuple(self._readings)
 
     def wait_for_reading(self, stop: Callable[[], bool]) -> None:
-        """If readings are acted on: wait for one that begins after this call, or until `stop` returns True."""
+        """If readings control the scan, wait for one that begins after this call, or until `stop` returns True."""
         due = self._begun + 1
         while self._react is not None and self._ended < due and self._thread.is_alive() and not stop():
             time.sleep(PAUSE_POLL)
@@ -277,15 +278,15 @@ class BeamLog:
             self._react(reading)
 
     def _fail(self, name: str, error: BaseException) -> None:
-        self._failed += 1
+        self._failed += 1  # and nothing else: a failing beam monitor never stops a scan
         if self._failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
-        self._sink(Warned(f"{problem} The scan goes on without readings until it answers again."))
+        self._sink(Warned(f"{problem} The scan continues without readings until the monitor answers again."))
 
 
 def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink, pause: PauseRequest) -> BeamLog:
-    """The log of the configured beam monitor, which pauses the scan where that is configured."""
+    """The log of the configured beam monitor, which pauses the scan if so configured."""
     if isinstance(config, NoBeamMonitor):
         return BeamLog(None, math.inf, sink)
     guard = None

@@ -55,7 +55,7 @@ INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=be
 def watched(
     folder: Path, sink: Sink, stop: StopRequest | None = None, pause: PauseRequest | None = None
 ) -> Iterator[None]:
-    """Within the context a watchdog looks after the run in this folder; a warning if it cannot be started.
+    """A context in which a watchdog process guards the run in this folder; warns if it cannot be started.
 
     A watchdog that ends meanwhile is reported and replaced.
 
@@ -72,7 +72,7 @@ def watched(
 
 @contextmanager
 def inhibited() -> Iterator[None]:
-    """Ask systemd, if present, not to shut down or sleep, without waiting for its answer."""
+    """Ask systemd, if present, to inhibit shutdown and sleep, without waiting for its answer."""
     with ExitStack() as ending:
         if (program := shutil.which(INHIBIT[0])) is not None:
             with suppress(OSError):
@@ -103,7 +103,7 @@ class _Keeper:
         while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
             self._process.beat()
         if not self._ready.is_set() or not self._process.running:
-            self._warn("The watchdog does not run: a scan that is killed leaves the shutter open.")
+            self._warn("The watchdog is not running: if the scan is killed, the shutter stays open.")
         self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
         self._thread.start()
 
@@ -153,8 +153,9 @@ class _Keeper:
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
-    """Stop the stage, disarm its trigger output and close the shutter; True if all obeyed. say: gets a sentence on each
-    step."""
+    """Stop the stage, disarm its trigger output and close the shutter; True if all succeeded. `say` gets a sentence on
+    each step.
+    """
     stage, shutter = config.devices.stage, config.devices.shutter
     apart = shutter if isinstance(shutter, FoundShutter) else None
     closed = "the shutter is moved by hand"
@@ -217,7 +218,7 @@ class _Life:
 
 
 def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
-    """Wait until the scan is dead; returns whether it is frozen.
+    """Wait until the scan process is dead or hangs; returns whether it hangs.
 
     A step in which this process did nothing either (the computer slept, or was busy with its memory) counts once.
 
@@ -237,7 +238,7 @@ def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
 
 
 def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
-    """Wait until the scan is dead, then act, and log the actions; returns the exit code.
+    """Wait until the scan process is dead, then make the devices safe, and log it; returns the exit code.
 
     Args:
         scan: its process.

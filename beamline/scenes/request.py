@@ -79,7 +79,7 @@ def _print_effects(ctx: click.Context, param: click.Parameter, wanted: bool) -> 
 
 @dataclass(frozen=True, eq=False)
 class SimulateRequest:
-    """What `beamline simulate` is asked for."""
+    """The arguments of `beamline simulate`."""
 
     scene: str = set_by(click.argument("scene", metavar="SCENE"))
     explains: bool = set_by(

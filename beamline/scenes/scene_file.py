@@ -53,14 +53,14 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
 
 
 def open_other(name: str, overrides: Sequence[str], load: Callable[[Mapping[str, Any]], S]) -> S:
-    """As `open_scene`, for a scene of a feature, which `load` makes of its values."""
+    """Open a scene of a feature, which `load` builds from its values; otherwise as `open_scene`."""
     path, tree, _ = _scene_text(name, overrides)
     with _naming(path):
         return load(tree)
 
 
 def feature_of(name: str, overrides: Sequence[str]) -> str | None:
-    """The module of the feature whose scenes have a key that this one has; None: it is a scene of frames."""
+    """The module of the feature to which a key of the scene belongs; None for a scene of frames."""
     _, tree, _ = _scene_text(name, overrides)
     modules = in_folders("beamline.features", "SCENES")
     return next((module for key, module in modules.items() if key in tree), None)
@@ -122,17 +122,19 @@ def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
 
 
 def binning_of(detector: Detector) -> int:
-    """The least binning for a volume of LARGEST voxels across at most, limited by the frame's rows and columns."""
+    """The smallest binning for which a volume has at most LARGEST voxels across, limited by the frame's rows and
+    columns.
+    """
     return max(1, min(-(-max(detector.shape) // LARGEST), *detector.shape))
 
 
 def memory_of(detector: Detector, binning: int) -> int:
-    """Peak memory of `truth_of` in bytes. ValueError: the binning does not fit into the frame."""
+    """Peak memory of `truth_of` in bytes. Raises ValueError if the binning does not fit the frame."""
     return BYTES_A_VOXEL * math.prod(grid_of(detector, binning).shape)
 
 
 def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
-    """The truth in voxels of `binning` pixels. ValueError: the binning does not fit into the frame."""
+    """The truth in voxels of `binning` pixels. Raises ValueError if the binning does not fit the frame."""
     grid = grid_of(detector, binning)
     z, y, x = grid.centre
     shifted = replace(grid, centre=(z + _above(detector, binning), y, x))

@@ -64,7 +64,7 @@ def labels_path(scan: Path) -> Path:
 
 
 def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None:
-    """Write the labels, also where there are none. The file is complete or absent.
+    """Write the labels, even if there are none. The file is complete or absent.
 
     Raises:
         DataError: `path` exists or cannot be written.

@@ -50,7 +50,7 @@ class UnderHdf5:
         return str(self.path)  # which is the name of the file for HDF5
 
     def stat(self) -> os.stat_result:
-        """Status of the open file, whatever has its name now."""
+        """Status of the open file, even if its name now belongs to another file."""
         return os.fstat(self._file.fileno())
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
@@ -67,7 +67,7 @@ class UnderHdf5:
         return len(out)
 
     def read(self, n: int) -> bytes:
-        """Exists because h5py looks for it; h5py calls `readinto`."""
+        """Never called: h5py requires that it exists, but calls `readinto`."""
         out = bytearray(n)
         self.readinto(out)
         return bytes(out)
@@ -93,7 +93,7 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file that a program of ours is writing, or wrote until it died, shown as if it were closed.
+    """A file that this program is writing, or wrote until it died, presented as if it were closed.
 
     A refresh by HDF5 finds its present state. Torn blocks are read as whole ones.
     """
@@ -159,11 +159,11 @@ class DiskFile(UnderHdf5):
         return size
 
     def keep(self, error: BaseException) -> None:
-        """Keep an error for `require_taken`, unless there is an earlier one."""
+        """Record an error for `require_taken`, unless there is an earlier one."""
         self._error = self._error or error
 
     def require_taken(self) -> None:
-        """Raise the first error so far: OSError if the disk refused."""
+        """Raise the first error recorded so far: OSError if the disk refused."""
         error = self._error
         if isinstance(error, OSError):  # HDF5's own have no number
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error
@@ -171,7 +171,7 @@ class DiskFile(UnderHdf5):
             raise error
 
     def finish(self) -> None:
-        """Bring the file to the disk, read it back and compare, a block at a time.
+        """Flush the file to the disk, read it back and compare, a block at a time.
 
         A write that a later one changed in part is not compared: these are metadata.
 
@@ -204,7 +204,7 @@ class DiskFile(UnderHdf5):
 
 
 def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Float32 zeros of this shape that lie on the disk of `folder`, as a memory map.
+    """A float32 array of zeros of this shape, memory-mapped from a file in `folder`.
 
     Raises:
         DataError: the disk has not so much space.
@@ -216,8 +216,8 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def reserve(descriptor: int, wanted: int, folder: Path) -> None:
-    """Take so many bytes for an open file in the folder where the system can. Missing space is then found now, not in
-    the middle of the work.
+    """Allocate so many bytes for an open file in the folder, where the system can. Missing space is then found now, not
+    during the work.
 
     Raises:
         DataError: the disk has not so much space.

@@ -59,7 +59,7 @@ class Mark:
 
 
 def mark_of(flags: Iterable[Flag]) -> Mark:
-    """The flags of a frame as a row of a file."""
+    """The flags of a frame as they are stored in a row of a file."""
     flags = [flag for flag in flags if flag.level is not Level.INFO]
     scores, regions = np.full(len(CHECKS), np.nan, np.float32), np.full((len(CHECKS), 4), -1, np.int32)
     for flag in flags:
@@ -105,7 +105,7 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """Marks [row] of the frames of a file by these flags; a flag for earlier rows marks these, too."""
+        """Marks [row] of the frames of a file with these flags; a flag for earlier rows marks these, too."""
         flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
         assert flags.scores is not None and flags.regions is not None
         for flag in chain.from_iterable(found):
@@ -151,7 +151,7 @@ class FrameFlags:
         return FrameFlags(self.bits[frames], self.legend, scores, regions)
 
     def after(self, n: int) -> FrameFlags:
-        """The flags after `n` further frames, which no check has seen, at the front."""
+        """The flags after `n` frames, which no check has seen, were put in front."""
         bits = np.concatenate([np.zeros(n, self.bits.dtype), self.bits])
         scores = None if self.scores is None else np.pad(self.scores, ((n, 0), (0, 0)), constant_values=np.nan)
         regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)
@@ -168,7 +168,7 @@ class FrameFlags:
         return np.flatnonzero(alarms if level is Level.ALARM else self.bits >> entry.bit & 1 & ~alarms)
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Frames by check and level, for the checks and levels that flagged any; a frame counts by its worst level."""
+        """Frames by check and level, for the checks and levels that flagged any; a frame counts at its worst level."""
         counted: dict[str, dict[str, int]] = {}
         for entry in self.legend:
             by_level = {level: self.rows(entry, level).size for level in (Level.WARN, Level.ALARM)}
@@ -188,7 +188,7 @@ def counted(counts: Mapping[str, Mapping[str, int]]) -> str:
 
 
 def write_legend(file: h5py.File) -> None:
-    """Write the legend of all checks, one row a check; before SWMR writing begins."""
+    """Write the legend of all checks, one row for each check; before SWMR writing begins."""
     file[FLAGS].attrs["description"] = "bits of the monitor's checks, see flag_legend; 0: no check flagged the frame"
     group = file.create_group(LEGEND)
     group.attrs["NX_class"] = "NXcollection"
@@ -209,7 +209,7 @@ def write_legend(file: h5py.File) -> None:
 
 
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
-    """The legend of a scan file. ValueError for impossible bits."""
+    """The legend of a scan file. Raises ValueError for impossible bits."""
     items = [file[f"{LEGEND}/{name}"] for name in ("name", "bit", "unit", "meaning")]
     if any(map(hdf5.is_foreign, items)):
         raise ValueError(f"{LEGEND} lies in another file")
@@ -225,7 +225,7 @@ def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
 
 
 def read_flags(file: h5py.File, n: int) -> FrameFlags:
-    """The flags of the first `n` frames of a scan file of ours, also of one that is being written.
+    """The flags of the first `n` frames of a scan file of this program, which may still be growing.
 
     Raises:
         ValueError: a dataset of them has another shape than the frames and the legend.

@@ -30,13 +30,14 @@ Spacing = tuple[float, float, float]
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr, of whatever program."""
+    """Whether a folder is a Zarr store, written by any program."""
     return any((path / name).is_file() for name in _METADATA)
 
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """An array [..., z, y, x] of a Zarr whose leading axes have one place each (`VolumeScale`)."""
+    """A scale of a volume: an array [..., z, y, x] of a Zarr store whose leading axes have length one
+    (`VolumeScale`)."""
 
     path: Path
     array: Any
@@ -71,7 +72,7 @@ class ZarrScale:
 
 
 def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacing | None]:
-    """The finest scale of an OME-Zarr with the coarser ones, or the array `dataset`; mm of a voxel, where it says.
+    """The finest scale of an OME-Zarr with the coarser ones, or the array `dataset`; voxel size in mm, if stated.
 
     Raises:
         DataError: no library, not readable, no volume, or several channels or times.
@@ -89,7 +90,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except Exception as error:  # readers of foreign files raise various errors if one is damaged
         raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
     if not arrays:
-        raise DataError(f"{path} is no image of OME-Zarr; name an array in it, in `view` as {path.name}::NAME.")
+        raise DataError(f"{path} is not an OME-Zarr image; name an array in it, in `view` as {path.name}::NAME.")
     finest, *coarser = arrays
     if finest.ndim < 3 or any(n != 1 for n in finest.shape[:-3]) or np.dtype(finest.dtype).kind not in "uifb":
         raise DataError(
@@ -172,7 +173,7 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
 
 
 def is_halved(finest: tuple[int, ...], array: Any) -> bool:
-    """Whether a power of two takes one shape to that of an array, along each axis, rounded either way."""
+    """Whether halving one shape repeatedly gives the shape of an array, along each axis, rounded either way."""
     shape = getattr(array, "shape", ())[-3:]  # a group has none
     if len(shape) < 3 or min(*shape, *finest) < 1:
         return False

@@ -59,11 +59,11 @@ class NotReadyError(DataError):
 
 
 class UnreadableError(DataError):
-    """A file does not give a frame that it should hold; the others may be good."""
+    """A frame cannot be read from a file that should contain it; other frames may be good."""
 
 
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
-    """Open for reading, also a file that is being written or whose writer died (SWMR).
+    """Open for reading, even a file that is being written or whose writer died (SWMR).
 
     HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
     end. Two followers of one file would both read wrong values. So such a file gets a handle of its own.
@@ -72,7 +72,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
-        raise (NotReadyError if follow else DataError)(f"{path} is not there.")
+        raise (NotReadyError if follow else DataError)(f"{path} does not exist.")
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):
@@ -129,7 +129,7 @@ def _unopened(
 
 
 def grows_here(path: Path) -> bool:
-    """Whether this program has the file open by HDF5's own driver, to write it or to follow it."""
+    """Whether this program has the file open through HDF5's own driver, for writing or following it."""
     here = path.stat()
     for file in _open_by_name().values():
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
@@ -170,7 +170,7 @@ def opened_itself(path: Path) -> Iterator[None]:
     except (OSError, ValueError):  # it is gone, or was closed
         itself = False
     if not itself:
-        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself to have it read.")
+        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself.")
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:
@@ -193,7 +193,7 @@ def look_again(item: h5py.Dataset) -> None:
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:
-    """Whether to open the path as HDF5: by its signature, at the start or after a user block.
+    """Whether the path is an HDF5 file: by its signature, at the start or after a user block.
 
     h5py.is_hdf5 says no to a file that is being written. A path that does not exist, or that is followed, counts as
     HDF5: `open_hdf5` says what is wrong with it, or that it is not ready.
@@ -218,7 +218,7 @@ them."""
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn h5py's errors in the block into a DataError: the file is damaged, or altered by another program."""
+    """A context that converts h5py's errors to a DataError: the file is damaged, or altered by another program."""
     try:
         yield
     except ALTERED as error:
@@ -230,14 +230,14 @@ def readable(path: Path) -> Iterator[None]:
         limit = f"{limit} If that is too little, the file may be good." if limit and damaged(error) else ""
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
-            f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was "
+            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was "
             f"changed.{limit}"
         ) from error
 
 
 @contextmanager
 def closed_on_error(file: Any) -> Iterator[None]:
-    """Close what the block cannot make use of."""
+    """A context that closes what was opened if the block fails."""
     try:
         yield
     except BaseException:
@@ -252,7 +252,7 @@ def reason(error: Exception) -> str:
 
 
 def never_close(file: h5py.File) -> None:
-    """Keep a file open until the process ends, so that HDF5 does not change it further.
+    """Keep a file open until the process ends, so that HDF5 does not change it any more.
 
     For a file that the disk did not take. Closing it would repeat the writes, with a traceback for each object, and may
     leave the file marked so that nobody can open it. HDF5 still closes it at the end of the process, and crashes if the
@@ -276,7 +276,7 @@ def _lead_to_memory(handle: int, inode: int) -> None:
 
 
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
-    """A file that is made or changed by `created` and `changed`."""
+    """A file that is created by `created` or changed by `changed`."""
 
     def __init__(self, disk: DiskFile, mode: str, libver: str | tuple[str, str] | None = None) -> None:
         super().__init__(disk, mode, libver=libver)
@@ -286,7 +286,7 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
 
 @contextmanager
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
-    """Create a file. At the end of the block it is on the disk, read back and compared.
+    """Create a file. At the end of the block it is flushed to the disk, read back and compared.
 
     Raises:
         OSError: the disk refused the bytes or holds others; the file is closed and stays.
@@ -336,7 +336,7 @@ def _nothing_ignored(disk: DiskFile) -> Iterator[None]:
 
 
 def text(value: Any) -> str:
-    """A string from what HDF5 gives for one: str, bytes, or an array of one of these; without control characters."""
+    """A string from HDF5's representations: str, bytes, or an array of one of these; without control characters."""
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
     return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
@@ -354,12 +354,13 @@ def text_at(group: h5py.Group, path: str) -> str:
 
 
 def text_of(item: h5py.Dataset) -> str:
-    """The first value of a dataset as text; "" where it `is_foreign`."""
+    """The first value of a dataset as text; "" if it `is_foreign`."""
     return "" if is_foreign(item) else text(first_of(item))
 
 
 def is_foreign(item: h5py.Dataset) -> bool:
-    """Whether a text is behind a link in a file without images: no scan needs it, and its reader would print it."""
+    """Whether a text is behind a link to a file without images: no scan needs it, and a reader would print its
+    content."""
     if item.dtype.kind in "uifb":
         return False
     if item.is_virtual:
@@ -373,7 +374,8 @@ def is_foreign(item: h5py.Dataset) -> bool:
 
 
 def file_of(item: h5py.Dataset) -> str:
-    """The file that holds the values of a dataset: another one behind a link, or that of the first virtual source."""
+    """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
+    source."""
     sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
     return next((name for name in sources if name != "."), str(item.file.filename))
 
@@ -401,13 +403,13 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 
 def first_of(item: h5py.Dataset) -> Any:
-    """The first value of a dataset, which may hold many; of an empty one nothing."""
+    """The first value of a dataset, which may have many; of an empty dataset nothing."""
     _require_brief(item, item.dtype.itemsize)
     return item[()] if item.size <= 1 else item[(0,) * item.ndim]
 
 
 def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
-    """All values of a dataset of so many bytes at most, by default those of a number, a text or a list of a scan.
+    """All values of a dataset of at most so many bytes, by default those of a number, a text or a list of a scan.
 
     Raises:
         DataError: it holds more.
@@ -417,13 +419,14 @@ def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
 
 
 def piece_of(item: h5py.Dataset) -> int:
-    """Bytes that HDF5 unpacks at once: a chunk; of a dataset without chunks, a value."""
+    """Bytes that HDF5 decompresses at once: a chunk; of a dataset without chunks, a value."""
     return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
 
 
 def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
-    """Bytes that HDF5 unpacks for one frame of a dataset of three dimensions, the one numbered `frames` that of
-    frames."""
+    """Bytes that HDF5 decompresses for one frame of a dataset of three dimensions; `frames` is the number of the frame
+    dimension.
+    """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
     return math.prod(pieces) * math.prod(across) * int(item.dtype.itemsize)
@@ -439,7 +442,7 @@ def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> Non
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
-    """The object at a path; None without one, as after a link to a missing file, or in a circle of links."""
+    """The object at a path; None if there is none, as after a link to a missing file, or in a circle of links."""
     try:
         return group[path]
     except (KeyError, OSError, RuntimeError):
@@ -467,7 +470,7 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
 
 
 def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
-    """The dataset at a path; None if it is missing or can hold nothing (a null dataspace).
+    """The dataset at a path; None if it is missing or has a null dataspace.
 
     Raises:
         DataError: a list longer than any scan.
@@ -481,7 +484,7 @@ def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """A number in our unit; None if it is absent, not finite, or in an unknown or missing unit."""
+    """A number in the unit of this program; None if it is absent, not finite, or its unit is unknown or missing."""
     item = dataset(group, path)
     factor = None if item is None else units.get(attribute(item, "units").lower())
     if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
@@ -491,7 +494,9 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
-    """Numbers in our unit, as a list; None where there is no dataset of real numbers, or its unit is not known."""
+    """Numbers in the unit of this program, as a list; None if there is no dataset of real numbers, or its unit is
+    unknown.
+    """
     factor = None if item is None else units.get(attribute(item, "units").lower())
     if item is None or factor is None or item.dtype.kind not in "uif":
         return None
@@ -518,7 +523,7 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
-    """Copy all attributes of an object, with their types and shapes; the target has none of these names."""
+    """Copy all attributes of an object, with their types and shapes; the target must have none of these names."""
     for name in source.attrs:
         given = source.attrs.get_id(name)
         made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
@@ -578,7 +583,7 @@ def _fills(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def require_possible(item: h5py.Dataset) -> None:
-    """DataError for frames [frame, row, col] without pixels, or of a size that no memory holds."""
+    """Raise DataError for frames [frame, row, col] without pixels, or too large for any memory."""
     if 0 in item.shape[1:]:
         raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
@@ -594,7 +599,7 @@ def require_possible(item: h5py.Dataset) -> None:
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
-    """Fill out [frame, row, col] with frames in the order asked for; consecutive ones are read at once.
+    """Fill out [frame, row, col] with frames in the requested order; consecutive ones are read at once.
 
     Raises:
         DataError: the file does not give them: damaged or cut chunks, or a compression that is not installed.
@@ -621,6 +626,6 @@ _SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "t
 
 
 def require_real(dtype: np.dtype[Any], what: str) -> None:
-    """DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
+    """Raise DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
     if dtype.kind not in "uif":
         raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")

@@ -17,7 +17,7 @@ from beamline.storage.writer_lock import abandoned, held
 
 
 def scan_file(path: str | Path) -> Path:
-    """The scan of a path: the file itself, or for the folder of a run the file with all its parts.
+    """The scan file at a path: the file itself, or for the folder of a run the file with all its parts.
 
     Raises:
         DataError: a run without a scan file, one whose parts are not joined, or a folder of runs.
@@ -37,7 +37,7 @@ def scan_file(path: str | Path) -> Path:
 
 
 def volume_file(path: Path) -> Path:
-    """The volume of a path: the file or folder itself, or for the folder of a run its recon.h5.
+    """The volume file at a path: the file or folder itself, or for the folder of a run its recon.h5.
 
     Raises:
         DataError: a run without a volume, or a folder of runs.
@@ -61,7 +61,7 @@ def _no_run(folder: Path, wanted: str) -> Path:
 
 
 def next_step(scan: Path) -> str:
-    """A sentence on the next step for a scan that still runs, died or ended early; "" if nothing is missing."""
+    """A sentence on the next step for a scan that is running, died or ended early; "" if nothing is missing."""
     run = run_of(scan.parent) if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file() else None
     if run is not None:
         parts = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]

@@ -24,11 +24,11 @@ _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piec
 
 
 class PartlyChangedError(DataError):
-    """A disk error when the file had been changed in part."""
+    """A disk error occurred when part of the file had been changed."""
 
 
 class Overlay(UnderHdf5):
-    """Bytes of a file, covered by later writes in memory, for h5py.File(overlay). Torn blocks are made whole.
+    """A file with later writes in memory on top, for h5py.File(overlay). Torn blocks are repaired.
 
     Args:
         length: of the file in bytes; bytes beyond its end are zero.
@@ -40,7 +40,7 @@ class Overlay(UnderHdf5):
         self._pages: dict[int, bytearray] = {}
 
     def copy(self) -> Self:
-        """A copy of the overlay; later writes go to one of the two."""
+        """A copy of the overlay; later writes go to only one of the two."""
         made = type(self)(self.path, self._size)
         made._pages = {page: bytearray(data) for page, data in self._pages.items()}
         return made
@@ -62,7 +62,7 @@ class Overlay(UnderHdf5):
         return len(given)
 
     def put(self, at: int, data: bytes) -> None:
-        """Write these bytes there."""
+        """Write these bytes at this offset."""
         end = at + len(data)
         for page in _pages(at, end):
             begin = page * _PAGE
@@ -78,7 +78,7 @@ class Overlay(UnderHdf5):
 
     @property
     def head(self) -> Superblock:
-        """Superblock of the file with the writes."""
+        """Superblock of the file including the writes."""
         self.seek(0)
         return Superblock(self.read(SIZE), self._there)
 
@@ -89,11 +89,11 @@ class Overlay(UnderHdf5):
 
     @property
     def changed(self) -> bool:
-        """Whether the writes differ from what is on the disk."""
+        """Whether the writes differ from the content of the disk."""
         return bool(self.room or self._differing())
 
     def carry_out(self) -> None:
-        """Change the file.
+        """Write the changes to the file.
 
         Raises:
             DataError: its disk has no room or does not take it; the file is as it was.

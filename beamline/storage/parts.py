@@ -38,8 +38,8 @@ _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_in(file: h5py.File) -> frozenset[int]:
-    """The views of the plan that a file holds, counted from 0. Not those whose frame became invalid, or whose record
-    differs from its checksum.
+    """The planned views in a file, counted from 0, except those whose frame is invalid, or whose record differs from
+    its checksum.
 
     Raises:
         ValueError: a row claims to replace a later one.
@@ -58,7 +58,7 @@ def views_in(file: h5py.File) -> frozenset[int]:
 
 
 def views_planned(file: h5py.File) -> int | None:
-    """Number of planned views of the scan; None if the file does not hold its plan."""
+    """Number of planned views of the scan; None if the file does not contain its plan."""
     angles = _plan_of(file).get("angles_deg")
     return None if angles is None else len(angles)
 
@@ -69,7 +69,7 @@ def _plan_of(file: h5py.File) -> dict[str, Any]:
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
-    """Triggers before the last view that gave no frame, by the frames themselves: for files whose writer died.
+    """Triggers before the last view without a frame, judged by the frames themselves: for files whose writer died.
 
     None of a later part of a run, which takes what the parts before lack, and of files without their plan.
     """
@@ -89,7 +89,7 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references planned after the views that the files of a scan lack, wholly or in part.
+    """Kinds of references planned after the views that are missing, wholly or in part, in the files of a scan.
 
     Args:
         files: all of the scan, in the order that they were taken in.
@@ -128,7 +128,7 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
-    """Make or replace the file with the frames of all parts, in this order; returns their number.
+    """Create or replace the file with the frames of all parts, in this order; returns their number.
 
     Args:
         parts: closed files of one scan, each with a frame at least. They are only read.
@@ -172,7 +172,7 @@ def may_hold_frames(part: Path) -> bool:
 
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
-    """The file that joins this one with other parts of its scan, and how many it joins; None where there is none."""
+    """The file that joins this one with other parts of its scan, and how many it joins; None if there is none."""
     part = part.resolve()
     for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
         joined = folder / JOINED
@@ -194,7 +194,7 @@ def to_join(run: Path) -> str:
 
 
 def require_joined(file: h5py.File) -> None:
-    """Raise DataError if a joined file takes frames from changed parts, or lacks a part.
+    """Raise DataError if a joined file refers to frames of changed parts, or lacks a part.
 
     A file with frames of its own, such as an archived one, always passes.
     """
@@ -274,7 +274,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
 
 
 def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
-    """Copy the first `n` rows of a scan file, with all that is not in rows, into a new, finished file."""
+    """Copy the first `n` rows of a scan file, with all that is not stored by row, into a new, closed file."""
     _copy(file["/"], target, {path: file[path][:n] for path in layout.GROWING})
     for path in _VIRTUAL:
         item = file[path]

@@ -42,7 +42,7 @@ _HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translat
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """Poses of some views, of unbinned pixels.
+    """Poses of some views, in unbinned pixels.
 
     Attributes:
         path: of the file.
@@ -72,7 +72,7 @@ class PoseTable:
 
     @property
     def leans(self) -> bool:
-        """Whether a row of a view may show several slices."""
+        """Whether a row of a view may show several slices, because the view is rolled or tilted."""
         return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
@@ -101,7 +101,7 @@ class _NoPosesError(Exception):
 
 
 def read_poses(text: str) -> PoseTable:
-    """The table that `FILE`, or `FILE:x,-y` of an NXtomo file, names; one without rows for `ignore`.
+    """The table named by `FILE`, or `FILE:x,-y` of an NXtomo file; an empty one for `ignore`.
 
     Raises:
         ValueError: the file cannot be read as poses; the message says why.
@@ -280,7 +280,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:
-    """The poses of the views of a volume file as a CSV that `read_poses` reads; how many views, and the axis' column.
+    """Write the poses of the views of a volume file as a CSV that `read_poses` reads; returns the number of views, and
+    the axis' column.
 
     Raises:
         DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.

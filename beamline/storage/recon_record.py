@@ -24,7 +24,7 @@ _ENDS = {"ended_early": "early", "resumed_from": "resumed_from", "checkpoint_los
 
 @dataclass(frozen=True, eq=False)
 class VoxelsInFile:
-    """float32 voxels, [z, y, x] or [volume, z, y, x], that are in files alone: `read` gives a part where it is used."""
+    """float32 voxels, [z, y, x] or [volume, z, y, x], that are only in files: `read` loads a part when it is needed."""
 
     shape: tuple[int, ...]
     read: Callable[[Any], NDArray[np.float32]]
@@ -41,7 +41,7 @@ class VoxelsInFile:
 
 
 class VolumeField:
-    """A field of a dataclass that holds a volume; voxels in a file alone are read at the first use."""
+    """A field of a dataclass that holds a volume; voxels in a file are read on first use."""
 
     def __get__(self, record: Any, owner: type | None = None) -> Volume:
         if record is None:
@@ -114,7 +114,7 @@ class ReconRecord:
 
     @property
     def grid(self) -> Grid:
-        """Grid of the volume, whose voxels are not read for it."""
+        """Grid of the volume, without reading its voxels."""
         held: Volume = self.__dict__["volume"]
         return held.grid
 
@@ -125,17 +125,17 @@ class ReconRecord:
 
     @property
     def method(self) -> str:
-        """Name of the method; with `auto`, of the one that it chose. Empty in a file of another program."""
+        """Name of the method; for `auto`, of the one that it chose. Empty in a file of another program."""
         return str(self.parameters.get("method", ""))
 
     @property
     def axis_col(self) -> float:
-        """Rotation axis in columns of the full detector; NaN where no file states it."""
+        """Rotation axis in columns of the full detector; NaN if no file states it."""
         return float(self.parameters.get("axis_col", math.nan))
 
     @property
     def ending(self) -> Ending:
-        """How the reconstruction ended, by its parameters."""
+        """How the reconstruction ended, from its parameters."""
         early, *others = (self.parameters.get(name, "") for name in _ENDS)
         return Ending(bool(early), *map(str, others))
 
@@ -207,5 +207,5 @@ class ReconRecord:
 
 
 def recorded_ending(ending: Ending) -> dict[str, Value]:
-    """The parameters that tell how a reconstruction ended; none of one that began anew and came to its end."""
+    """The parameters that state how a reconstruction ended; empty for one that restarted and was completed."""
     return {name: value for name, field in _ENDS.items() if (value := getattr(ending, field))}

@@ -85,7 +85,7 @@ class Recovered:
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
-    """Clear the mark of the dead writer, cut what was not committed, and add what a writer adds at the end.
+    """Clear the mark of the dead writer, truncate uncommitted data, and add what a writer adds at the end.
 
     Args:
         say: is told the room needed, before anything is written.
@@ -95,7 +95,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             10 s: then nothing is changed. Or a disk that does not take it: then it can be run again.
     """
     if not path.is_file():
-        raise DataError(f"{path} is not there. Nothing was changed.")
+        raise DataError(f"{path} does not exist. Nothing was changed.")
     if held(path):
         raise DataError(
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
@@ -122,7 +122,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
 def _checked(path: Path) -> Superblock:
     head = superblock(path)
     if head is None or not head.intact:
-        raise DataError(f"{path} is no HDF5 file that this program wrote. Nothing was changed.")
+        raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
     if head.open_for_writing and abs(age := _now_beside(path) - path.stat().st_mtime) < QUIET:
         raise DataError(
             f"{path} changed {max(age, 0):.0f} s ago and is marked as being written. If its writer is dead, try again "
@@ -173,7 +173,7 @@ def _now_beside(path: Path) -> float:
 
 def _require_ours(path: Path, file: h5py.File) -> None:
     if layout.COMMITTED not in file:
-        raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
+        raise DataError(f"{path} is not a scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
 
 def _mended(path: Path, head: Superblock) -> tuple[Recovered, Overlay]:

@@ -30,8 +30,8 @@ _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5p
 
 
 def require_harmless(file: h5py.File) -> None:
-    """DataError for a file with more objects or deeper groups than any scan. Also for one that draws on a path without
-    a file, or that claims more data than it has.
+    """Raise DataError for a file with more objects or deeper groups than any scan has, for one that refers to a path
+    without a file, and for one that claims more data than it has.
 
     Files that it draws on are looked at, too, and those that they draw on.
     """
@@ -179,7 +179,7 @@ _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far bey
 
 
 def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
-    """Three whole numbers from 1 on, as [z, y, x] of a volume or of a chunk."""
+    """Three integers of at least 1, the shape [z, y, x] of a volume or of a chunk."""
     sides = tuple(said) if isinstance(said, list | tuple) else ()
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
         raise ValueError(f"its {what} is {_brief(said)}; expected three whole numbers")
@@ -210,7 +210,7 @@ def dtype_of(said: Any) -> np.dtype[Any]:
 
 
 def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, stored: int) -> None:
-    """Raise ValueError unless the file stores all voxels from byte `begin` on."""
+    """Raise ValueError unless the file has all voxels from byte `begin` on."""
     needed = math.prod(shape) * dtype.itemsize
     if begin < 0 or begin + needed > stored:
         raise ValueError(
@@ -219,7 +219,7 @@ def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, 
 
 
 def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an .npy; ValueError unless the file has all its values. Its position stays."""
+    """Shape and type of an .npy; raises ValueError unless the file has all its values. The file position is kept."""
     at, stored = file.tell(), os.fstat(file.fileno()).st_size
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -29,7 +29,7 @@ _TIMES, _PHASES = 0x20, 0x10  # flags of an object header: it has these fields
 
 @dataclass(frozen=True)
 class Superblock:
-    """The bytes of a file's head, their fields, and the size of the file."""
+    """The superblock of an HDF5 file: its bytes, its fields, and the size of the file."""
 
     head: bytes
     size: int
@@ -41,30 +41,30 @@ class Superblock:
 
     @property
     def grows(self) -> bool:
-        """Whether it is being written in a way that others may read it meanwhile (SWMR)."""
+        """Whether the file is being written so that others may read it meanwhile (SWMR)."""
         return bool(self.head[_FLAGS] & _GROWS)
 
     @property
     def missing(self) -> int:
-        """Bytes that are missing at the end of the file, by its head."""
+        """Bytes missing at the end of the file, by its superblock."""
         return max(0, self.end - self.size)
 
     @property
     def intact(self) -> bool:
-        """Whether the checksum of the head is right."""
+        """Whether the checksum of the superblock is correct."""
         return self.head[_CHECKSUM] == lookup3(self.head[: _CHECKSUM.start])
 
     @property
     def end(self) -> int:
-        """Length of the file in bytes, as its head states it."""
+        """Length of the file in bytes, as its superblock states it."""
         return int.from_bytes(self.head[_END], "little")
 
     def closed(self, end: int) -> Superblock:
-        """The head of the same file as if it had been closed with so many bytes."""
+        """The superblock of the same file as if it had been closed with so many bytes."""
         return self._with(0, end)
 
     def marked(self) -> Superblock:
-        """The head of the same file as if its writer had died: others may read it."""
+        """The superblock of the same file as if its writer had died, so that others may read it."""
         return self._with(_WRITTEN | _GROWS, self.end)
 
     def _with(self, flags: int, end: int) -> Superblock:
@@ -76,7 +76,7 @@ class Superblock:
 
 
 def superblock(path: Path) -> Superblock | None:
-    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes.
+    """The superblock of a file; None unless the file begins with a supported version with addresses of eight bytes.
 
     Of one of which only the first half was written, as before: its flags come first.
     """
@@ -90,7 +90,7 @@ def superblock(path: Path) -> Superblock | None:
 
 
 def made_whole(at: int, read: memoryview) -> tuple[int, bytes] | None:
-    """Give a torn block the checksum of what is in it: in `read`, the bytes from `at` on that HDF5 asked for.
+    """Repair the checksum of a torn block in `read`, the bytes from `at` on that HDF5 asked for.
 
     Returns:
         where in the file the checksum is, and the right one. None: no block across the end of a page begins at `at`,
@@ -107,7 +107,7 @@ def made_whole(at: int, read: memoryview) -> tuple[int, bytes] | None:
 
 
 def block_size(read: memoryview) -> int:
-    """Bytes of the block that begins here, with its checksum; 0 for anything else."""
+    """Length in bytes of the block that begins here, with its checksum; 0 if no known block does."""
     kind = bytes(read[:5])
     if kind in _OF_ITS_LENGTH:
         return len(read)

@@ -29,7 +29,7 @@ SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", 
 def read_volume(
     path: Path, dataset: str | None = None
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """The volume, and mm from voxel to voxel along its axes where NIfTI, OME-Zarr or `voxel_mm` of an .npz say it.
+    """Read a volume, and the voxel spacing in mm along its axes if NIfTI, OME-Zarr or `voxel_mm` of an .npz state it.
 
     Args:
         dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array of three axes.
@@ -45,7 +45,7 @@ def read_volume(
     if path.is_dir():
         return _from_folder(path), None
     if not path.is_file():
-        raise DataError(f"There is no volume {path}.")
+        raise DataError(f"{path} does not exist.")
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
@@ -71,7 +71,7 @@ def read_volume(
 def axes_of(
     file: h5py.File, dataset: str | None, unit: str = "mm"
 ) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
-    """Spacing and first coordinates (z, y, x) by the arrays z, y, x beside a dataset; None without them in `unit`."""
+    """Spacing and first coordinates (z, y, x) from the arrays z, y, x beside a dataset; None without them in `unit`."""
     node = None if dataset is None else file.get(dataset)
     axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
     if not axes or any(not isinstance(axis, h5py.Dataset) or axis.size < 2 for axis in axes):

@@ -54,14 +54,14 @@ _OFF = {"FALSE", "0", "BEST_EFFORT"}
 
 
 class LockFailure(Enum):
-    """Reason for which HDF5 got no lock."""
+    """Why HDF5 got no lock."""
 
     NO_LOCKS = "no locks"
     HELD = "held"
 
 
 def lock_failure(error: BaseException) -> LockFailure | None:
-    """Whether an error of h5py says that a file could not be locked, and why; None: it is another error."""
+    """Why a file could not be locked, from an error of h5py; None if that is another error."""
     match = re.search(r"unable to lock file, errno = (\d+)", str(error))
     if match is None:
         return None
@@ -69,8 +69,9 @@ def lock_failure(error: BaseException) -> LockFailure | None:
 
 
 def no_locks(folder: Path) -> str:
-    """A sentence if files in a folder cannot be locked, so that HDF5 would create none there; "" if they can, if HDF5
-    is told to do without, or if it cannot be found out."""
+    """A sentence if files in a folder cannot be locked, so that HDF5 cannot create files there; "" if they can, if HDF5
+    is set to use no locks, or if that is unknown.
+    """
     if os.environ.get(SWITCH, "").upper() in _OFF:
         return ""
     with suppress(OSError), tempfile.TemporaryFile(dir=folder, prefix=".beamline-lock-") as file:
@@ -100,7 +101,7 @@ def held_sentence(path: Path) -> str:
 
 
 def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
-    """A file that no program is writing, open to be read; without a lock where its file system has none.
+    """Open for reading a file that no program is writing; without a lock if its file system has none.
 
     Args:
         unlocked: may be opened without a lock.
@@ -119,7 +120,7 @@ def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
 
 
 class WriterLock:
-    """Held from now on until `release`, or until this process ends. Nothing is held where the disk has no locks.
+    """A lock held until `release`, or until this process ends. There is no lock if the file system has none.
 
     Args:
         exclusive: take an exclusive lock, and raise OSError where another process holds one; else a shared one.
@@ -143,7 +144,7 @@ class WriterLock:
 
 
 def held(path: Path) -> bool:
-    """Whether a program that runs has the file open, so far as locks tell; not where the file cannot be opened."""
+    """Whether a running program has the file open, as far as locks tell; False if the file cannot be opened."""
     try:
         file = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
     except OSError:
@@ -160,12 +161,14 @@ def held(path: Path) -> bool:
 
 
 def abandoned(path: Path) -> bool:
-    """Whether no program seems to write the file: it has not changed for QUIET s, and no program that runs holds it."""
+    """Whether no program seems to write the file: it has not changed for QUIET s, and no running program has it
+    open."""
     return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
 
 class WriterWatch:
-    """Tells the follower of a growing file that its writer is gone: at once by the lock, or else by its silence.
+    """Detects, for the follower of a growing file, that its writer has died: at once by the lock, or else by its
+    silence.
 
     Args:
         now: s, by the clock of the follower.
@@ -179,7 +182,7 @@ class WriterWatch:
         self._was_held = self._held = held(path)
 
     def lost(self, now: float, grew: bool, finished: Callable[[], bool]) -> str:
-        """The sign that the writer is gone, as the end of a sentence; "" while there is none.
+        """How the loss of the writer was detected, as the end of a sentence; "" if it was not.
 
         Args:
             grew: since the last call.

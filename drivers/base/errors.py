@@ -45,7 +45,7 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error, reported by a device that uses this one. changed: parts of the error to replace."""
+        """The same error, reported by a device that uses the failed one. changed: parts of the error to replace."""
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 

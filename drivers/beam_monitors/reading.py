@@ -159,7 +159,7 @@ class PageSource:
 
 
 def url_problem(url: str) -> str:
-    """Reason for which a URL cannot be read; "" if it can."""
+    """Why a URL cannot be read; "" if it can."""
     try:
         parts = urlsplit(url)
         legal = parts.scheme == "file" or (parts.scheme in ("http", "https") and bool(parts.hostname))
@@ -175,7 +175,7 @@ _SHOWN = 200  # Characters of the text that an error shows
 
 
 class TextSource(Protocol):
-    """A source of a text that holds the number: an instrument or a web page."""
+    """A source of a text that contains the number: an instrument or a web page."""
 
     request: str
     """The query or URL, for error messages."""
@@ -217,7 +217,7 @@ class TextBeamMonitor:
         self._pattern = re.compile(pattern)
 
     def reading(self) -> BeamReading:
-        """Read the source once. Raises DeviceTimeout, or DeviceError: no number, or over range."""
+        """Read the source once. Raises DeviceTimeout, or DeviceError if there is no number, or it is over range."""
         text = self._source.text()
         time = self._clock.now()
         match = self._pattern.search(text)
@@ -244,7 +244,7 @@ class TextBeamMonitor:
 
 
 def pattern_problem(pattern: str) -> str:
-    """Reason for which a pattern cannot be used; "" if it can."""
+    """Why a pattern cannot be used; "" if it can."""
     try:
         groups = re.compile(within_a_line(pattern)).groups
     except re.error as error:

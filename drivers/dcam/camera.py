@@ -290,6 +290,6 @@ class DcamCamera:
 
 
 def configured(section: Any, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
-    """The camera of a section of a configuration, connected; see `DcamCamera` for errors and `memory`."""
+    """Connect the camera of a section of a configuration; see `DcamCamera` for errors and `memory`."""
     library = None if section.library is None else Path(section.library)
     return DcamCamera(library, section.index, clock=clock, options=section.options, memory=memory)

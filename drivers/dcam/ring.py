@@ -77,7 +77,7 @@ class Ring:
                 self._device,
                 f"its count of frames went back from {before} to {self._count}",
                 request="dcamcap_transferinfo",
-                expected="a count that only grows while a capture runs",
+                expected="a count that only increases during a capture",
                 advice="Check that no other program uses the camera, then arm it again",
                 state=f"{self._next} frames of this run were taken before",
             )

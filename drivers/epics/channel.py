@@ -84,7 +84,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
 
 
 def url_problem(url: str) -> str:
-    """Reason for which a URL names no process variable; "" if it names one."""
+    """Why a URL names no process variable; "" if it names one."""
     scheme, _, name = url.partition("://")
     legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
     return "" if legal else f"{url!r} names no process variable; expected pva://NAME (PVAccess) or ca://NAME"
@@ -97,7 +97,7 @@ def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> N
             device,
             f"{name} has an INVALID alarm: its IOC does not vouch for the value",
             reply=str(value),
-            advice="Look at the record in its own screen: the IOC has lost its controller, or the record was never set",
+            advice="Check the record in its control screen: the IOC lost its controller, or the record was never set",
             state=state,
         )
 

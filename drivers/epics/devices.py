@@ -92,8 +92,7 @@ class PvShutter(_PvDevice):
         self._put(self._closer, self._pvs.close_value, False, lambda: None)
 
     def is_open(self) -> bool:
-        """Whether it is open by its status. Raises DeviceTimeout without an answer, DeviceError if the alarm is
-        INVALID."""
+        """Whether the status is open. Raises DeviceTimeout without an answer, DeviceError if the alarm is INVALID."""
         (status,) = self._status.read("")
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)
@@ -254,12 +253,12 @@ class PvMonochromator(_PvDevice):
         )
 
     def stop(self) -> None:
-        """Stop it where it can be stopped. Raises DeviceError."""
+        """Stop the monochromator, if it can be stopped. Raises DeviceError."""
         for stopper in self._stoppers:
             stopper.write("", 1)
 
     def remember_place(self) -> Callable[[], str]:
-        """See `drivers.base.protocols.Rechecked`. It may be off for less than `settle`, as after a move."""
+        """See `drivers.base.protocols.Rechecked`. The energy may be off for less than `settle`, as after a move."""
         before = self.energy()
 
         def moved() -> str:

@@ -78,7 +78,7 @@ QUIET = 0.05  # s without a byte after which a line counts as silent
 
 @dataclass(frozen=True)
 class Probe:
-    """A query without side effects and the form of its one-line reply; it brings the line into step again."""
+    """A query without side effects and the form of its one-line reply, used to resynchronise the line."""
 
     request: str
     reply: str

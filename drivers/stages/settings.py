@@ -56,7 +56,7 @@ class StageFigures(CheckedSettings):
             raise ValueError(f"from {low:g} to {high:g} deg there is no room to move")
         if not (self.high - self.low) * self.per_radian < MOST:
             raise ValueError(
-                f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can tell apart"
+                f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can resolve"
             )
 
     @property

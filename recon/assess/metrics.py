@@ -159,7 +159,7 @@ def sampled(volume: Array) -> Array:
 
 
 def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[slice, slice, slice]:
-    """The largest box inside the cylinder that every view sees, less a margin: (z, y, x) slices.
+    """The largest box inside the cylinder that every view sees, minus a margin: (z, y, x) slices.
 
     The side is 2 r cos 45° for a circle of radius r = half the smaller of ny and nx. The margin is a fraction of the
     side, and of the height, taken off at each end.
@@ -219,7 +219,7 @@ def _between_two_means(values: NDArray[np.float64]) -> float:
 
 
 def interior_regions(reference: Array, seed: int = 0) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a volume, less their rims, to judge any volume of the same sample.
+    """Dense and empty regions of a volume, without their rims, to assess any volume of the same sample.
 
     Those of `kmeans_mask` of the reference blurred by a voxel, less two voxels at each edge between them. So neither
     the reference's noise nor where exactly its edges lie decides: references of one sample, with noise, streaks or an
@@ -281,7 +281,8 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
 
 
 def contrast(truth: Array, volume: Array) -> dict[str, float]:
-    """What NEMA NU 4-2008 asks of an image of activity, in the regions of the truth, less `_RIM` voxels at each edge.
+    """Figures of merit of NEMA NU 4-2008 for an image of activity, in the regions of the truth, without `_RIM` voxels
+    at each edge.
 
     `recovery`: (hot / body - 1) / (true hot / body - 1), mean of hot voxels. `spillover`: cold / body, of cold regions
     inside the body. `variation`: standard deviation over mean of the body, whose level most voxels of the truth have.

@@ -50,7 +50,7 @@ class QualityCurve:
         return float(np.interp(math.log(steps), np.log(at), gains))
 
     def fixed(self, speeds: Speeds, further: int = 1) -> float:
-        """Time in s beside the steps, with views binned by a further factor."""
+        """Time in s that does not depend on the steps, with views binned by a further factor."""
         placed = (speeds.start + speeds.fill) * self.share / further**3
         finished = self.share == 0 or math.isfinite(speeds.sweep)
         sweeps, trials = (self.sweeps * speeds.sweep, speeds.trials) if self.sweeps > 0 and finished else (0.0, 0.0)
@@ -191,7 +191,7 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
 
 def best_steps(method: str) -> int:
-    """Steps of this method beyond which no measured curve gains: further steps follow the noise."""
+    """Number of steps beyond which no measured curve of this method gains: further steps fit the noise."""
     best = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
     return max(best, default=DEFAULT_STEPS)
 
@@ -322,7 +322,7 @@ def record(seconds: ArrayLike, residuals: ArrayLike) -> tuple[NDArray[np.float64
 
 
 def parse_budget(text: str) -> float:
-    """Seconds of "30s", "2m", "1.5h" or a bare number of seconds.
+    """Parse "30s", "2m", "1.5h" or a bare number to seconds.
 
     Raises:
         ValueError: for anything else, and for a time that is not positive and finite.

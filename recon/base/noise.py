@@ -57,7 +57,7 @@ def noise_level(images: F32) -> float:
 
 
 def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
-    """The smaller one of `noise_level` and the noise at frequencies where no sample has structure.
+    """The smaller of `noise_level` and the noise at frequencies above those of the sample's structure.
 
     While the stage turns by an angle, a point at most R pixels off the axis moves by R times this angle at most. So a
     sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
@@ -118,7 +118,7 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
 
 
 def ring_offsets(residual: F32, geometry: Geometry) -> F32:
-    """Offsets of single pixels [row, col] that stay in all views and become rings in a volume.
+    """Offsets of single pixels [row, col] that are constant over all views and cause rings in a volume.
 
     It is the median of the residual over the views, less its neighbourhood along the row. The wall of a can around the
     axis stays in all views, too, in all rows alike (-1.1 dB on a battery), and on both sides of the axis. So of what
@@ -167,7 +167,7 @@ def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floati
 
 
 def without_layers(stripes: F32, axis_col: float) -> F32:
-    """Stripes [row, col] less what the columns on the other side of the axis have, too.
+    """Stripes [row, col] minus what the columns on the other side of the axis also show.
 
     Where both sides have more in common than twice the standard deviation of what is one-sided, it belongs to layers of
     the sample around the axis: of 800 pairs of independent columns, one has. Columns without one on the other side stay
@@ -272,7 +272,7 @@ _FEWEST_MIRRORED = 20  # mirrored columns
 
 @dataclass(frozen=True)
 class Steadiness:
-    """What stays in the columns of a sinogram through all views, as standard deviations of fine differences.
+    """What is constant over all views in the columns of a sinogram, as standard deviations of fine differences.
 
     A layer of the sample around the axis stays in its columns, too, but in those on both sides of the axis alike. The
     answer of a pixel knows nothing of the pixel on the other side. So stripes are odd about the axis as much as they
@@ -294,12 +294,12 @@ class Steadiness:
 
     @property
     def stripes(self) -> bool:
-        """Whether pixels answer unequally."""
+        """Whether the pixels respond unequally."""
         return self.score > _SEEN and self.odd > _ONE_SIDED * self.even
 
 
 def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
-    """How steady and how one-sided the columns of sinograms are; None: too few columns have a mirrored one.
+    """How constant and how asymmetric the columns of sinograms are; None if too few columns have a mirrored one.
 
     Args:
         sinograms: [view, row, col] in the order of the angles.

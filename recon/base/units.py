@@ -43,7 +43,7 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
 
 
 def warn_of_degrees(angles: NDArray[np.floating]) -> None:
-    """A UserWarning if angles look like degrees; it names the line that called the asking function."""
+    """Give a UserWarning if angles look like degrees; it names the line that called the asking function."""
     if look_like_degrees(angles):
         warnings.warn(
             f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
@@ -111,8 +111,9 @@ def _some(projections: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def look_like_light(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like transmission of a brighter beam, as counts and
-    percents do: far above 1 at the edges of the views, and less where the sample is."""
+    """Whether values [view, row, col] given as line integrals look like transmission of a brighter beam, such as counts
+    or percent: far above 1 at the edges of the views, and lower behind the sample.
+    """
     if projections.ndim != 3 or not projections.size:
         return False
     some, edge = _some(projections), projections.shape[2] // _EDGE or 1
@@ -122,8 +123,9 @@ def look_like_light(projections: NDArray[np.floating]) -> bool:
 
 
 def look_negative(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like those of the other sign: the logarithm of
-    transmission, which is 0 beside the sample and falls where it is. Differences of views are of both signs."""
+    """Whether values [view, row, col] given as line integrals look like their negatives: the logarithm of transmission,
+    which is 0 beside the sample and negative behind it. Differences of views have both signs.
+    """
     if projections.ndim != 3 or not projections.size:
         return False
     some = _some(projections)
@@ -133,7 +135,7 @@ def look_negative(projections: NDArray[np.floating]) -> bool:
 
 
 def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:
-    """A UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
+    """Give a UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
 
     Args:
         stacklevel: of the warning; 3 names the line that called the asking function.

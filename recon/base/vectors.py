@@ -28,7 +28,7 @@ _CLEAN = 1e-9  # rad, pixels, or of the distance to the source: what is less is 
 
 
 def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, cone: bool) -> Geometry:
-    """The geometry of views that vectors describe: any direction of a parallel beam, any source of a cone.
+    """The geometry of views described by vectors: any direction of a parallel beam, any source of a cone beam.
 
     Detectors have square pixels of one size. That of a parallel beam stands across the beam; that of a cone has one
     distance from its source in all views, and need not face the origin.
@@ -82,7 +82,7 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
 
 
 def vectors_of(geometry: Geometry) -> F64:
-    """The vectors [view, 12] of a geometry, in mm; of a parallel beam the first three are its direction.
+    """The vectors [view, 12] of a geometry, in mm; for a parallel beam the first three are its direction.
 
     Raises:
         ValueError: rows that were read one after the other, each at an angle of its own.

@@ -97,7 +97,7 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: 
 
 
 def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most `n` of the frames, evenly spread; of a full turn half as many, and with each the one opposite to it.
+    """At most `n` of the frames, evenly spread; of a full turn half as many, each with the opposite one.
 
     Args:
         angles: [frame], radians.
@@ -114,7 +114,7 @@ def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64])
 
 
 def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """At most `n` of the items [item], evenly spread, with the first and the last."""
+    """At most `n` of the items [item], evenly spread, including the first and the last."""
     if items.size <= n:
         return items
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
@@ -134,5 +134,5 @@ def used_and_kept_back(
     if kept_back.size >= n_views:
         raise ValueError(f"all {n_views} views are held out: none is left for the fit")
     if early_stop and not kept_back.size:
-        raise ValueError("early_stop looks at views held out, and there are none")
+        raise ValueError("early_stop needs held-out views, and there are none")
     return np.setdiff1d(np.arange(n_views), kept_back), kept_back

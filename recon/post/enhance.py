@@ -161,7 +161,7 @@ def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float
 
 
 def rescaled(volume: F32, low: float = 0.5, high: float = 99.5) -> F32:
-    """Grey values from 0 at the `low` to 1 at the `high` percentile, cut at both.
+    """Grey values rescaled from 0 at the `low` to 1 at the `high` percentile, clipped at both.
 
     Raises:
         ValueError: the percentiles are no range, or their values are equal.
@@ -183,7 +183,7 @@ def _range(volume: F32, low: float, high: float) -> tuple[float, float]:
 def enhanced(
     volume: F32, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0, sigma: float = 0.7
 ) -> F32:
-    """Rescaled, raised to the power `gamma`, then smoothed by a Gaussian.
+    """Grey values rescaled, raised to the power `gamma`, then smoothed by a Gaussian.
 
     A gamma other than 1 moves edges, since half of the grey value is then not half of the attenuation.
 

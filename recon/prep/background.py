@@ -57,13 +57,13 @@ class Background:
     level: float
 
     def confirmed(self, noise: float) -> bool:
-        """Whether it is large enough, and leaves little more than noise in air that was not fitted."""
+        """Whether the surface is significant, and leaves little more than noise in air that was not fitted."""
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
     @property
     def may_be_matter(self) -> bool:
-        """Whether it is positive: weak matter all around the sample would look the same."""
+        """Whether the background is positive: weak matter all around the sample would look the same."""
         return self.level > 0
 
     def remove(self, views: F32, factor: int = 1) -> None:
@@ -103,7 +103,7 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums over the air of views, which are all that fits of polynomials of any order need."""
+    """Sums over the air of views, sufficient for fitting polynomials of any order."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
         """Start sums for views of a detector (rows, cols), binned by a factor."""

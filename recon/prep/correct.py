@@ -160,7 +160,7 @@ class Correction:
         return self._waiting is not None
 
     def provisional(self) -> Projections | None:
-        """Line integrals of the waiting view, as if no view came after it; None without one.
+        """Line integrals of the waiting view, as if no view followed; None if no view waits.
 
         It keeps waiting, because all its zingers show only beside both neighbours."""
         if self._waiting is None:
@@ -172,7 +172,7 @@ class Correction:
 
     @property
     def air_columns(self) -> tuple[int, int]:
-        """(left, right) columns of air by the views surveyed so far; (0, 0): no columns."""
+        """(left, right) columns of air from the views surveyed so far; (0, 0) if there are none."""
         air = self._settings.air
         if air != "auto":
             return (0, 0) if air == "none" else air
@@ -359,7 +359,7 @@ def correct(
 
 
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
-    """Join batches of a scan's views. The list is emptied meanwhile, so that few views are in memory twice.
+    """Join batches of a scan's views. The list is emptied meanwhile, so that only few views are in memory twice.
 
     The air columns and the mask are those of the last batch.
 

@@ -47,7 +47,7 @@ class DynamicFlats:
         return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """The flat of this view [row, col] (without its dark); it has the level of the mean."""
+        """The flat of this view [row, col] (without its dark), with the level of the mean flat."""
         w = self.weights_of(view, floor)
         return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 

@@ -116,7 +116,7 @@ def mass_attenuation(name: str, energies: ArrayLike) -> F64:
 
 
 def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float:
-    """Gray at the surface that photons of one energy enter: fluence x energy x absorption of energy.
+    """Entrance dose in gray of photons of one energy: fluence x energy x mass energy absorption.
 
     Absorbed are the energies of photoelectrons and of Compton electrons. Fluorescence counts as absorbed, which is too
     much by up to a quarter just above an edge. Inside, the dose is less by the attenuation above. xraylib's own
@@ -126,7 +126,7 @@ def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float
         ValueError: as `delta_beta`, or an energy outside 1 to 200 keV.
     """
     if not 1.0 <= energy_kev <= 200.0:
-        raise ValueError(f"a dose is known from 1 to 200 keV; got {energy_kev:g} keV")
+        raise ValueError(f"doses are tabulated from 1 to 200 keV; got {energy_kev:g} keV")
     kept = energy_kev / (_ELECTRON_KEV + 2.1 * energy_kev)  # mean share of a Compton electron, to 2 % (Klein-Nishina)
     absorbed = sum(  # cm²/g
         share * (xraylib.CS_Photo(z, energy_kev) + kept * xraylib.CS_Compt(z, energy_kev))

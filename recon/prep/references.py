@@ -76,7 +76,7 @@ def check(references: References) -> None:
 
 
 def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
-    """The dark of an exposure, s: offset and dark current are linear in it, so that two darks tell that of any other.
+    """The dark for an exposure in s: offset and dark current are linear in it, so that two darks determine any other.
 
     Args:
         darks: (exposure, image [row, col]), one or more, of different exposures.

@@ -37,7 +37,7 @@ WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=
 
 
 def while_views_come(settings: FitSettings) -> FitSettings:
-    """The same, with the caller's settings where these differ from the defaults."""
+    """The same settings with the caller's where these differ from the defaults."""
     usual = FitSettings()
     chosen = {
         f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
@@ -48,7 +48,7 @@ def while_views_come(settings: FitSettings) -> FitSettings:
 
 
 def fallen(steps: int, settings: FitSettings) -> float:
-    """Share, 0..1, of the rates' logarithmic way to the last ones after so many steps.
+    """Fraction, 0..1, of the logarithmic decay of the rates that is done after so many steps.
 
     Rates that are lower from the start fall as much later.
     """
@@ -57,7 +57,7 @@ def fallen(steps: int, settings: FitSettings) -> float:
 
 
 def average(state: FitState, since: int) -> None:
-    """Add the parameters to their mean, at every fourth step; the first ones start it.
+    """Include the parameters in their running mean, at every fourth step; the first ones start it.
 
     Args:
         since: the step that the last quarter is counted from.
@@ -110,12 +110,12 @@ def next_view(n_views: int, rng: np.random.Generator) -> int | None:
 
 
 def is_held_out(view: int) -> bool:
-    """Whether the view of this number is not learnt before the last round: it judges the volumes so far."""
+    """Whether the view of this number is held out until the last round, to assess the volumes so far."""
     return view % _ONE_IN == _ONE_IN // 2
 
 
 def covered_angle(theta: NDArray[np.float64]) -> float:
-    """The angle that views cover, modulo π: π less the widest gap."""
+    """The angle that views cover, modulo π: π minus the widest gap."""
     ordered = np.sort(np.mod(theta, np.pi))
     return float(np.pi - np.diff(ordered, append=ordered[0] + np.pi).max())
 
@@ -136,7 +136,7 @@ _COMPARED = 4  # views held out, the last ones
 
 
 def volume_error(rendered: F32, measured: F32) -> float:
-    """The error of a volume along the rays of views [..., col], relative to what is measured: √Σ|ω||F Δ|² over it."""
+    """The error of a volume along the rays of views [..., col], relative to the measured: √Σ|ω||F Δ|² over it."""
     n = 2 * measured.shape[-1]
     ramp = np.arange(n // 2 + 1)
 
@@ -154,7 +154,7 @@ def direct_volume(images: Sequence[F32], geometry: Geometry, grid: Grid) -> F32:
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """The `volume_error` of the fit and of FBP, in views held out of a growing scan and as many others; NaN: not known.
+    """The `volume_error` of the fit and of FBP in held-out views of a growing scan and as many others; NaN: unknown.
 
     A volume's error is least at the angles of views and largest in the gaps. A view held out alone shows a gap that is
     twice as wide as the others, which FBP bears worse than a fit.
@@ -167,7 +167,7 @@ class PredictionErrors:
     def of(
         cls, images: Sequence[F32], geometry: Geometry, held_out: Sequence[int], render: Callable[[int], F32]
     ) -> Self:
-        """Errors in the last views held out and those before them; FBP is of all views that are not held out.
+        """Errors in the last held-out views and those before them; FBP uses all views that are not held out.
 
         NaN where none is, or the beam is not one of FBP's slices.
 
@@ -190,7 +190,7 @@ class PredictionErrors:
 
 @dataclass(frozen=True, eq=False)
 class BetterVolume:
-    """The volume of the views so far that predicts views held out best, 1/mm. `direct`: it is FBP's, else the fit's."""
+    """The volume of the views so far that predicts held-out views best, 1/mm. `direct`: it is FBP's, else the fit's."""
 
     volume: Volume
     direct: bool
@@ -200,7 +200,7 @@ class BetterVolume:
     def of(
         cls, state: FitState, problem: FitProblem, settings: FitSettings, grid: Grid, held_out: Sequence[int]
     ) -> Self:
-        """The better volume of a problem's views; the fit in this state has not seen those held out."""
+        """The better volume of a problem's views; the fit in this state was not fitted to the held-out ones."""
 
         def render(view: int) -> F32:
             return problem.backend.numpy(next(renders(state, problem, settings, [view])))

@@ -15,7 +15,7 @@ from recon.splatting.backend import Backend, Cpu, Pass
 
 
 class On(NamedTuple):
-    """Unit of the densities, kernel and backend of raw parameters."""
+    """Unit of the densities, kernel and backend for raw parameters."""
 
     unit: float
     kernel: Kernel
@@ -23,14 +23,16 @@ class On(NamedTuple):
 
 
 class Project(torch.autograd.Function):
-    """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
+    """Projection of raw parameters on a backend. The backward pass renders each view again, and stores no table of
+    it."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, geometry: Geometry,
         how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
-        """Images [view, row, col]; `how` is what is too faint, the truncation in standard deviations, and the rays."""
+        """Images [view, row, col]; `how` has the faintness limit, the truncation in standard deviations, and the
+        rays."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = on, geometry, how
         run = _begin((means, log_scales, quaternions, raw), on)
@@ -49,14 +51,14 @@ class Project(torch.autograd.Function):
 
 
 class Voxelize(torch.autograd.Function):
-    """Voxels of raw parameters on a backend."""
+    """Voxelization of raw parameters on a backend."""
 
     @staticmethod
     def forward(
         ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, grid: Grid,
         how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
-        """Density [z, y, x]; `how` is what is too faint, and the truncation in standard deviations."""
+        """Density [z, y, x]; `how` has the faintness limit, and the truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = on, grid, how
         run = _begin((means, log_scales, quaternions, raw), on)

@@ -113,7 +113,7 @@ _BEST = "best."  # names of the best model's arrays in a checkpoint begin so
 
 @dataclass(eq=False)
 class HeldOutTracker:
-    """Tracks the residual of views held out, and keeps the model with the lowest one."""
+    """Tracks the residual of held-out views, and keeps the model with the lowest one."""
 
     problem: FitProblem | None
     settings: FitSettings

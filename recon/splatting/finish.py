@@ -87,7 +87,7 @@ Fit = Callable[[ReconProblem, RunControl, float], Reconstruction]
 
 @dataclass(eq=False)
 class Candidates:
-    """Residuals of views held out by each candidate, [view]; None: not tried.
+    """Residuals [view] of held-out views for each candidate; None: not tried.
 
     Attributes:
         direct, smooth, patches, fit: FBP, total variation, sparse patches, and a fit that the better of these refines.
@@ -185,7 +185,7 @@ def _without(problem: VoxelProblem, beyond: F32 | None) -> VoxelProblem:
 
 
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
-    """[view, row, col] what Gaussians explain of the views, and no voxels of their volume can; None: nothing.
+    """[view, row, col] the part of the views explained by Gaussians, but not by voxels of their volume; None: nothing.
 
     That is matter beyond the box: what Gaussians that reach there add to the views, but not to the voxels.
     Measured views alone would bend the volume, by -12 dB on a region of interest and -22 dB in the end slices of a
@@ -224,7 +224,7 @@ def refine(
 
 
 def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fit: Fit) -> Candidates:
-    """Residuals of views held out by total variation, sparse patches and a fit, and the decisions on their prior.
+    """Residuals of held-out views with total variation, sparse patches and a fit, and the decisions on their prior.
 
     The trials see sixteen rows. Each candidate predicts views by its whole model: Gaussians show what lies beyond the
     box, and edges within voxels, too. A fit of all views would know the views held out, so this one is of its own. It
@@ -272,7 +272,7 @@ class _Finish:
 
 
 class Finished(NamedTuple):
-    """The refined volume, and the sweeps of total variation that it took; 0: it is the fit's."""
+    """The refined volume, and the sweeps of total variation used for it; 0: it is the fit's."""
 
     volume: Volume
     sweeps: int

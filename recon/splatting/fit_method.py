@@ -49,18 +49,18 @@ class FitMethod(Method, Protocol):
 
     @property
     def by_content(self) -> bool:
-        """Views held out tell whether the fit pays, see `finish.judged`."""
+        """Whether held-out views decide if the fit is worthwhile, see `finish.judged`."""
 
     def for_trial(self, share: float, of_steps: float) -> Self:
         """The fit alone, of this share of the rows, with this share of the steps."""
 
     @property
     def least_steps(self) -> int | None:
-        """The fewest after which the data may end the fit; `planned_steps` where they cannot."""
+        """The fewest steps after which the data may end the fit; `planned_steps` if they cannot."""
 
     @property
     def finish_sweeps(self) -> int:
-        """Sweeps of total variation in the finish; 0: there is none."""
+        """Sweeps of total variation in the finish; 0 without a finish."""
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that grows while views with the geometry of `template`, whose angles are ignored, arrive.

@@ -134,7 +134,7 @@ class Gaussians:
 
 
 def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaussians:
-    """Each Gaussian turned about the axis by the skew up to its row; one that is many rows high does not bend.
+    """Each Gaussian turned about the axis by the skew at its row; a Gaussian over many rows is not bent.
 
     Args:
         sense: -1: from the object's frame to that which all rows see at the angle of the first; 1: back.
@@ -175,7 +175,7 @@ _THIN, _LONG = 0.5, 10.0  # pixels of a standard deviation that views do not res
 
 @dataclass(frozen=True)
 class Needles:
-    """Gaussians beyond what the views resolve.
+    """Gaussians thinner than the views resolve.
 
     Attributes:
         thin: share of the mass in Gaussians with a width below half a pixel.
@@ -189,7 +189,7 @@ class Needles:
 
 
 def needles(gaussians: Gaussians, geometry: Geometry) -> Needles:
-    """Shares by mass, density times the three widths; widths are standard deviations."""
+    """Shares of the mass, density times the three widths; widths are standard deviations."""
     values = gaussians.physical()
     widths = np.sort(values["widths"].astype(np.float64), axis=1)
     mass = values["densities"] * widths.prod(axis=1)

@@ -67,7 +67,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """The same, estimated quickly at the beginning from binned pixels."""
+    """Time of a sweep of FISTA-TV, estimated quickly at the beginning from binned pixels."""
     factor = max(1, min(geometry.detector_shape[1] // _COLS, geometry.detector_shape[0]))
     coarse = geometry.binned(factor)
     box = Grid.of_field(coarse, coarse.sample_pitch)
@@ -76,7 +76,7 @@ def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def first_draw_seconds(grid: Grid, count: int, now: Clock) -> float:
-    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, which count as matter."""
+    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, as if all were matter."""
     nz, ny, nx = grid.shape
     slices = min(_DRAWN, nz)
     slab, rng = grid.part(slice(0, slices), slice(0, ny), slice(0, nx)), np.random.default_rng(0)
@@ -146,7 +146,7 @@ def planned_finish(method: FitMethod, remaining: float, steps: float, problem: R
 
 @dataclass(frozen=True, eq=False)
 class LastRound:
-    """The last round of a fit, over the views that it has learnt already, and the sweeps after it.
+    """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
 
     Attributes:
         fit: holds the line integrals of the problem that it is run on, in the same order.
@@ -215,11 +215,11 @@ class LastRound:
         return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)
 
     def toy(self) -> Self:
-        """The same: its kernels were compiled when the fit began."""
+        """The same method: its kernels were compiled when the fit began."""
         return self
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Most bytes beside the projections: as the method that began the fit."""
+        """Peak memory in bytes without the projections: that of the method that began the fit."""
         return self.method.memory(geometry, grid, weighted)
 
 

@@ -191,12 +191,12 @@ def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid
 
 
 def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
-    """The sweeps that make the first volume; None: FBP or FDK does."""
+    """The sweeps that make the first volume; None if FBP or FDK makes it."""
     return OsSirtTv(iterations=START_SWEEPS, momentum=True) if _swept(geometry, start) else None
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:
-    """About how many sweeps of FISTA-TV over all views take as long as the first volume."""
+    """Approximate number of sweeps of FISTA-TV over all views that take as long as the first volume."""
     return 2 * START_SWEEPS if _swept(geometry, start) else 1.0
 
 

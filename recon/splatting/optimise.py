@@ -27,7 +27,7 @@ NORMALISE = 100  # steps between two normalisations of the quaternions
 
 @dataclass(eq=False)
 class FitState:
-    """All that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
+    """Everything that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
 
     `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels. They live on the
     backend's device. `mean` is a running mean of the parameters, or None, see `anytime`. Where `fused` makes the steps,
@@ -209,7 +209,7 @@ def _fused(
 
 
 def settle(state: FitState) -> None:
-    """Wait until the arrays of a state hold all its steps: before they are read."""
+    """Wait until the arrays of a state include all its steps, before they are read."""
     if state.fused is not None:
         state.fused.settle()
 

@@ -56,7 +56,7 @@ class FitProblem:
 
     @property
     def scale(self) -> np.float32:
-        """Line integrals over what `images` hold."""
+        """Factor from `images` to line integrals."""
         return np.float32(self.half_field * self.unit)
 
     @property

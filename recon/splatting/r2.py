@@ -79,12 +79,12 @@ class R2(Checked):
 
     @property
     def planned_steps(self) -> int | None:
-        """Steps that end the fit; None where `seconds` alone do."""
+        """Number of steps that end the fit; None if only `seconds` do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
     @property
     def by_content(self) -> bool:
-        """Views held out tell whether the fit pays."""
+        """Whether held-out views decide if the fit is worthwhile."""
         given = self.steps is not None or self.seconds is not None or self.finish is not None
         return not (given or self.early_stop or isinstance(self.gaussians, Gaussians))
 
@@ -93,7 +93,7 @@ class R2(Checked):
         return MODEL_STEPS if self.by_content else self.planned_steps
 
     def as_candidate(self) -> Self:
-        """The fit that competes with methods on voxels: it is made, whatever they predict."""
+        """The fit that competes with methods on voxels: it is run, whatever they predict."""
         return replace(self, steps=self.planned_steps) if self.by_content else self
 
     def for_trial(self, share: float, of_steps: float) -> Self:

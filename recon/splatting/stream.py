@@ -122,7 +122,7 @@ class StreamingFit:
 
     @property
     def n_unlearnt(self) -> int:
-        """Views that no step has taken yet."""
+        """Number of views that no step has used yet."""
         return len(self._unseen)
 
     @property
@@ -135,7 +135,7 @@ class StreamingFit:
         return self._state is not None
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
-        """Line integrals [k, row, col] at angles [k] in radians; they count from the next step on.
+        """Add line integrals [k, row, col] at angles [k] in radians; they are used from the next step on.
 
         Raises:
             ValueError: where shapes disagree with the template, values are not finite, or a view holds nothing but
@@ -166,7 +166,7 @@ class StreamingFit:
             ValueError: there is no model yet.
         """
         if self._state is None or self._problem is None:
-            raise ValueError("there is no model yet, and nothing to compare the newest view with")
+            raise ValueError("there is no model yet that could be compared with the newest view")
         problem = self._problem
         (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
         return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
@@ -270,7 +270,7 @@ class StreamingFit:
 
     @property
     def last_steps(self) -> int:
-        """Steps of the last round: what the fit lacks of a fit of all views at once, and each view once at least.
+        """Steps of the last round: those missing to a fit of all views at once, and at least one for each view.
 
         Never more than such a fit has. So a fit that had to wait for its processor makes up for it.
         """
@@ -317,7 +317,7 @@ class StreamingFit:
         return fit.volume_of(averaged(self._state), self._grid, self._template, self._settings)
 
     def shown(self) -> BetterVolume:
-        """The volume that predicts views held out better: that of the model, or FBP of the views so far."""
+        """The volume that predicts held-out views better: that of the model, or FBP of the views so far."""
         if self._problem is None or self._state is None:
             return BetterVolume(self.snapshot(), False, PredictionErrors())
         apart = np.flatnonzero(self._held_out).tolist()

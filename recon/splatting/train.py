@@ -107,7 +107,7 @@ class _Views:
             weights = weights / np.float32(usual_weight(weights, data))
         blank = kept_back[~data[kept_back].any(axis=(1, 2))]
         if blank.size:
-            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
+            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere; choose other held-out views")
         views, start = geometry.select(used), method.gaussians
         pixel_grid = Grid.for_fit(geometry, problem.grid)
         usual = default_count(views, pixel_grid.voxel_size)
@@ -247,7 +247,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
 
 
 def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
-    """Residuals of views held out by a fit and by methods on voxels."""
+    """Residuals of held-out views for a fit and for methods on voxels."""
 
     def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
         share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]

@@ -62,7 +62,7 @@ class Displacement:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How well a volume predicts views held out of it, see `judge`.
+    """How well a volume predicts held-out views, see `judge`.
 
     Attributes:
         alone: deviation of the longest part's views from a volume of that part.
@@ -100,7 +100,7 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
 
 
 def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: int = 3) -> F32:
-    """Images [view, row, col] that are magnified by `factor`, as they are without; 0 beyond what they show.
+    """Images [view, row, col] with the magnification `factor` removed; 0 outside the field.
 
     Args:
         centre: row and column that keep their place.
@@ -115,7 +115,7 @@ def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: 
 
 
 def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
-    """Pixels [view, row, col] of `unmagnified` that pixels which were measured alone determine."""
+    """Pixels [view, row, col] of `unmagnified` that are determined by measured pixels only."""
     return unmagnified(there.astype(np.float32), factor, centre, order=1) > _MEASURED
 
 
@@ -128,7 +128,7 @@ def displacements(
     rounds: int = 3,
     optics: bool = False,
 ) -> list[Displacement]:
-    """The displacement of each part against the longest one.
+    """The displacement of each part relative to the longest one.
 
     Precise to some 0.1 pixel if matter has edges. Motion by more than a tenth of the field, or with deformation, is
     not found, see `judge`.
@@ -165,7 +165,7 @@ def displacements(
 def judge(
     projections: F32, geometry: Geometry, parts: Parts, known: NDArray[np.bool_], moves: Sequence[Displacement]
 ) -> Judgement:
-    """Deviations of views held out, from volumes of the longest part and of all parts; arguments as `displacements`.
+    """Deviations of held-out views, for volumes of the longest part and of all parts; arguments as for `displacements`.
 
     If the displacement is right, the other parts improve the prediction of the longest part's views.
     """

@@ -30,7 +30,7 @@ _WIDEST_GAP = 3.0  # largest gap, in even steps: golden-ratio angles leave gaps 
 
 @dataclass(frozen=True)
 class Goal:
-    """When views are enough; if there are two limits, both must be met.
+    """When views suffice; if there are two limits, both must be met.
 
     Attributes:
         psnr_gain_per_10_views: dB that ten more views may add; None: any.
@@ -53,7 +53,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Gain:
-    """The predicted gain by the views to come.
+    """The predicted gain of further views.
 
     Attributes:
         n_views, planned: so far, and in all.
@@ -75,14 +75,14 @@ class Gain:
         return cls(n_views, planned, mean, mean - error, mean + error)
 
     def share_of(self, views: int) -> float:
-        """The share of the gain by the next `views`, if the error falls as a power of their number."""
+        """The fraction of the gain from the next `views`, if the error follows a power of their number."""
         if self.n_views + views >= self.planned:
             return 1.0
         return math.log1p(views / self.n_views) / math.log(self.planned / self.n_views)
 
 
 def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, samples: int) -> list[float]:
-    """Random samples of the gain by the views to come, dB of PSNR.
+    """Random samples of the gain of further views, in dB of PSNR.
 
     Computed on the two to eight rows with most matter, by eight sweeps of FISTA-TV from FBP, the weight by the noise.
     Measured against true gains: tests/bench/test_enough_views.py.
@@ -96,7 +96,7 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
     """
     n, cols = len(data), data.shape[2]
     if not 2 <= n < geometry.n_views:
-        raise ValueError(f"{n} of {geometry.n_views} views leave nothing to predict")
+        raise ValueError(f"{n} of {geometry.n_views} views leave no view to predict")
     rows = busiest_rows(data, min(max(_PIXELS // cols**2, _ROWS[0]), _ROWS[1]))
     part = np.ascontiguousarray(data[:, rows])
     planned = geometry.rows(rows.start, rows.stop)
@@ -115,7 +115,7 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
             for some, of in ((views[:n], so_far), (views, planned))
         )
         if min(fewer, all_) == 0:
-            raise ValueError("the views so far hold no matter")
+            raise ValueError("the views so far show no matter")
         return 10 * math.log10(fewer / all_)
 
     return [one() for _ in range(samples)]

@@ -25,7 +25,7 @@ _FULL = 0.5  # share of the fullest row's mass that a row needs
 
 @dataclass(frozen=True)
 class FieldEdges:
-    """The edges of parallel views or of a cone.
+    """Line integrals at the left and right edge of parallel or cone-beam views: where the sample exceeds the field.
 
     Attributes:
         levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
@@ -40,7 +40,7 @@ class FieldEdges:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
-        """Edge levels of up to 32 views, in the rows that hold matter.
+        """Edge levels of up to 32 views, in the rows that show matter.
 
         Medians over views and rows: corners at some angles do not count. The least of the quarters: a beam drifts away
         from its flats, a sample is there from the first to the last view. A full turn about an axis off the middle is
@@ -70,7 +70,7 @@ class FieldEdges:
         return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))), of_views, views)
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
-        """The edges beyond which the sample goes on, with their line integrals; empty where it is in the field.
+        """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.
 
         Args:
             least: line integral that a beam which changes may leave; 0 of views whose air is at zero.
@@ -78,7 +78,7 @@ class FieldEdges:
         return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
 
     def passing(self) -> dict[str, tuple[int, int]]:
-        """The edges at which matter goes out of the field in a part of the scan, with the first and last such view.
+        """The edges at which matter leaves the field in a part of the scan, with the first and last such view.
 
         Empty where a view has matter at both edges: it is wider than the field, or the beam has changed.
         """
@@ -127,7 +127,7 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
 
 
 def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
-    """The columns of `images` [view, row, col] that see matter, with some air beside it, and the box that holds it.
+    """The columns of `images` [view, row, col] that show matter, with some air beside it, and the box that contains it.
 
     None: they are all columns, or rows do not show slices around the detector's middle.
     """

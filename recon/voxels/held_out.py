@@ -55,7 +55,7 @@ def beyond_chance(gains: F64, errors: float) -> bool:
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """[view] root mean square of what a volume leaves of each view, at the resolution of voxels.
+    """[view] root mean square residual of a volume in each view, at the resolution of voxels.
 
     The truth leaves the noise alone, by that; of views as measured it would leave more than a sharper volume does.
 
@@ -76,14 +76,14 @@ def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: Vie
 
 
 def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one of so many to judge by, evenly spread in angle."""
+    """Views to reconstruct from, and one in so many held out, evenly spread in angle."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
 
 
 def choice_sweeps(geometry: Geometry) -> float:
-    """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
+    """Cost of `choose_weight` in sweeps over all rows: four trials as a rule; 0 if no view is held out."""
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
@@ -91,7 +91,8 @@ def choice_sweeps(geometry: Geometry) -> float:
 def predicted_views(
     method: Method, data: F32, geometry: Geometry, grid: Grid, known: NDArray[Any] | None, one_in: int
 ) -> tuple[NDArray[np.intp], F32]:
-    """Numbers of the views held out, one in so many by angle, and their images [view, row, col] by the others.
+    """Numbers of the held-out views, one in so many by angle, and their images [view, row, col] predicted by the
+    others.
 
     Args:
         method: that makes the volume.
@@ -109,14 +110,14 @@ def predicted_views(
 
 @dataclass(frozen=True, eq=False)
 class BestStrength:
-    """The strength of a prior that views held out prefer, and the least residual in its search, of each [view]."""
+    """The best strength of a prior by held-out views, and the least residual [view] in its search."""
 
     strength: float
     residuals: F64
 
 
 def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> BestStrength | None:
-    """The strength of a prior whose residual is least, sought in octaves from `first`.
+    """The strength of a prior whose residual is least, searched in octaves from `first`.
 
     No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
     standard error of the least is an octave or two above it: a teapot refined from a fit loses 1.1 dB by one.) The
@@ -155,7 +156,7 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Be
 def choose_weight(
     problem: VoxelProblem, start: F32, sweeps: int, trial: Callable[[], HeldOutTrial | None] | None = None
 ) -> NoiseBalance | float:
-    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by views held out, where there are any, else by the noise.
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by held-out views, if there are any, else by the noise.
 
     μ is that of all views: noise and prior do not depend on their number. It is sought from FBP: a fit knows the views
     held out, and any weight takes it away from them.
@@ -193,7 +194,7 @@ class AllColumns(NamedTuple):
 
 
 class HeldOutTrial:
-    """Volumes of a slab from seven of eight views, judged by the others.
+    """Volumes of a slab from seven of eight views, assessed with the others.
 
     Attributes:
         problem: of the slab.
@@ -216,7 +217,7 @@ class HeldOutTrial:
 
     @classmethod
     def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
-        """The trial of the rows with most matter; of a cone of those in the middle.
+        """The trial of the rows with most matter; for a cone beam of those in the middle.
 
         Columns of air far beside the sample are left out.
 
@@ -275,7 +276,7 @@ class HeldOutTrial:
 
     @property
     def ended(self) -> bool:
-        """Whether the trials were ended; no volume is judged any more."""
+        """Whether the trials were stopped; no further volume is assessed."""
         return self._ended
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
@@ -309,7 +310,7 @@ class HeldOutTrial:
         return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all
 
     def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
-        """`unseen_residuals` of a volume [y, x, z]; infinite where the trials were ended.
+        """`unseen_residuals` of a volume [y, x, z]; infinite if the trials were stopped.
 
         Args:
             beyond: [view held out, col, row], what its model adds to its projection.

@@ -52,7 +52,7 @@ class StrayMass:
     air: Mask
 
     def level(self, volume: Volume) -> tuple[float, float]:
-        """Mean and standard deviation of a volume on the same grid in `air`; NaN where that has under 100 voxels."""
+        """Mean and standard deviation of a volume on the same grid in `air`; NaN if that has under 100 voxels."""
         values = volume.data[self.first : self.first + len(self.air)][self.air]
         if values.size < _LEAST_AIR:
             return math.nan, math.nan
@@ -91,7 +91,7 @@ def stray_mass(
 
 
 def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
-    """Bytes that `stray_mass` takes beside projections and volume, about."""
+    """Approximate memory of `stray_mass` in bytes, without projections and volume."""
     slices = _looked_at(geometry, grid)
     rows = min(slices, geometry.detector_shape[0]) if slices < grid.shape[0] else geometry.detector_shape[0]
     rays = min(geometry.n_views, _VIEWS) * rows * geometry.detector_shape[1]
@@ -99,7 +99,7 @@ def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
 
 
 def stray_mass_share(geometry: Geometry, grid: Grid) -> float:
-    """About how many projections of all rays take as long as `stray_mass`."""
+    """Approximate number of projections of all rays that take as long as `stray_mass`."""
     return 3 * min(1.0, _VIEWS / geometry.n_views) * _looked_at(geometry, grid) / grid.shape[0]
 
 
@@ -233,7 +233,7 @@ def unexplained(
 
 
 def unexplained_memory(geometry: Geometry) -> int:
-    """Bytes that `unexplained` takes beside projections and volume, about."""
+    """Approximate memory of `unexplained` in bytes, without projections and volume."""
     n, views, cols = _rows_looked_at(geometry), geometry.n_views, geometry.detector_shape[1]
     slices = (1 + _FLIPS) * n
     gridded = is_gridded(replace(geometry, detector_shape=(slices, cols)), Grid((slices, cols, cols)), "hann")
@@ -276,7 +276,7 @@ _BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 @dataclass(frozen=True)
 class LostMatter:
-    """The matter that an FBP of the same views shows and a volume lacks.
+    """The matter that FBP of the same views shows, but a volume lacks.
 
     Attributes:
         lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.

@@ -81,7 +81,7 @@ class FistaTv(VoxelMethod):
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], HeldOutTrial | None] | None = None
     ) -> tuple[F32, NoiseBalance | float]:
-        """The volume after the iterations, and the weight μ; `trial`: as of `choose_weight`."""
+        """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
@@ -245,7 +245,7 @@ class PnpDct(VoxelMethod):
 
 
 class Patches(NamedTuple):
-    """Sparse patches as views held out prefer them.
+    """The settings of sparse patches chosen by held-out views.
 
     Attributes:
         strength: of `pnp_dct`.
@@ -259,7 +259,7 @@ class Patches(NamedTuple):
 def choose_patches(
     problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None]
 ) -> Patches:
-    """The strength of `pnp_dct` that views held out prefer, from volumes of total variation with a weight μ.
+    """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
 
     The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
     views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
@@ -283,7 +283,7 @@ def choose_patches(
 
 
 def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
-    """Residuals of views held out by the volume that patches make of `x`."""
+    """Residuals of held-out views for the volume that patches make of `x`."""
 
     def made(strength: float) -> F32:
         return trial.volume_by(

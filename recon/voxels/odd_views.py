@@ -129,7 +129,7 @@ def odd_views(
 
 
 def odd_views_memory(geometry: Geometry) -> int:
-    """Bytes that `odd_views` takes beside projections and volume, about."""
+    """Approximate memory of `odd_views` in bytes, without projections and volume."""
     views, (rows, cols) = geometry.n_views, geometry.detector_shape
     side, height = _side(geometry), min(_band(geometry), rows)
     band = (height + 2 * _BLUR) * cols * (cols + 2 * views + 8 * _TOGETHER)

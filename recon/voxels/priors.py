@@ -121,7 +121,7 @@ _LOOKED_AT = 9  # views of a sweep whose residual is looked at
 
 @dataclass(frozen=True, eq=False)
 class Subsets:
-    """Subsets of the views of a problem, which all runs with these views and weights may share.
+    """Subsets of the views of a problem, which all runs with these views and weights can share.
 
     Attributes:
         views: indices, of each subset.

@@ -153,13 +153,13 @@ class VoxelProblem:
         return math.sqrt(replace_by_residual(self.data, np.zeros_like(self.data), self.weight))
 
     def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
-        """Data and weights of some views; the projector stays that of all views."""
+        """Data and weights of some views; the projector remains that of all views."""
         weight = None if self.weight is None else self.weight[views]
         measured = None if self.measured is None else self.measured[views]
         return replace(self, data=self.data[views], weight=weight, measured=measured)
 
     def filtered(self, filter: Filter) -> F32 | None:
-        """FBP or FDK [y, x, z] of the views with some weight, rays of weight 0 filled in; None: neither takes them."""
+        """FBP or FDK [y, x, z] of the weighted views, rays of weight 0 filled in; None if neither applies."""
         images, geometry = projection_images(self.views), self.projector.geometry
         if self.weight is not None:
             seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
@@ -173,7 +173,7 @@ class VoxelProblem:
         return Sweeps(self.projector, self.data, self.weight, subsets)
 
     def single_views(self) -> Sweeps:
-        """Sweeps with one view a step."""
+        """Sweeps with one view per step."""
         return self.sweeps([np.array([view]) for view in range(self.projector.geometry.n_views)])
 
 
@@ -236,7 +236,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
 
 
 def slices_are_rows(projector: Projector) -> bool:
-    """Each slice of the grid is what one row of the views sees."""
+    """Whether each slice of the grid is seen by one row of the views."""
     geometry, grid = projector.geometry, projector.grid
     rows = Grid.matching(geometry)
     same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])

@@ -27,7 +27,7 @@ _PASSES_AHEAD = 2.0  # over the volume, of a step of `Momentum`
 
 
 def beam_of(geometry: Geometry, grid: Grid) -> str:
-    """The kernels of `Projector` that take these views."""
+    """The kernels of `Projector` for these views."""
     if not geometry.is_straight:
         return "posed"
     if grid.shape[0] == 1:
@@ -83,7 +83,7 @@ def patch_steps(geometry: Geometry, grid: Grid, steps: int) -> Work:
 
 
 def trial_part(geometry: Geometry, grid: Grid, rows: int = TRIAL_ROWS) -> tuple[Geometry, Grid] | None:
-    """Views and voxels of a trial by views held out, see `HeldOutTrial`; None: there is none."""
+    """Views and voxels of a trial by held-out views, see `HeldOutTrial`; None if there is none."""
     if geometry.n_views < LEAST_VIEWS:
         return None
     seen = geometry.n_views - geometry.n_views // ONE_IN

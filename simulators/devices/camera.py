@@ -104,12 +104,13 @@ class SimulatedOrcaQuest:
 
     @property
     def scene(self) -> Scene:
-        """What stands in the beam."""
+        """The scene in front of the camera."""
         return self._scene
 
     def show(self, scene: Scene) -> None:
-        """Sample and beam become those of `scene`, the effects stay. Exposed frames that were not read yet show them,
-        too."""
+        """Replace sample and beam by those of `scene`; the effects stay. Exposed frames that were not read yet show
+        them, too.
+        """
         with self._lock:
             self._scene = replace(self._scene, sample=scene.sample, beam=scene.beam)
 
@@ -118,7 +119,7 @@ class SimulatedOrcaQuest:
         return self._labels.get(time, ())
 
     def rehearse(self) -> None:
-        """Compute a frame of the sample with the present settings and discard it; it does not count as a frame.
+        """Compute a frame of the sample with the present settings and discard it; it is not counted.
 
         Raises:
             CannotExposeError: the scene cannot be exposed with them; the message says what would help.
@@ -127,7 +128,9 @@ class SimulatedOrcaQuest:
         expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
+        """Apply settings and read them back; the exposure is rounded to 10 ns. Raises DeviceRefused, with nothing
+        changed.
+        """
         with self._lock:
             self._answer()
             problem = orca_quest.refusal(settings, self._model)
@@ -145,7 +148,9 @@ class SimulatedOrcaQuest:
             self._answer()
             if n_frames < 1 or self._armed_for:
                 problem = "is armed already" if self._armed_for else "cannot be armed for less than one frame"
-                raise DeviceRefused(self.name, problem, request=f"arm({n_frames})", advice="disarm() it first, n >= 1")
+                raise DeviceRefused(
+                    self.name, problem, request=f"arm({n_frames})", advice="Call disarm() first, with n >= 1"
+                )
             self._ring.clear()
             self._armed_for, self._framestamp = n_frames, 0
             self._seen, self._accepted = self._clock.now(), -np.inf
@@ -189,12 +194,12 @@ class SimulatedOrcaQuest:
                     self.name,
                     f"no frame came within {timeout:g} s; it was armed for {self._armed_for} and exposed {exposed}",
                     expected=f"a frame by {self._settings.trigger} trigger",
-                    advice="Look whether the stage moves and its trigger output is connected",
+                    advice="Check that the stage moves and its trigger output is connected",
                 )
             self._clock.sleep(due - now)
 
     def disarm(self) -> None:
-        """Stop and forget the frames not taken; legal in every state."""
+        """Stop the run and discard the frames not taken; legal in every state."""
         with self._lock:
             self._armed_for = 0
             self._ring.clear()
@@ -239,7 +244,7 @@ class SimulatedOrcaQuest:
         if self._gone and not self._ring:
             raise DeviceError(self.name, self._gone, advice="Connect it anew", state="Frames already taken are good")
         if armed and not self._armed_for:
-            raise DeviceRefused(self.name, "is not armed", advice="arm(n) it before frames are taken or triggered")
+            raise DeviceRefused(self.name, "is not armed", advice="Call arm(n) before frames are read or triggered")
 
     def _catch_up(self, now: float) -> None:
         """Look at every trigger up to `now`."""

@@ -13,7 +13,7 @@ from simulators.scenes.scene import Scene
 
 @dataclass(frozen=True)
 class Exposed:
-    """A frame that was exposed and is not computed yet.
+    """A frame that was exposed, but is not computed yet.
 
     Attributes:
         framestamp: counts from 0 with every arm.

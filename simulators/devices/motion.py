@@ -81,17 +81,17 @@ class TrapezoidMove:
 
     @property
     def duration(self) -> float:
-        """s."""
+        """Duration in s."""
         return self.phases[-1].end if self.phases else 0.0
 
     @property
     def end(self) -> float:
-        """When it stands again."""
+        """Time at which the axis stands again."""
         return self.begin + self.duration
 
     @property
     def direction(self) -> int:
-        """+1, -1, or 0 for a move to the present place."""
+        """+1, -1, or 0 for a move to the present position."""
         return (self.target > self.start) - (self.target < self.start)
 
     def position(self, time: float) -> float:
@@ -114,7 +114,7 @@ class TrapezoidMove:
         return 0.0 if phase is None else phase.velocity_after(time - self.begin - phase.begin)
 
     def time_at(self, position: float) -> float:
-        """When the move passes `position`.
+        """Time at which the move passes `position`.
 
         Raises:
             ValueError: it never passes there.
@@ -139,7 +139,7 @@ class TrapezoidMove:
         return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
 
     def halted(self, position: float) -> TrapezoidMove:
-        """The same move until it reaches `position`, where it stands at once, as an emergency stop does.
+        """The same move until it reaches `position`, with an immediate stand there, as by an emergency stop.
 
         Raises:
             ValueError: the move does not pass there.
@@ -198,7 +198,7 @@ class MovedAxis:
         return (move.position(time) - zero) * self._angle_of_count
 
     def disturb(self, beyond: Callable[[float], float]) -> None:
-        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
+        """Until its next move, turn the axis by `beyond` (counts at a time in s) without any sign in its status."""
         self._replace(replace(self.move, beyond=beyond))
 
     def _at(self, time: float) -> tuple[TrapezoidMove, int]:

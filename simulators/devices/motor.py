@@ -64,7 +64,7 @@ class MotorOutput:
         self._coming: list[float] = []
 
     def can_arm(self, position: int) -> bool:
-        """Whether it is on, and the axis at `position` stands before its start point."""
+        """Whether the output is on, and the axis at `position` stands before its start point."""
         return self.settings.width is not None and self.settings.sign * (self.settings.start - position) > 0
 
     def arm(self) -> None:
@@ -76,7 +76,7 @@ class MotorOutput:
         self._fired, self._coming, self._armed = 0, [], False
 
     def ready(self, now: float) -> bool:
-        """Whether it waits for its start point."""
+        """Whether the output waits for its start point."""
         self.settle(now)
         return self._armed and self._fired == 0
 
@@ -88,7 +88,7 @@ class MotorOutput:
         self._coming = self._coming[len(fired) :]
 
     def follow(self, move: TrapezoidMove, now: float) -> list[tuple[float, int]]:
-        """(time, count) of the edges that `move` gives from `now` on; they replace earlier predictions."""
+        """(time, count) of the edges that `move` causes from `now` on; they replace earlier predictions."""
         self.settle(now)
         self._coming = []
         width = self.settings.width
@@ -174,7 +174,7 @@ class PulseMotor(MovedAxis):
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
-        """Slow down with `acceleration` (counts/s²) and stand at a whole pulse."""
+        """Decelerate with `acceleration` (counts/s²) and stand at a whole pulse."""
         now, move = self._clock.now(), self.move
         self.ended = Ended.SLOW_STOP
         if not self.moving():

@@ -37,7 +37,7 @@ class QuantumEfficiency(ImageEffect):
 
     def __post_init__(self) -> None:
         if sum(each is not None for each in (self.value, self.wavelength_nm, self.path)) != 1:
-            raise ValueError(f"give either value or wavelength_nm, or path, got {self}")
+            raise ValueError(f"give one of value, wavelength_nm or path, got {self}")
 
     @property
     def efficiency(self) -> float:

@@ -79,7 +79,7 @@ class Scan:
 
     @property
     def period(self) -> float:
-        """s from one trigger to the next."""
+        """Time in s from one trigger to the next."""
         settings = self.scene.scan
         return settings.period_s * (max(settings.views / self.views, 1.0) if settings.fly else 1.0)
 

@@ -53,7 +53,7 @@ def _counter(progress: Progress | None, total: int) -> CountImage:
 
 @dataclass(frozen=True)
 class Archived:
-    """What was written, and compared with the raw file.
+    """The written copy, and its comparison with the raw file.
 
     Attributes:
         sources: the raw file, then the files that it draws frames from; raw_bytes: of all of them.
@@ -117,7 +117,7 @@ def archive(
 def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
     """The number of frames, and the altered ones, in words, too; DataError if the scan cannot be archived."""
     if scan.exists() and not (scan.is_file() and hdf5.is_hdf5(scan)):
-        raise DataError(f"{scan} is no HDF5 scan. `beamline ingest` makes one of it. Nothing was written.")
+        raise DataError(f"{scan} is not an HDF5 scan. `beamline ingest` converts it to one. Nothing was written.")
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
         frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))
@@ -147,7 +147,7 @@ def _damaged(scan: Path, rows: set[int]) -> DataError:
 
 
 def drop_from_cache(path: Path) -> None:
-    """Have the system read the file from the disk from now on, not from its memory, where it can be told so."""
+    """Make the system read the file from the disk, not from its cache, if it can be told so."""
     if sys.platform == "linux":
         with path.open("rb") as file:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -214,7 +214,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def filter_of(codec: str) -> Mapping[str, Any]:
-    """The keywords of an HDF5 dataset that is compressed by a codec of these."""
+    """The keywords of an HDF5 dataset that is compressed by one of these codecs."""
     filters: Mapping[str, Any] = {
         "blosc2": hdf5plugin.Blosc2("zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE),
         "bitshuffle-zstd": hdf5plugin.Bitshuffle(cname="zstd", clevel=3),

@@ -25,7 +25,7 @@ CODECS = ("blosc2", "bitshuffle-zstd", "bitshuffle-lz4")  # The first is the def
     show_default=True,
     help="Compressor, all lossless. blosc2: zstd after a bit shuffle. bitshuffle-lz4: fast, and most widely read.",
 )
-@click.option("--keep-damaged", is_flag=True, help="Archive frames that differ from their checksum, as they are.")
+@click.option("--keep-damaged", is_flag=True, help="Include frames that differ from their checksum, unchanged.")
 @json_option
 def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: bool) -> None:
     """Write a compressed copy of the HDF5 scan SCAN, and compare every frame of it with SCAN.

@@ -37,7 +37,7 @@ _SILENCE = 1800.0  # real s without an event of a scan, after which it is taken 
 
 @dataclass(frozen=True)
 class BatchRow:
-    """A scan of a batch.
+    """A scan of a batch and its result.
 
     Attributes:
         name: of its folder of results, inside the batch's.
@@ -108,7 +108,7 @@ class ScanNeed(Need):
 
 @dataclass(frozen=True, kw_only=True)
 class BatchPlan(Need):
-    """Scans that a call would reconstruct, and the time and memory that it would take.
+    """Scans that a batch would reconstruct, and the time and memory needed.
 
     Attributes:
         rows: all rows of the table, with those of this call.
@@ -120,7 +120,7 @@ class BatchPlan(Need):
     needs: Mapping[str, ScanNeed]
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The plan as lines for people."""
         width = max((len(row.name) for row in self.rows), default=4)
         rows = [f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{row.scan}" for row in self.rows]
         refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]

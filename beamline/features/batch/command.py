@@ -26,7 +26,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
         path, root = Path(name), Path(Path(name).anchor)
         matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
         if not matches:
-            raise click.BadParameter(f"{name!r} is no file, and no pattern that any file matches")
+            raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
         scans.update((scan_file(match.resolve()), None) for match in matches)
     return list(scans)
 

@@ -14,7 +14,7 @@ from beamline.core.files import RUNS
 
 @click.command()
 @click.argument("runs", required=False, default=RUNS, type=click.Path(path_type=Path, file_okay=False))
-@click.option("--prefix", default="splatline:", show_default=True, help="Of the names of the process variables.")
+@click.option("--prefix", default="splatline:", show_default=True, help="Prefix of the names of the process variables.")
 @click.option(
     "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
 )

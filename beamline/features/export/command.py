@@ -101,7 +101,7 @@ def window_of(text: str) -> tuple[float, float]:
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise ValueError(f"{text!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+        raise ValueError(f"{text!r} is not a window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
     return low, high
 
 
@@ -149,10 +149,12 @@ class ExportRequest:
     )  # fmt: skip
     gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
     poses: bool = set_by(
-        "--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads."
+        "--poses",
+        is_flag=True,
+        help="Write displacement, roll and tilt of the volume's views as a .csv that --poses reads.",
     )
     at: int | None = set_by(
-        "--at", type=WholeRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
+        "--at", type=WholeRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)
@@ -209,13 +211,13 @@ def _export_voxels(request: ExportRequest) -> None:
     from beamline.storage.volumes.files import format_of, opened_volume, write_volume
 
     if request.dataset is not None and request.at is not None:
-        raise click.UsageError("--at does not go with --dataset: a series in time has one array.")
+        raise click.UsageError("--at cannot be combined with --dataset: a time series has a single array.")
     pixels = Pixels(int(request.bits), request.window)
     if pixels.bits == 32 and request.window is not None:
-        raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
+        raise click.UsageError("--window needs --bits 8 or --bits 16.")
     if pixels.bits < 32 and not format_of(request.output).greys:
         raise click.UsageError(
-            f"{format_of(request.output).name} holds the values themselves: leave out --bits and --window."
+            f"{format_of(request.output).name} stores values, not grey values: leave out --bits and --window."
         )
     with answering(request.as_json) as answer:
         refuse_existing(request.output)

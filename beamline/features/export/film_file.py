@@ -36,7 +36,7 @@ _GIF_TICK = 0.01  # s; a GIF states the time of an image in whole ones
 
 @dataclass(frozen=True)
 class FilmImages:
-    """The images of a film as numbers, read one after another.
+    """The images of a film as arrays, read one after another.
 
     Attributes:
         shown: which slices along the axis, or frames of the scan, in the order of the film.
@@ -53,7 +53,7 @@ class FilmImages:
 
 @dataclass(frozen=True)
 class FilmStyle:
-    """What a film looks like.
+    """Style of a film.
 
     Attributes:
         side: pixels of the longer side of an image, at most. Images are never enlarged.
@@ -237,7 +237,7 @@ _LOOKED_AT_VIEWS = 9  # views that tell the grey window
 
 
 def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
-    """Corrected views of a scan by angle, binned where that leaves `side` pixels or more; unlit ones are left out.
+    """Corrected views of a scan by angle, binned if that leaves `side` pixels or more; unlit views are omitted.
 
     Raises:
         DataError: it has no view whose angle is known; while the images are read: none of these views can be used.

@@ -37,11 +37,17 @@ _PATH = click.Path(path_type=Path)
 @heading(DATA)
 @scan_options
 @heading(OUTPUT)
-@click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
-@click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
+@click.option(
+    "--statistics", is_flag=True, help="For a scan: range, percentiles, mean and saturated pixels of the stored values."
+)
+@click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: write the histograms as a picture.")
 @light_options
-@click.option("--truth", metavar="FILE", help="Of a volume: PSNR and SSIM against this one (FILE or FILE:first:end).")
-@click.option("--masks", metavar="FILE", type=_PATH, help="Of a volume: SNR and CNR by labels, 1 dense and 2 empty.")
+@click.option(
+    "--truth", metavar="FILE", help="For a volume: PSNR and SSIM against this reference (FILE or FILE:first:end)."
+)
+@click.option(
+    "--masks", metavar="FILE", type=_PATH, help="For a volume: SNR and CNR in labelled regions, 1 dense and 2 empty."
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(
     file: Path,
@@ -67,7 +73,7 @@ def info(
     if (output is not None or light is not None) and not statistics:
         raise click.UsageError("-o and --photons-per-count go with --statistics.")
     if statistics and (truth or masks):
-        raise click.UsageError("--statistics is of a scan, --truth and --masks are of a volume: give one of them.")
+        raise click.UsageError("--statistics needs a scan, --truth and --masks need a volume: give one of them.")
     if statistics:
         _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
         return

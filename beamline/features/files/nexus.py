@@ -32,7 +32,7 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
 
 
 def definition_stated(places: Places) -> Iterator[Finding]:
-    """The entry says that it is an NXtomo, whose data are what the detector counted (NX_INT)."""
+    """The entry states that it is an NXtomo, whose data are detector counts (NX_INT)."""
     definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
     if definition == layout.FLOAT_DEFINITION:
         yield Finding("info", "definition", f"{definition}: float frames in NXtomo's places, on purpose not an NXtomo.")
@@ -44,7 +44,7 @@ def definition_stated(places: Places) -> Iterator[Finding]:
 
 
 def lengths(places: Places) -> Iterator[Finding]:
-    """One image key and one angle a frame."""
+    """There is one image key and one angle for each frame."""
     for name in ("image_key", "image_key_control"):
         key = hdf5.dataset(places.detector, name)
         if key is not None and key.size != places.data.shape[0]:
@@ -63,7 +63,7 @@ def key_codes(places: Places) -> Iterator[Finding]:
 
 
 def angle_units(places: Places) -> Iterator[Finding]:
-    """Angles say their unit: readers differ in what they assume."""
+    """Angles have a unit: readers differ in their default."""
     if places.angle is not None:
         unit = hdf5.attribute(places.angle, "units")
         if unit.lower() not in hdf5.ANGLE_UNITS:
@@ -72,7 +72,7 @@ def angle_units(places: Places) -> Iterator[Finding]:
 
 
 def links_targeted(places: Places) -> Iterator[Finding]:
-    """NXdata links to the three that NXtomo wants, and @target names where each really is."""
+    """NXdata links to the three datasets that NXtomo requires, and @target names their paths."""
     nxdata = hdf5.resolve(places.entry, "data")
     if not isinstance(nxdata, h5py.Group):
         yield Finding("warning", "links", f"{places.entry.name}/data (NXdata) is not there: viewers find no plot.")
@@ -110,7 +110,7 @@ def axis_order(places: Places) -> Iterator[Finding]:
 
 
 def names_stated(places: Places) -> Iterator[Finding]:
-    """Sample name and title, which validators and people look for."""
+    """Sample name and title are present, as validators and people expect."""
     for where in ("sample/name", "title"):
         if not hdf5.text_at(places.entry, where):
             yield Finding("warning", "names", f"{places.entry.name}/{where} is empty or not there.")
@@ -132,7 +132,7 @@ def iso_times(places: Places) -> Iterator[Finding]:
 
 
 def time_order(places: Places) -> Iterator[Finding]:
-    """Frames come one after the other."""
+    """Frames are in the order of their times."""
     times = _column(places, "frame_log/time")
     back = np.flatnonzero(np.diff(times) < 0)
     if back.size:
@@ -143,7 +143,7 @@ def time_order(places: Places) -> Iterator[Finding]:
 
 
 def framestamp_order(places: Places) -> Iterator[Finding]:
-    """A camera's counter goes up by one a frame.
+    """The camera's frame counter increases by one for each frame.
 
     It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
     another part of a joined file. Not always at 0, for the first frame may be lost.
@@ -198,7 +198,7 @@ def frames_differ(places: Places) -> Iterator[Finding]:
 
 
 def frames_counted(places: Places) -> Iterator[Finding]:
-    """The writer counted no more rows than there are."""
+    """The writer counted no more rows than the file has."""
     if layout.COMMITTED not in places.entry.file or places.entry.name != layout.ENTRY:
         return
     committed, n = int(places.entry.file[layout.COMMITTED][()]), places.data.shape[0]

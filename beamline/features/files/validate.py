@@ -65,7 +65,7 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
 
 
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
-    """All findings in a file, the worst first; [] for a scan without fault.
+    """All findings in a file, the most severe first; [] for a valid scan.
 
     Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
 
@@ -112,7 +112,7 @@ def source_findings(source: ScanSource) -> list[Finding]:
 
 
 def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
-    """Views have light: all of them, or some over the scan. `beamline recon` names and leaves out those without."""
+    """Views have light throughout the scan. `beamline recon` names and leaves out dark views."""
     counted = source.quantity == "counts"
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     kinds = {FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION}
@@ -133,7 +133,7 @@ def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
 
 
 def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator[Finding]:
-    """Every frame can be read, and has the checksum that was written with it, where the file has checksums.
+    """Every frame can be read and matches its checksum, if the file has checksums.
 
     Args:
         progress: how many of how many frames were read; None: only those that other rules have read are judged.
@@ -183,7 +183,7 @@ LOOK = 15.0
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
-    """Describe a scan or a volume. DataError if it cannot be opened."""
+    """Describe a scan or a volume. Raises DataError if it cannot be opened."""
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     if (kind := volume_format(path)) is not None:
         seconds = times_of(path)
@@ -216,7 +216,7 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 
 
 def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
-    """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
+    """Format, frames, angles, quantity, scale, and the findings of the rules; None for what is unknown.
 
     Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `used` are
     the numbers that the file states and somebody uses, by path, `not_used` those that nobody does. `findings` are the

@@ -38,11 +38,18 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @unfinished_option
 @heading(OUTPUT)
-@option("-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material.")
+@option(
+    "-o",
+    "--output",
+    metavar="PATH.h5",
+    type=_FILE,
+    required=True,
+    help="One file per material, with _NAME appended to this stem.",
+)
 @option(
     "--register",
     is_flag=True,
-    help="Find where the sample stood in each scan, and its magnification; correct them.",
+    help="Find and correct the sample position and the magnification of each scan.",
 )
 @option(
     "--states",

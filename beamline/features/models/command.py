@@ -39,18 +39,19 @@ _MOST_VIEWS = 1_000_000
 
 
 def box_of(text: str) -> Box:
-    """Three intervals Z0:Z1,Y0:Y1,X0:X1 of lengths. ValueError for anything else."""
+    """Parse three intervals Z0:Z1,Y0:Y1,X0:X1 of lengths. Raises ValueError for any other text."""
     try:
         box = tuple((float(low), float(high)) for low, high in (part.split(":") for part in text.split(",")))
     except ValueError:
         box = ()
     if len(box) != 3 or not all(-math.inf < low < high < math.inf for low, high in box):
-        raise ValueError(f"{text!r} is no box; expected Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
+        raise ValueError(f"{text!r} is not a box; expected Z0:Z1,Y0:Y1,X0:X1 in the unit of the volume")
     return box
 
 
 def angles_of(text: str) -> NDArray[np.float64]:
-    """FIRST:END:STEP or angles apart by commas, in degrees, as radians. ValueError for anything else."""
+    """Parse FIRST:END:STEP or angles separated by commas, in degrees, to radians. Raises ValueError for any other
+    text."""
     try:
         first, *rest = (float(part) for part in text.split(":"))
         if len(rest) == 2 and rest[1] and 0 < (n := math.ceil((rest[0] - first) / rest[1] - 1e-9)) <= _MOST_VIEWS:
@@ -79,7 +80,12 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
 @click.command()
 @volume_argument
 @click.option(
-    "-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True, help="Its suffix names the format."
+    "-o",
+    "--output",
+    metavar="PATH",
+    callback=parsed(volume_path),
+    required=True,
+    help="Output; the suffix chooses the format.",
 )
 @click.option("--voxel", type=POSITIVE, help="Edge of a voxel, in the unit of the volume. Default: that of VOLUME.")
 @click.option(
@@ -202,7 +208,7 @@ def _mesh_path(text: str) -> Path:
 @dataset_option
 @json_option
 def surface(volume: Path, output: Path, level: float | None, source: str, dataset: str | None, as_json: bool) -> None:
-    """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm where the voxel is known).
+    """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm if the voxel size is known).
 
     The mesh is watertight: matter that leaves the volume is closed at its faces. Nothing is overwritten.
     """

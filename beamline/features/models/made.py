@@ -57,7 +57,8 @@ def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Vo
 
 
 def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Callable[[int, int], None]) -> None:
-    """Line integrals of the model at `angles` [view] in radians: a scan of ours, which every command reads.
+    """Write line integrals of the model at `angles` [view] in radians as a scan of this program, which every command
+    reads.
 
     It states quantity, pixel size, axis and cone, and has the /exchange view of Data Exchange. The views are straight,
     in their place: the poses of the views that were fitted are those of their own angles.
@@ -131,7 +132,7 @@ def surface_of_volume(path: Path, dataset: str | None, level: float | None, coun
 
 
 def surface_of_gaussians(path: Path, level: float | None, count: Count) -> Surface:
-    """The surface of the model behind a volume, each vertex brought to the level along the density's gradient.
+    """The surface of the model behind a volume, each vertex moved to the level along the density's gradient.
 
     Raises:
         DataError: the file holds no model. ValueError: as `surface`.

@@ -61,24 +61,25 @@ _HEADERS = {
 
 
 class Strangers:
-    """Connections that have shown no token. Each is closed in time, and the oldest when there are many, so that they
-    take no place of those who have one. All calls come from the thread of the server."""
+    """Connections without a valid token so far. Each is closed in time, and the oldest first if there are many, so that
+    they do not displace authorised clients. All calls come from the server's thread.
+    """
 
     def __init__(self) -> None:
         self._ends: dict[object, Callable[[], None]] = {}
 
     def enter(self, client: object, end: Callable[[], None]) -> None:
-        """A new connection, and what closes it."""
+        """Add a new connection, with the function that closes it."""
         if len(self._ends) >= MOST_STRANGERS:
             self.end(next(iter(self._ends)))
         self._ends[client] = end
 
     def leave(self, client: object) -> None:
-        """It has shown a token, or is closed."""
+        """Remove a connection that has shown a token, or is closed."""
         self._ends.pop(client, None)
 
     def end(self, client: object) -> None:
-        """Close a connection, if it is still one of these."""
+        """Close a connection if it still is without a token."""
         self._ends.pop(client, lambda: None)()
 
 
@@ -94,7 +95,7 @@ class Access:
 
 
 class Guard:
-    """Sets the headers of every answer, and refuses requests to another host, or without the token for looking."""
+    """Sets the headers of every response, and refuses requests for another host, or without the viewing token."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
@@ -143,7 +144,7 @@ def _same(given: str, expected: str) -> bool:
 
 
 def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
-    """The application. `log`: takes a line for each verb that was sent, with the client's address."""
+    """The application. `log` gets a line for each command sent, with the client's address."""
     return guarded("index.html", page_routes(reader, access, log), access)
 
 
@@ -154,7 +155,7 @@ def viewer(volumes: Sequence[ShownVolume], access: Access, scan: ShownScan | Non
 
 
 def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> list[BaseRoute]:
-    """What a page of a run asks for; below `view/` its newest volume, by itself and in the viewer."""
+    """Routes of the page of a run; below `view/` its newest volume, alone and in the viewer."""
     server = _Server(reader, access, log)
     return [
         Mount("/view", begins_with("view.html", viewer_routes(reader.on_volumes))),
@@ -171,13 +172,13 @@ def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> l
 
 
 def guarded(start: str, routes: Sequence[BaseRoute], access: Access) -> Starlette:
-    """An application of these answers that begins with a page of `static`, behind the guard."""
+    """An application with these routes that starts with a page of `static`, behind the guard."""
     static = Mount("/static", StaticFiles(directory=str(_STATIC)))
     return begins_with(start, [static, *routes], [Middleware(Guard, access=access)])
 
 
 def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
-    """An application of these answers that begins with a page of `static`."""
+    """An application with these routes that starts with a page of `static`."""
     text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
     first = Route("/", lambda request: HTMLResponse(text))
     return Starlette(routes=[first, *routes], middleware=middleware, exception_handlers={BeamlineError: _refused})

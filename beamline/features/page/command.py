@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LOOPBACK, PORT = "127.0.0.1", 8642
 
 port_option = click.option(
-    "--port", default=PORT, show_default=True, type=WholeRange(0, 65535), help="Or the next free one."
+    "--port", default=PORT, show_default=True, type=WholeRange(0, 65535), help="Port, or else the next free one."
 )
 bind_option = click.option(
     "--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all."
@@ -38,7 +38,7 @@ bind_option = click.option(
 
 @click.command()
 @click.argument("path", metavar="[RUN|FILE|RUNS]", required=False, type=click.Path(path_type=Path))
-@click.option("--control", is_flag=True, help="A second address, from which the scan can be paused and ended.")
+@click.option("--control", is_flag=True, help="Print a second address, which can pause and end the scan.")
 @port_option
 @bind_option
 @click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
@@ -102,7 +102,7 @@ def _end(server: PageServer) -> None:
 @click.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
-@click.option("--page", "as_page", is_flag=True, help="Show them in the browser; a link opens the page of each.")
+@click.option("--page", "as_page", is_flag=True, help="Show the runs in the browser; a link opens the page of each.")
 @port_option
 @bind_option
 @click.option("--open", "browse", is_flag=True, help="With --page: open it in this machine's browser.")
@@ -156,8 +156,10 @@ def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:
 @port_option
 @bind_option
 @click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
-@click.option("--napari", "in_napari", is_flag=True, help="Show it in napari, where that is installed.")
-@click.option("--labels", type=click.Path(path_type=Path), help="With --napari: labels of `segment`, or as a TIFF.")
+@click.option("--napari", "in_napari", is_flag=True, help="Show the volume in napari, if installed.")
+@click.option(
+    "--labels", type=click.Path(path_type=Path), help="With --napari: labels from `segment`, or a TIFF of labels."
+)
 def view(
     volume: str,
     other: str | None,

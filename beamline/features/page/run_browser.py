@@ -45,7 +45,7 @@ class RunBrowser:
             opened.reader.close()
 
     def app(self, access: Access) -> Starlette:
-        """The application; its pages of runs are to look alone."""
+        """The application; its pages of runs are read-only."""
         self._access = replace(access, act=None)
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
         return guarded("runs.html", routes, access)
@@ -61,7 +61,7 @@ class RunBrowser:
         return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows})
 
     async def page_of(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer as the page of a run does."""
+        """Answer a request as the page of a run does."""
         opened = self._open(scope["path_params"]["number"])
         opened.requests += 1
         try:

@@ -29,7 +29,7 @@ class OnVolumes(Protocol):
 
 
 def viewer_routes(do: OnVolumes) -> list[Route]:
-    """What the page of one volume, or of two to compare, asks for."""
+    """Routes of the page of one volume, or of two to compare."""
     server = _Viewer(do)
     return [
         Route("/api/volumes", server.facts),
@@ -41,7 +41,7 @@ def viewer_routes(do: OnVolumes) -> list[Route]:
 
 
 def scan_routes(do: OnVolumes, scan: ShownScan) -> list[Route]:
-    """What the page of a scan asks for beside the slices of its views."""
+    """Routes of the page of a scan, besides the slices of its views."""
     server = _Scan(do, scan)
     return [
         Route("/api/scan", server.facts),
@@ -52,7 +52,7 @@ def scan_routes(do: OnVolumes, scan: ShownScan) -> list[Route]:
 
 
 def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
-    """A thread that reads these volumes, also before anybody asks."""
+    """A thread that reads these volumes ahead of requests."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
     def read_more() -> None:
@@ -86,7 +86,7 @@ class _Viewer:
 
         def cuts(volumes: Sequence[ShownVolume]) -> list[VolumeTile]:
             if len({volume.shape for volume in volumes}) != 1 or len(volumes) != 2:
-                raise DataError("A difference is of two volumes of the same shape.")
+                raise DataError("A difference needs two volumes of the same shape.")
             return [volume.cut(axis, index, region, time) for volume in volumes]
 
         first, second = self._do(cuts)

@@ -33,7 +33,9 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.command(cls=Repeatable)
 @volume_argument
 @click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
-@click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
+@click.option(
+    "--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as stated in the file, else lengths are in voxels."
+)
 @click.option(
     "--crop",
     type=NameChoice(["square", "none"]),
@@ -43,7 +45,7 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.option("--margin", type=FiniteRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
               help="Share of the square's side taken off at each end.")  # fmt: skip
 @click.option("--percentiles", type=_PERCENT, nargs=2, default=(0.5, 99.5), show_default=True, metavar="LOW HIGH",
-              help="Grey values below and above are cut.")  # fmt: skip
+              help="Percentiles at which grey values are clipped.")  # fmt: skip
 @click.option("--gamma", type=POSITIVE, default=1.0, show_default=True, help="Power of the grey values, from 0 to 1.")
 @click.option(
     "--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Width of the Gaussian filter, voxels."
@@ -58,8 +60,8 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
               help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "
               "always.")  # fmt: skip
-@click.option("--napari", "view", is_flag=True, help="Then open volume and labels in napari, if it is installed.")
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the clusters' starts.")
+@click.option("--napari", "view", is_flag=True, help="Open volume and labels in napari afterwards, if installed.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Random seed of the clustering.")
 @click.option(
     "-o",
     "--output",
@@ -113,7 +115,7 @@ def segment(
 
 
 def summary(result: Segmented, options: SegmentOptions) -> str:
-    """The result for people."""
+    """The result as lines for people."""
     figures, unit = result.particles.statistics(), result.unit
     _, rows, cols = result.box
     crop = "none, the whole volume"

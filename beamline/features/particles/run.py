@@ -88,7 +88,7 @@ class SegmentOptions:
 
 @dataclass(frozen=True, eq=False)
 class Segmented:
-    """What was found.
+    """The result of a segmentation.
 
     Attributes:
         box: the part of the volume in the file that was segmented.
@@ -114,7 +114,7 @@ class Segmented:
 
     @property
     def verdict(self) -> str:
-        """Whether the table is of use, and what to give where it is not."""
+        """Whether the table is usable, and which option to give if it is not."""
         n, cut, k = self.particles.label.size, int(self.particles.cut.sum()), self.clusters.centres.size
         other = "--clusters and --percentiles LOW HIGH take weaker matter"
         if n == 0:
@@ -240,7 +240,7 @@ def _is_scan(path: Path) -> bool:
 
 
 def table_of(found: Segmented) -> str:
-    """One line a particle, largest first."""
+    """The table as text, one line for each particle, largest first."""
     unit, particles = found.unit, found.particles
     heading = [f"volume_{unit}3", f"equivalent_diameter_{unit}", f"z_{unit}", f"y_{unit}", f"x_{unit}", "cut"]
     bars = found.volume_deviation
@@ -255,7 +255,7 @@ def table_of(found: Segmented) -> str:
 
 
 def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
-    """Everything that the labels depend on, and the figures of all particles, by name."""
+    """All settings that determine the labels, and the figures of all particles, by name."""
     low, high = options.percentiles
     return {
         "margin": "none" if found.margin is None else found.margin,
@@ -290,7 +290,7 @@ _SLICES, _COLOURS = 3, 12
 
 
 def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: Particles) -> bytes:
-    """Three slices as they are, the same with each particle in a colour, and a histogram of diameters, as PNG."""
+    """Three slices, the same with each particle in a colour, and a histogram of diameters, as PNG."""
     z, y, x = volume.grid.coordinates()
     at = np.linspace(0, z.size - 1, _SLICES + 2).round().astype(int)[1:-1]
     extent, column = slice_extent(volume.grid), WIDTH / _SLICES

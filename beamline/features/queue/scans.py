@@ -35,14 +35,14 @@ _CONFIG = "config"  # the column with the configuration's file
 
 @dataclass(frozen=True, eq=False)
 class QueuedScan:
-    """A scan that waits for its turn: its sample's name, and its configuration."""
+    """A scan of a queue: its sample's name, and its configuration."""
 
     name: str
     config: Config
 
 
 class QueueStatus(StrEnum):
-    """What became of a scan in a queue."""
+    """How a scan of a queue ended."""
 
     COMPLETE = "complete"
     ALARMS = "alarms"
@@ -61,7 +61,7 @@ class RecordedScan:
 
 @dataclass(frozen=True)
 class ScanOutcome:
-    """What became of a scan of a queue, where it is, and why it is not complete."""
+    """How a scan of a queue ended, where its files are, and why it is incomplete."""
 
     name: str
     status: QueueStatus
@@ -71,7 +71,7 @@ class ScanOutcome:
 
 
 class RunNotes:
-    """A sink that notes the folder of a queue's scan, and whether a device could not be brought to rest."""
+    """A sink that records the folder of a queue's scan, and whether a device could not be stopped."""
 
     def __init__(self) -> None:
         self.folder: Path | None = None
@@ -85,7 +85,7 @@ class RunNotes:
 
 
 class QueueError(BeamlineError):
-    """Some scans of a queue are not complete; it exits as the first of them would have."""
+    """Some scans of a queue are incomplete; the exit code is that of the first of them."""
 
     def __init__(self, message: str, code: int) -> None:
         super().__init__(message)
@@ -151,23 +151,23 @@ def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
 
 @dataclass(frozen=True, eq=False)
 class QueueNeeds:
-    """What the scans of a queue need: each worked out without devices, by name."""
+    """Needs of the scans of a queue, computed without devices, by name."""
 
     scans: tuple[tuple[str, DryRun], ...]
 
     @property
     def duration(self) -> float:
-        """s for all scans, without the time to change samples."""
+        """Time in s for all scans, without changing samples."""
         return sum(map(_seconds, self._worked))
 
     @property
     def total_bytes(self) -> int:
-        """Of the files of all scans."""
+        """Bytes of the files of all scans."""
         return sum(worked.total_bytes for worked in self._worked)
 
     @property
     def free_bytes(self) -> int:
-        """Of the fullest disk."""
+        """Free bytes of the fullest disk."""
         return min(worked.free_bytes for worked in self._worked)
 
     @property
@@ -185,13 +185,13 @@ class QueueNeeds:
         return [*lines, "", f"{count(len(self.scans), 'scan')}: {total}, without what is done between them"]
 
     def data(self) -> Mapping[str, Any]:
-        """For a program: s and bytes of each scan and of all."""
+        """The needs for programs: s and bytes of each scan and of all."""
         each = [{**worked.data(), "sample": name, "duration": _seconds(worked)} for name, worked in self.scans]
         totals = {"duration": self.duration, "total_bytes": self.total_bytes, "free_bytes": self.free_bytes}
         return {"scans": each, **totals}
 
     def refuse_impossible(self) -> None:
-        """ConfigError for scans that break a limit, or that the disk does not hold together. Nothing was started."""
+        """Raise ConfigError for scans that violate a limit, or do not fit on the disk together. Nothing was started."""
         faults = [f"{name}: {text}" for name, worked in self.scans for text in worked.timeline.violations]
         if not faults and self.total_bytes * ROOM > self.free_bytes:
             faults.append(
@@ -203,7 +203,7 @@ class QueueNeeds:
 
 
 def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
-    """Work out the scans of a queue without devices; `place`: as of `run_scan`.
+    """Compute the needs of a queue without devices; `place` as in `run_scan`.
 
     Raises:
         ConfigError: of the first scan that cannot be worked out, with its name.
@@ -223,7 +223,7 @@ def run_queue(
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
-    """Take the scans of a queue. A failed one does not keep the next from its turn, unless `stop_on_failure`.
+    """Run the scans of a queue. After a failed one the next follows, unless `stop_on_failure`.
 
     It ends where somebody stopped a scan (Ctrl-C, a signal, `beamline stop`), and where an instrument did not obey.
 
@@ -264,7 +264,7 @@ def summary(outcomes: Sequence[ScanOutcome]) -> list[str]:
 
 
 def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
-    """QueueError where a scan is not complete; AlarmError where all are, and some have alarms."""
+    """Raise QueueError if a scan is incomplete; AlarmError if all are complete, and some have alarms."""
     bad = [outcome for outcome in outcomes if outcome.status not in (QueueStatus.COMPLETE, QueueStatus.ALARMS)]
     alarmed = [outcome for outcome in outcomes if outcome.status is QueueStatus.ALARMS]
     if bad:
@@ -285,7 +285,7 @@ def _seconds(worked: DryRun) -> float:
 
 
 def take_all(request: ScanRequest) -> None:
-    """Take the scans of a queue, or work them out, and print what became of each."""
+    """Run the scans of a queue, or compute their needs, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
         queue = load_queue(request.files, request.overrides, rehearse=request.rehearse)
         if request.discard and (series := [scan.name for scan in queue if scan.config.scan.energies is not None]):

@@ -38,7 +38,7 @@ REPORT_EVERY = 0.1  # s of real time between `frame` events
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """The written files; `stopped` where the scan ended before its last frame."""
+    """The written files; `stopped` if the scan ended before its last frame."""
 
     path: Path
     labels: Path
@@ -49,7 +49,7 @@ class SimulatedScan:
 
 
 def check_output(scan: Scan, out: Path) -> None:
-    """Raises DataError where the file or its labels exist, or the disk has too little space. Nothing is written."""
+    """Raise DataError if the file or its labels exist, or the disk has too little space. Nothing is written."""
     for path in (out, labels_path(out)):
         refuse_existing(path)
     rows, cols = scan.detector.shape
@@ -66,7 +66,7 @@ def check_output(scan: Scan, out: Path) -> None:
 def write_scan(
     scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
 ) -> SimulatedScan:
-    """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
+    """Compute every frame of `scan` and write it to `out`, with the labels beside it, even if it ends early.
 
     Args:
         should_stop: called before each frame; true ends the scan with a valid file and labels.
@@ -156,7 +156,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
 
 
 def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
-    """The scan of a scene, see Scan.of. Its last frame is computed once, so that an impossible scene is refused here.
+    """The scan of a scene, see Scan.of. Its last frame is computed once, to refuse an impossible scene early.
 
     Raises:
         CannotExposeError: the scene cannot be exposed with its settings.
@@ -168,7 +168,7 @@ def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Sca
 
 @contextmanager
 def exposure_errors(scene: str) -> Iterator[None]:
-    """Within it a CannotExposeError becomes a ConfigError that names the scene."""
+    """A context that converts a CannotExposeError to a ConfigError that names the scene."""
     try:
         yield
     except CannotExposeError as error:
@@ -176,12 +176,12 @@ def exposure_errors(scene: str) -> Iterator[None]:
 
 
 def frame_cost(scan: Scan, now: Callable[[], float]) -> FrameCost:
-    """The cost of the view in the middle of the scan, where an anomaly is likeliest."""
+    """The cost of the view in the middle of the scan, where an anomaly is most likely."""
     return explain(scan.scene, scan.frame(len(scan) - 1 - scan.views // 2).shot, now)
 
 
 def cost_table(found: FrameCost) -> str:
-    """A line for each step, in order, and the effects that the scene does not name."""
+    """A line for each step, in order, and the effects that are not in the scene."""
     lines = [f"{'step':<22}{'acts on':<15}{'ms/frame':>9}{'memory':>10}  what happens"]
     for cost in found.costs:
         domain = "" if cost.domain is None else cost.domain.words
@@ -199,7 +199,7 @@ MOST = 512  # pixels a side that a picture of 2 inches can resolve
 
 
 def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
-    """PNG. Its frames are computed again, so that it needs no file.
+    """A contact sheet as PNG. Its frames are computed again, so that no file is needed.
 
     Args:
         marked: frames to include, such as those with anomalies.

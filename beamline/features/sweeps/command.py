@@ -214,7 +214,9 @@ def _remarks(
 
 
 def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    """CSV: values, the residual of views held out, whether the slice is the best one or alike, and seconds."""
+    """The table as CSV: values, residual of held-out views, whether the slice is the best or equivalent to it, and
+    seconds.
+    """
     rows = [[*slices[0].values, "residual_held_out", "verdict", "seconds"]]
     for n, each in enumerate(slices):
         residual = "" if scores is None else f"{scores.shares[n]:.6g}"

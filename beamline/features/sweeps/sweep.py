@@ -45,7 +45,7 @@ _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
 @dataclass(frozen=True, eq=False)
 class SweptSlice:
-    """The slice with one value of each option.
+    """The slice reconstructed with one value of each option.
 
     Attributes:
         values: of the options, by name.
@@ -69,7 +69,9 @@ class SweptSlice:
 
 @dataclass(frozen=True, eq=False)
 class HeldOutViews:
-    """Views that no volume of the sweep has learnt from: rows of the file, and line integrals [view, row, col]."""
+    """Held-out views, which no volume of the sweep was fitted to: rows of the file, and line integrals [view, row,
+    col].
+    """
 
     ids: NDArray[np.int64]
     data: F32
@@ -78,7 +80,7 @@ class HeldOutViews:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How well each slice's volume predicts views held out.
+    """How well each slice's volume predicts held-out views.
 
     Attributes:
         residuals: [slice, view] root mean square, as a share of that of all these views.
@@ -92,18 +94,18 @@ class Scores:
 
     @property
     def shares(self) -> F64:
-        """[slice] the data residual of the views held out, as of `beamline.reconstruct.measure`."""
+        """[slice] data residual of the held-out views, as in `beamline.reconstruct.measure`."""
         return np.asarray(np.sqrt(np.square(self.residuals).mean(axis=1)))
 
     @property
     def best(self) -> int | None:
-        """The slice of the least residual; None where that of a direct method hardly depends on the values."""
+        """The slice of least residual; None if that of a direct method hardly depends on the values."""
         flat = self.direct and np.ptp(self.shares) <= _FLAT * self.shares.min()
         return None if flat else int(np.argmin(self.shares))
 
     @property
     def alike(self) -> list[bool]:
-        """Which slices differ from the best by no more than chance; the best is one of them."""
+        """Which slices do not differ significantly from the best; the best is one of them."""
         if self.best is None:
             return [False] * len(self.residuals)
         best = self.residuals[self.best]
@@ -112,7 +114,7 @@ class Scores:
 
 @contextmanager
 def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
-    """The same reconstructions of a few rows around the middle, with no output.
+    """The same reconstruction options for a few rows around the middle, with no output.
 
     A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
     are given, all of them are made.
@@ -146,7 +148,7 @@ def sweep_slices(
     clock: Clock,
     progress: Callable[[int, int], None],
 ) -> Iterator[SweptSlice]:
-    """Each slice in turn. Views are corrected once for all values that leave them alike.
+    """Reconstruct each slice in turn. Views are corrected once for all values that do not affect the correction.
 
     The rotation axis is found once, so that slices differ by the options alone; where it is swept, views are corrected
     about the axis in the middle.
@@ -190,7 +192,7 @@ def swept_slice(
 
 
 def middle_axis(selections: Sequence[Selection]) -> float | None:
-    """The axis by which all views are corrected where the axis itself is swept; None where it is not.
+    """The axis used to correct all views if the axis itself is swept; None if it is not.
 
     Corrections look at views on both sides of the axis: with each its own, some would correct and others not.
     """
@@ -222,7 +224,7 @@ def _held_out(prepared: PreparedProjections) -> HeldOutViews:
 
 
 def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores | None:
-    """Residual of each volume in the views held out; None where slices differ in pixels, or in all views held out.
+    """Residual of each volume in the held-out views; None if slices differ in pixels, or in their held-out views.
 
     A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
     compared with them as every value corrects them, and the mean counts.
@@ -259,7 +261,7 @@ _CROP = 200  # pixels a side: of larger slices the part is shown that changes mo
 def sweep_sheet(
     slices: Sequence[SweptSlice], scores: Scores | None, options: Sequence[SweptOption], title: str
 ) -> bytes:
-    """The slices as PNG, y downwards. The best is framed in red, and those that chance does not tell from it in orange.
+    """The slices as PNG, y downwards. The best is framed in red, those not significantly different in orange.
 
     Two options make a grid, the values of the second one side by side.
     """

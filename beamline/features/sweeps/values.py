@@ -30,7 +30,7 @@ class SweptOption:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The values, where all are numbers; else none."""
+        """The values as numbers; empty if some are no numbers."""
         numeric = all(re.fullmatch(_NUMBER, value) for value in self.values)
         return tuple(map(float, self.values)) if numeric else ()
 
@@ -51,7 +51,7 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
     if name not in legal:
         near = " (did you mean axis?)" if name in _AXIS else did_you_mean(name, legal)
         raise ValueError(
-            f"{name!r} is no option of a slice{near}; those of `beamline recon --help-all` under Data, Corrections and "
+            f"{name!r} cannot be swept{near}; options of `beamline recon --help-all` under Data, Corrections and "
             "Method can be swept, such as tv-weight, rings or axis"
         )
     tried = _values(name, values)
@@ -77,7 +77,7 @@ def _values(name: str, text: str) -> tuple[str, ...]:
 
 
 def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
-    """Each combination of values, by name; the last option changes fastest.
+    """All combinations of values, by name; the last option varies fastest.
 
     Raises:
         ValueError: not one or two different options, or too many combinations.

@@ -13,7 +13,7 @@ from beamline.core.files import RUNS
 
 
 def device_name(value: str) -> str:
-    """A name with the three parts that Tango's names have. ValueError for another one."""
+    """A name with the three parts of Tango's names. Raises ValueError for other names."""
     if not re.fullmatch(r"[\w.-]+(/[\w.-]+){2}", value):
         raise ValueError(f"{value!r} is no name of a device; expected DOMAIN/FAMILY/MEMBER, such as id19/tomo/scan")
     return value

@@ -36,20 +36,21 @@ _STATES: dict[str, str] = {
 
 
 def device_state(values: RunValues) -> str:
-    """The name of Tango's state: RUNNING, ALARM where the monitor has alarms, STANDBY while the scan is paused, ON when
-    none runs, FAULT after one that ended badly."""
+    """The name of Tango's state: RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused, ON when
+    none runs, FAULT after one that failed.
+    """
     return _STATES.get(values.state, "ALARM" if values.alarms else "RUNNING")
 
 
 def quality(stamped: StampedValues, name: str) -> str:
-    """The name of Tango's quality of a value: INVALID where it is not known or old."""
+    """The name of Tango's quality of a value: INVALID if it is unknown or old."""
     if stamped.stamp(name).severity is Severity.INVALID:
         return "ATTR_INVALID"
     return _RAISED[name] if name in _RAISED and getattr(stamped.values, name) else "ATTR_VALID"
 
 
 class ServedRun:
-    """The newest run of a folder, with its pictures and verbs. Calls may come from any thread.
+    """The newest run of a folder, with its pictures and commands. Calls may come from any thread.
 
     Args:
         say: takes a line for each verb that is refused late.
@@ -64,7 +65,7 @@ class ServedRun:
         self.close = self.followed.close
 
     def look(self) -> StampedValues:
-        """The values now."""
+        """The current values."""
         with self._lock:
             self._look_at_verbs()
         return self.followed.look()
@@ -90,7 +91,7 @@ class ServedRun:
         )
 
     def ask(self, verb: Verb) -> None:
-        """Send a verb to the run. Returns at once; a refusal that comes later is in `refused`.
+        """Send a command to the run. Returns at once; a later refusal is in `refused`.
 
         Raises:
             BeamlineError: no scan runs there, or the request cannot be made.
@@ -146,7 +147,7 @@ class ServerPlace:
 
     @property
     def arguments(self) -> list[str]:
-        """As a device server takes them."""
+        """The arguments in the form that a device server expects."""
         address = "" if self.address == "0.0.0.0" else self.address
         named = [] if self.instance else ["-nodb", "-dlist", self.device]
         return ["splatline", self.instance or "scan", *named, "-ORBendPoint", f"giop:tcp:{address}:{self.port}"]
@@ -242,13 +243,13 @@ def _sender(run: ServedRun, verb: Verb) -> Callable[[Any], None]:
 
 
 def status_of(run: ServedRun) -> str:
-    """The state and the last message of the scan, and why it did not do the last verb."""
+    """The state and the last message of the scan, and why it refused the last command."""
     values = run.followed.stamped.values
     return one_line("; ".join(filter(None, (values.state, values.message, run.refused))), 1000)
 
 
 def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], None], ready: Callable[[], None]) -> None:
-    """Serve the newest run of a folder, also one that begins later, until SIGINT or SIGTERM.
+    """Serve the newest run of a folder, and each one that begins later, until SIGINT or SIGTERM.
 
     Args:
         control: verbs are taken, from everybody who reaches the address.
@@ -291,7 +292,7 @@ def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], No
 
 
 def push_changes(device: Any, before: StampedValues, now: StampedValues) -> None:
-    """Tell clients that wait for changes of each value that was set again."""
+    """Notify clients that subscribed to changes of each value that was set again."""
     from tango import AttrQuality, DevState
 
     for each in SHOWN:

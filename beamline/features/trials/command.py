@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def listed(value: str) -> tuple[str, ...]:
-    """Names of methods, separated by commas. ValueError for another name."""
+    """Parse names of methods separated by commas. Raises ValueError for an unknown name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     if others := [name for name in wanted if name not in names_of_one_volume()]:
         raise ValueError(unknown_method(others[0], names_of_one_volume()))
@@ -61,7 +61,7 @@ _OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each ene
 
 @dataclass(frozen=True, eq=False)
 class TradeoffRequest:
-    """What `beamline tradeoff` is asked for."""
+    """The arguments of `beamline tradeoff`."""
 
     files: tuple[Path, ...] = set_by(
         heading(DATA),
@@ -106,7 +106,7 @@ class TradeoffRequest:
         "of an emission also mlem and osem.",
     )
     quick: bool = set_by(
-        "--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones."
+        "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."
     )
     seconds: float | None = set_by(equal_time)
     max_seconds: float | None = set_by(
@@ -202,7 +202,7 @@ def _compare(
         answer.lines = text(table, layout), f"\n{'report':<10}{folder / layout.page}"
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
-        raise ScanStopped(f"The {layout.name} was stopped after {counts}; {folder} holds those.")
+        raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {folder}.")
 
 
 @dataclass(frozen=True, eq=False)

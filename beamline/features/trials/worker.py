@@ -135,7 +135,7 @@ def measured(
             None if rays is None else np.asarray(rays > 0),
         )
         if not own.any():
-            raise ValueError("the views held out are all zero, so there is nothing to explain")
+            raise ValueError("all held-out views are zero, so no residual can be computed")
         figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
         squared = left.tolist()
     return figures, squared

@@ -61,7 +61,7 @@ def charges_of(value: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if not numbers or len(set(numbers)) < len(numbers) or not all(0 <= charge <= 1 for charge in numbers):
-        raise ValueError(f"{value!r} are no states of charge; expected numbers from 0 to 1, e.g. 0,0.5,1")
+        raise ValueError(f"{value!r} are not states of charge; expected numbers from 0 to 1, e.g. 0,0.5,1")
     return numbers
 
 
@@ -75,7 +75,7 @@ def charges_of(value: str) -> tuple[float, ...]:
     "--angle",
     type=FiniteRange(min=-360, max=360),
     metavar="DEG",
-    help="At which the scene's stage stands; 0 unless given.",
+    help="Angle of the scene's stage. Default: 0.",
 )
 @click.option("--seed", type=SEED, help="Seed of all random numbers of a scene. Default: 0.")
 @click.option(
@@ -94,7 +94,7 @@ def charges_of(value: str) -> tuple[float, ...]:
     help="States of charge, 0 to 1, that the scene's material has, one after the other.",
 )
 @click.option(
-    "--around", callback=parsed(box), metavar=_BOX, help="Its surroundings, for the contrast; none unless given."
+    "--around", callback=parsed(box), metavar=_BOX, help="Region around the material, for the contrast. Default: none."
 )
 @click.option(
     "--unit", type=NameChoice(["keV", "eV"]), help="Unit of a file's energies. Default: as in the file, else keV."
@@ -122,7 +122,11 @@ def charges_of(value: str) -> tuple[float, ...]:
     type=click.Path(path_type=Path, dir_okay=False),
     help="With --volume: table as of `materials`; FILEs are volumes in 1/mm, and the map is of its last material.",
 )
-@click.option("--least", type=FiniteRange(min=0, min_open=True), help="With --volume: least sum; 0.5 unless given.")
+@click.option(
+    "--least",
+    type=FiniteRange(min=0, min_open=True),
+    help="With --volume: lowest sum of fractions that is mapped. Default: 0.5.",
+)
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_json: bool, **values: Any) -> None:
     """Find the energy at which a material of given thickness has the highest contrast to its surroundings, and its

@@ -37,7 +37,7 @@ Blocks = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Lines of one kind of frames, along one axis.
+    """Lines of one kind of frame, along one axis.
 
     Attributes:
         last: logarithms of the light of the last frames without a band, oldest first.

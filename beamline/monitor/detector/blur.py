@@ -51,7 +51,7 @@ class BlurState:
 
 @dataclass(frozen=True)
 class BlurCheck(Logged):
-    """Score: share of its fine contrast that a view has lost against the views before.
+    """Score: fraction of its fine contrast that a view has lost relative to the views before.
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
     is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well.

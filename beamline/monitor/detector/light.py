@@ -74,7 +74,7 @@ FEW = 10  # zingers a view that are never too many
 
 @dataclass(frozen=True)
 class ZingersState:
-    """Views so far, and their zingers."""
+    """Number of views so far, and of their zingers."""
 
     views: int = 0
     zingers: int = 0

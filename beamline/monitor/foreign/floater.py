@@ -60,7 +60,8 @@ class SeenCrumb:
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """The views since a gap: the last one's time in views, the angles of the first and the last, their step in rad."""
+    """The views since the last gap: time of the last one in views, angles of the first and the last, their step in
+    rad."""
 
     octaves: tuple[Octave, ...] = ()
     time: float = 0.0

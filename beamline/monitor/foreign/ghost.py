@@ -82,7 +82,7 @@ def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Filters for several signals."""
+    """Matched filters for several signals."""
 
     # weights: float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1
     weights: CellValues
@@ -99,7 +99,7 @@ def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Rea
 
 
 def correlate(views: CellValues, weights: CellValues) -> CellValues:
-    """[signal, row, col] of views [lag, row, col]; beyond the frame's edges it goes on as at the edge."""
+    """Correlation [signal, row, col] of views [lag, row, col]; beyond the frame's edges the edge value is continued."""
     wide = np.pad(views, ((0, 0), (0, 0), (REACH, REACH)), mode="edge")
     places = np.lib.stride_tricks.sliding_window_view(wide, 2 * REACH + 1, axis=2)
     return np.tensordot(weights, places, ((1, 2), (0, 3)))

@@ -62,7 +62,7 @@ def _model(text: str) -> str:
 
 @dataclass(frozen=True)
 class Air:
-    """Takes a background off each view, so that its air is at zero.
+    """Subtracts a background from each view, so that the line integral of air is zero.
 
     Attributes:
         model: as the option says it.
@@ -83,19 +83,19 @@ class Air:
 
     @property
     def columns(self) -> Columns:
-        """(left, right) columns of air, as of `recon.prep.correct.CorrectionSettings`, which takes them."""
+        """The (left, right) columns of air, as in `recon.prep.correct.CorrectionSettings`."""
         return _parts(self.model)[0]
 
     @property
     def sample_from(self) -> float:
-        """Line integral at the edges from which they are sample, as for the monitor; columns asked for are air."""
+        """Line integral above which the edges count as sample, as for the monitor; requested columns count as air."""
         from recon.voxels.field_edges import LEAST
 
         return LEAST if self.model == "auto" else math.inf
 
     @property
     def surface(self) -> Surface:
-        """The surface that is taken off, see `without_background`."""
+        """The background surface that is subtracted, see `without_background`."""
         return _parts(self.model)[1]
 
     def memory(self, part: ScanPart) -> StepMemory:
@@ -119,7 +119,7 @@ class Air:
 
 
 def background_memory(geometry: Geometry) -> int:
-    """Most bytes that `without_background` takes beside such views, about."""
+    """Approximate peak memory of `without_background` in bytes, without the views themselves."""
     from recon.voxels.fbp import fbp_memory
 
     small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
@@ -166,7 +166,7 @@ def without_background(
     unknown: Mask | None = None,
     levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
-    """Take the background of the beam off views [view, row, col], in place.
+    """Subtract the background of the beam from views [view, row, col], in place.
 
     Returns what was done, in words (empty: nothing), and the terms of the mean surface that was taken off.
 

@@ -40,7 +40,7 @@ def _table(text: str) -> PoseTable:
 
 @dataclass(frozen=True)
 class PosesOfFile:
-    """Where views were displaced, rolled and tilted, as a file states it.
+    """Displacement, roll and tilt of the views, as stated by a file.
 
     Attributes:
         table: the file's; None: views are displaced as the scan file says (.txrm), or not at all.
@@ -79,7 +79,7 @@ class PosesOfFile:
 
 
 def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
-    """The poses of the option's file, or else the shifts that the scan file states."""
+    """The poses in the option's file, or else the shifts stated by the scan file."""
     from beamline.storage.pose_table import PoseTable
 
     table, shifts = selection.step(PosesOfFile).table, source.shifts
@@ -119,7 +119,7 @@ class ScanPoses:
 
     @property
     def axis_col(self) -> float:
-        """Column of the whole detector that the axis falls on by vectors, or the nearest one."""
+        """The full-detector column of the axis according to the pose vectors, or the nearest column."""
         assert self.vectors is not None
         whole = self.binning * self.vectors.detector_shape[1]
         return float(np.clip(self.binning * self.vectors.axis_col + (self.binning - 1) / 2, 0, whole - 1))
@@ -129,11 +129,11 @@ class ScanPoses:
         return StepDone(self.sentence)
 
     def stated(self, view_ids: I64) -> NDArray[np.bool_]:
-        """[view] whether the file states their pose."""
+        """[view] whether the file states the pose of the view."""
         return np.isfinite(self.roll[view_ids])
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
-        """The geometry of these rows of the file in their poses."""
+        """The geometry of these rows of the file with their poses applied."""
         if self.vectors is not None:
             return self.vectors.select(self.view_of[view_ids])
         posed = replace(
@@ -146,7 +146,7 @@ class ScanPoses:
 
 
 def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses | None:
-    """The poses that the selection's file states of `frames`, or the scan file itself; None without any.
+    """The poses of `frames` from the selection's file, or else from the scan file; None if neither states any.
 
     Raises:
         ConfigError: options that do not go together.
@@ -189,7 +189,7 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> G
 
     assert table.vectors is not None
     if selection.axis_col is not None:
-        raise ConfigError(f"--axis: the vectors of {table.path} state where the axis falls. Leave it out.")
+        raise ConfigError(f"--axis: the vectors of {table.path} already determine the axis. Leave --axis out.")
     try:
         views = geometry_of_vectors(table.vectors, source.shape, cone=table.cone)
     except ValueError as error:
@@ -263,7 +263,7 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
 
 
 def require_stated(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
-    """DataError where views have no pose."""
+    """Raise DataError if views lack a pose."""
     unknown, table = view_ids[~poses.stated(view_ids)], stated_poses(source, selection)
     if unknown.size and table is not None:
         degrees = np.degrees(source.angles[unknown[0]])

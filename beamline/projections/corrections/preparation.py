@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Preparation:
-    """How line integrals are made of the frames. `checked_views` and `OpenBeam` follow it.
+    """How frames are converted to line integrals. `checked_views` and `OpenBeam` follow these settings.
 
     Attributes:
         flags: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
@@ -82,31 +82,31 @@ class Preparation:
 
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":
-            raise ValueError("--gain is for counted photons; it does not go with --noise log.")
+            raise ValueError("--gain is for --noise counts; it has no effect with --noise log. Leave one of them out.")
 
     @property
     def uses_flags(self) -> bool:
-        """Views are treated by flags, the file's or new ones."""
+        """Whether flags, those of the file or new ones, decide about views."""
         return self.flags != "ignore"
 
     @property
     def judged(self) -> bool:
-        """The monitor looks at the frames first."""
+        """Whether the monitor checks the frames first."""
         return self.flags == "judge"
 
     @property
     def accepted(self) -> bool:
-        """All groups of references are used, whatever their faults."""
+        """Whether all groups of references are used, even faulty ones."""
         return self.references == "accept"
 
     @property
     def by_current(self) -> bool:
-        """Views and flats are divided by the ring current."""
+        """Whether views and flats are divided by the ring current."""
         return self.ring_current == "use"
 
     @property
     def done(self) -> StepDone:
-        """What the volume's file records of it, beside what `OpenBeam` did."""
+        """What the volume's file records of the preparation, apart from the record of `OpenBeam`."""
         return StepDone(parameters={"flags": self.flags, "references": self.references})
 
     @property

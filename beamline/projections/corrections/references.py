@@ -26,7 +26,7 @@ _STEADY = 0.01  # of the ring current: top-up keeps it so
 
 
 def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> References:
-    """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
+    """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
 
     Frames that are damaged (see ScanSource) are left out, unless the selection uses all. The light of flats with an
     exposure of their own is scaled to the projections': dark + (flat - its dark) * t / t_flat, where both are known.
@@ -84,7 +84,7 @@ def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) ->
 def with_dynamic_flats(
     source: ScanSource, groups: ReferenceGroups, references: References, rows: slice, selection: Selection
 ) -> References:
-    """The same references with the components of all flats of these groups, which are read three times.
+    """The same references with the principal components of all flats of these groups, which are read three times.
 
     Raises:
         ConfigError: there are too few flats.
@@ -113,8 +113,9 @@ def with_dynamic_flats(
 
 
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
-    """By how much the light of each frame grows from its own exposure to the projections' median; 1 where one is
-    unknown. With `by_current` also from its own ring current."""
+    """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown. With
+    `by_current` also from its own ring current.
+    """
     from beamline.storage.rules.references import exposures_of
 
     scale = _to_median(exposures_of(source), source.image_key)
@@ -131,7 +132,7 @@ def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDA
 
 
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
-    """By how much the light of each frame grows from its own ring current to the median of the projections'.
+    """Factor [frame] that scales each frame from its own ring current to the median of the projections'.
 
     Raises:
         ConfigError: the file has none for some view or flat.
@@ -145,7 +146,8 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
 
 
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
-    """A warning where the ring current changed between flats and views and nobody asked to correct it; "" if not."""
+    """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
+    change."""
     used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
     if source.quantity != "counts" or selection.step(Preparation).by_current or (known := source.currents) is None:
         return ""
@@ -179,7 +181,7 @@ def _mean(
 
 
 def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
-    """What was done about changes of the beam and of the exposure, in words; empty where nothing was."""
+    """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
     from beamline.storage.rules.exposures import views_differ
 
     sentences = []

@@ -59,7 +59,7 @@ def _distortion(text: str) -> resample.Distortion:
 
 @dataclass(frozen=True)
 class TiltAndLens:
-    """How views are resampled.
+    """Settings for resampling views: tilt and lens distortion.
 
     Attributes:
         tilt: degrees by which the axis leans in the detector's plane; its column grows by tan(tilt) a row. "auto": it
@@ -89,12 +89,12 @@ class TiltAndLens:
 
     @property
     def sought(self) -> bool:
-        """The tilt is to be found."""
+        """Whether the tilt is to be found from the views."""
         return self.tilt == "auto"
 
     @property
     def tilt_deg(self) -> float:
-        """The turn of the views in degrees, as far as it is known."""
+        """The roll of the views in degrees, as far as it is known."""
         return self.tilt if isinstance(self.tilt, float | int) else 0.0
 
     @property
@@ -125,13 +125,13 @@ class TiltAndLens:
         return ViewFilter(apply, resampling.reach, "--tilt and --distortion mix"), self.done(turned)
 
     def done(self, sentence: str) -> StepDone:
-        """What it did, with what is recorded where nothing was asked, too."""
+        """What the step did; also recorded if nothing was requested."""
         lens = {} if self.distortion is None else asdict(self.distortion)
         parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": sentence} if sentence else {})}
         return StepDone(sentence, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
 
     def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
-        """How views are resampled; None where they are used as they are.
+        """The resampling of the views; None if they are used as recorded.
 
         Raises:
             ConfigError: a cone's axis is to be levelled.
@@ -155,7 +155,7 @@ def _plain(value: Any) -> float | str:
 def with_tilt(
     source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> tuple[Selection, str]:
-    """The selection with its tilt found by all rows of the detector, if it asks for that; and a sentence about it.
+    """The selection with the tilt found from all detector rows, if it asks for that; and a sentence about it.
 
     The sentence is empty where the tilt was not asked for.
 
@@ -184,8 +184,8 @@ def with_tilt(
         ) from error
     if abs(tilt) > STEEPEST:
         raise DataError(
-            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, more than the "
-            f"{math.degrees(STEEPEST):g} that are looked for. Look at the views; give the tilt with --tilt DEGREES."
+            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, beyond the "
+            f"{math.degrees(STEEPEST):g} that are searched. Check the views; give the tilt with --tilt DEGREES."
         )
     lean = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:

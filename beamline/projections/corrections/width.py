@@ -62,7 +62,7 @@ def _arc(text: str) -> str:
 
 @dataclass(frozen=True)
 class Width:
-    """What a pixel saw beside its central ray.
+    """Widths of the rays: the arc of an exposure, and the pixel.
 
     Attributes:
         spread: "none": rays. "pixel": a pixel's own area. A number: that, and a Gaussian blur of so many pixels.
@@ -99,7 +99,7 @@ class Width:
         return StepMemory()
 
     def rays(self, source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, StepDone]:
-        """The geometry with the rays' width; angles become those of the middle of the exposure.
+        """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:
             ConfigError: rows of a cone, or of views that roll or tilt or may do so, that see angles of their own.
@@ -123,8 +123,8 @@ class Width:
                 if bent and stated.skew:
                     beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
                     raise ConfigError(
-                        f"--exposure-arc {self.arc}: rows with angles of their own are known of a straight parallel "
-                        f"beam only, and this is {beam}. Give the arc alone. Nothing was written."
+                        f"--exposure-arc {self.arc}: a readout arc is supported only for an untilted parallel "
+                        f"beam, and this is {beam}. Give the exposure arc alone. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
@@ -160,7 +160,7 @@ class Width:
 
 
 def stated_motion(source: ScanSource) -> _Motion | None:
-    """The motion that the file of a fly scan states; None: the stage stood, or the file does not say.
+    """The motion stated by the file of a fly scan; None if the stage stood or the file states nothing.
 
     The speed is that of the median step from view to view, so that passes and lost views do not count.
     """

@@ -29,7 +29,7 @@ WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field that a file states and that is not used: where it is, its value, why or what to do, may it matter."""
+    """A field of a file that is ignored: its path, its value, why or what to do, and whether it may matter."""
 
     where: str
     value: str
@@ -38,7 +38,7 @@ class NotUsed(NamedTuple):
 
 
 class Used(NamedTuple):
-    """A field that a file states and that is used: where it is, its value, what for."""
+    """A field of a file that is used: its path, its value, and its purpose."""
 
     where: str
     value: str
@@ -46,7 +46,7 @@ class Used(NamedTuple):
 
 
 class EmissionCounts(NamedTuple):
-    """Float32 [view, row, col] each: what was counted, and survival and background as of `recon.Emission`."""
+    """Float32 [view, row, col] each: counts, survival and background as in `recon.Emission`."""
 
     counts: NDArray[np.float32]
     survival: NDArray[np.float32]
@@ -127,37 +127,37 @@ class ScanSource(ABC):
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
-        """Name and content of a text with the angles that lies beside the frames, or None."""
+        """Name and content of a text file with angles beside the frames, or None."""
         return None
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes that are unpacked to read a frame, or any row of it."""
+        """Bytes that are decompressed to read a frame, or any row of it."""
         return self.shape[0] * self.shape[1] * self.dtype.itemsize
 
     @property
     def finished(self) -> bool:
-        """No more frames will come. Ask before refresh(): refresh() then finds all frames."""
+        """Whether no more frames will come. Check before refresh(): refresh() then finds all frames."""
         return True
 
     @property
     def ending(self) -> ScanEnding:
-        """How the scan ended, as far as the file tells; a copy states the same."""
+        """How the scan ended, as far as the file states; a copy states the same."""
         return self.stated_ending
 
     @property
     def attributes(self) -> Attributes:
-        """Other facts of the file, for the record."""
+        """Further metadata of the file, for the record."""
         return self.facts
 
     @property
     def flags(self) -> FrameFlags | None:
-        """Of the monitor, by frame; None where no monitor looked at the frames."""
+        """The monitor's flags by frame; None if no monitor checked the frames."""
         return None
 
     @property
     def times(self) -> NDArray[np.float64] | None:
-        """float64 [frame], s at the trigger, NaN where unknown; None where the file says nothing."""
+        """float64 [frame], s at the trigger, NaN where unknown; None if the file has no times."""
         return None
 
     @property
@@ -170,7 +170,7 @@ class ScanSource(ABC):
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
-        """int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 in others.
+        """int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 for other frames.
 
         None if no view was repeated.
         """
@@ -178,7 +178,7 @@ class ScanSource(ABC):
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
-        """int64 [part], ascending, the first row of each part; [0] where the scan was not interrupted.
+        """int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted.
 
         Between two parts beam and camera may have changed.
         """
@@ -186,7 +186,7 @@ class ScanSource(ABC):
 
     @property
     def checksummed(self) -> bool:
-        """The file holds a checksum of every frame."""
+        """Whether the file has a checksum for every frame."""
         return False
 
     @property
@@ -196,7 +196,7 @@ class ScanSource(ABC):
 
     @property
     def damaged(self) -> frozenset[int]:
-        """Rows read so far whose pixels are not those that were written, by their checksums.
+        """Rows read so far whose pixels differ from their checksums.
 
         Frames are compared only where half of them or more is read.
         """
@@ -204,18 +204,20 @@ class ScanSource(ABC):
 
     @abstractmethod
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
+        """Pixels [frame, row, col] of the requested frames, in that order. Raises IndexError beyond the readable
+        frames.
+        """
 
     @abstractmethod
     def close(self) -> None:
         """Close the file."""
 
     def refresh(self) -> int:
-        """Look again at a growing file; how many frames can be read now."""
+        """Read the state of a growing file again; returns the number of readable frames."""
         return int(self.image_key.size)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on. A format without framestamps and times yields -1 and NaN for them.
+        """The frames from `first` on. Framestamps are -1 and times NaN if the format has none.
 
         Raises:
             DataError: the pixels are not the uint16 that a Frame holds.
@@ -237,7 +239,7 @@ class ScanSource(ABC):
             )
 
     def require_counts(self) -> None:
-        """DataError where the pixels are not the uint16 that a Frame holds."""
+        """Raise DataError if the pixels are not uint16, as a Frame requires."""
         if self.dtype != np.uint16:
             raise DataError(
                 f"{self.path} holds {self.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
@@ -251,7 +253,7 @@ class ScanSource(ABC):
 
 
 def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
-    """Frame numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
+    """Row numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
     if isinstance(frames, slice):
         return np.arange(n)[frames]
     indices = np.atleast_1d(np.asarray(frames))
@@ -261,12 +263,12 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
         raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
     indices = indices.astype(np.int64)
     if indices.min() < -n or indices.max() >= n:
-        raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
+        raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{n - 1} can be read.")
     return np.where(indices < 0, indices + n, indices)
 
 
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-    """As `source.read`, with NaN (0 of whole numbers) for frames that the file does not give: see its `unreadable`.
+    """`source.read`, with NaN (0 for integers) for unreadable frames: see its `unreadable`.
 
     A real number beyond LARGEST, which no detector counts and which float32 may not hold, is NaN, too.
     """
@@ -299,25 +301,25 @@ def _measured(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class LookedEnoughError(DataError):
-    """Looking at frames would take too long; what was found before stands."""
+    """The check was ended because it would take too long; findings so far are valid."""
 
 
 def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
-    """0, 1, 2, ... from each change of kind on: the trigger of each frame within its block."""
+    """The trigger of each frame within its block: 0, 1, 2, ..., starting at each change of kind."""
     rows = np.arange(image_key.size)
     starts = np.where(np.diff(image_key, prepend=image_key[:1] - 1) != 0, rows, 0)
     return rows - np.maximum.accumulate(starts)
 
 
 def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
-    """Rows of the views that were taken again, ascending."""
+    """Rows of the views that were repeated, ascending."""
     replaces = source.replaces
     return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
 
 
 @dataclass(frozen=True)
 class Opening:
-    """How a scan is opened.
+    """Options for opening a scan.
 
     Attributes:
         follow: the file may still be growing.

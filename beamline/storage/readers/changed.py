@@ -19,7 +19,7 @@ from drivers.base.frame import Frame, FrameKind
 
 
 class OverlaidSource(WrappedSource):
-    """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
+    """A ScanSource with references in front of the frames of `base`: darks, flats, then these frames.
 
     If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
     """
@@ -88,7 +88,7 @@ class OverlaidSource(WrappedSource):
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
-        """The parts of `base`, the first with the references in front; added flats hold for all parts."""
+        """The parts of `base`, the first including the references in front; added flats are valid for all parts."""
         if self._replaced[FrameKind.FLAT] is not None:
             return np.zeros(1, np.int64)
         starts = self._base.part_starts
@@ -118,7 +118,7 @@ class OverlaidSource(WrappedSource):
         return out
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on; those of `base` keep what their file knows about them."""
+        """The frames from `first` on; those of `base` keep their metadata."""
         if len(self._front) or self.dtype != np.uint16:
             return super().frames(first)
         angles = self.angles
@@ -131,7 +131,8 @@ _EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds
 
 
 class AveragedSource(WrappedSource):
-    """A ScanSource whose projections are means of `base`'s; darks and flats are as they are, and invalid frames gone.
+    """A ScanSource whose projections are means of those of `base`; darks and flats are unchanged, invalid frames are
+    omitted.
 
     A view is up to `n` projections that follow one another, closer in angle than the last frames of a view and the
     first of the next. So a view that lacks frames takes none of its neighbour's. Of a growing file a view is there once
@@ -206,7 +207,7 @@ class AveragedSource(WrappedSource):
         self._looked_at = open_group[0] if open_group else int(keys.size)
 
     def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Means over the frames used."""
+        """Values [row] of this scan: means over the frames averaged into each row."""
         return np.array([known[rows].mean(axis=0) for rows in self._used]).reshape(-1, *known.shape[1:])
 
     def _without_alarms(self) -> list[list[int]]:
@@ -233,7 +234,7 @@ class AveragedSource(WrappedSource):
 
     @property
     def flags(self) -> FrameFlags | None:
-        """Of the frames that a row is the mean of, together; a region is the box around theirs."""
+        """The combined flags of the frames averaged into each row; a region is the box around theirs."""
         flags = self._base.flags
         if flags is None:
             return None
@@ -293,12 +294,12 @@ def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def stated_frames_per_view(source: ScanSource) -> int:
-    """How many frames a view has by the plan in the file; 1 where it says nothing."""
+    """Frames per view by the plan in the file; 1 if it has no plan."""
     stated = source.plan.get("frames_per_view", 1)
     return stated if isinstance(stated, int) and stated > 1 else 1
 
 
 def angles_of_frames(angles: NDArray[np.float64], source: ScanSource, n: int) -> NDArray[np.float64]:
-    """An angle for each frame: where there is one a view, it is that of the view's n frames."""
+    """Angles [frame]: if one is given for each view, it applies to the view's n frames."""
     views = int((source.image_key == FrameKind.PROJECTION).sum())
     return np.repeat(angles, n) if angles.size * n == views else angles

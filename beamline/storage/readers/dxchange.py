@@ -41,7 +41,7 @@ PLACES = (
 
 
 def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
-    """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""
+    """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
@@ -71,13 +71,13 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 class ExchangeSource(StacksSource):
-    """A scan as Data Exchange."""
+    """A scan in a Data Exchange file."""
 
     _of_stack: NDArray[np.int64] | None = None
     """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
 
     def take_order(self, thetas: Sequence[NDArray[np.float64] | None]) -> None:
-        """Put darks and flats among the views by the angles at which they were taken, where the file states them.
+        """Sort darks and flats among the views by the angles at which they were taken, if the file states them.
 
         Args:
             thetas: radians of the darks and of the flats; None where the file states none.

@@ -19,7 +19,7 @@ _LISTED = 6  # detectors that an error names
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where a file keeps what we need; None where it does not."""
+    """Paths in a file of the fields that are read; None for a missing one."""
 
     entry: h5py.Group
     detector: h5py.Group
@@ -30,7 +30,7 @@ class Places:
 
 
 def find(file: h5py.File) -> list[Places]:
-    """Every tomography entry of a file; [] where it has none. DataError where the frames' own file is missing."""
+    """Every tomography entry of a file; [] if it has none. Raises DataError if the file with the frames is missing."""
     places = []
     unresolved: list[str] = []
     for name in file:
@@ -52,7 +52,7 @@ def find(file: h5py.File) -> list[Places]:
 
 
 def groups(parent: Any) -> list[h5py.Group]:
-    """The groups in a group; [] for anything else."""
+    """The groups in a group; [] for any other object."""
     if not isinstance(parent, h5py.Group):
         return []
     items = (hdf5.resolve(parent, name) for name in parent)
@@ -79,7 +79,7 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset |
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
-    """The one detector to read: whose frames are `data`, or which the attributes `default` of file and entry name.
+    """The one detector to read: the one whose frames are `data`, or the one named by `default` of file and entry.
 
     DataError: there is none, or several fit.
     """
@@ -121,7 +121,7 @@ _MONOCHROMATOR = "instrument/monochromator"
 
 @dataclass(frozen=True)
 class NexusGeometry:
-    """What a file states; None for what it does not.
+    """The geometry stated by a file; None for what it does not state.
 
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
@@ -139,7 +139,7 @@ class NexusGeometry:
 
 
 def read_geometry(places: Places) -> NexusGeometry:
-    """Of a foreign file.
+    """The geometry of a file of another program.
 
     Raises:
         DataError: distances that cannot be.
@@ -181,12 +181,12 @@ def _cone_of(
 
 
 def differing(height: float | None, width: float | None) -> float | None:
-    """The height of a pixel where it is not its width, to a part in a thousand; None for a square one."""
+    """The height of a pixel if it differs from its width by more than a thousandth; None for a square pixel."""
     return height if height is not None and (width is None or abs(height - width) > 1e-3 * abs(width)) else None
 
 
 def require_order(places: Places) -> None:
-    """DataError where the attribute `axes` of the detector's NXdata names an order other than frame, row, column."""
+    """Raise DataError if the attribute `axes` of the detector's NXdata names an order other than frame, row, column."""
     for name in ("data", str(places.detector.name).rsplit("/", 1)[1]):
         nxdata = hdf5.resolve(places.entry, name)
         if not isinstance(nxdata, h5py.Group) or "axes" not in nxdata.attrs:
@@ -201,13 +201,13 @@ def require_order(places: Places) -> None:
 
 
 def read_energy(entry: h5py.Group) -> float | None:
-    """Of the photons in keV, by an energy or a wavelength of the beam or the monochromator; None for a spectrum."""
+    """Photon energy in keV, from an energy or a wavelength of the beam or the monochromator; None for a spectrum."""
     values = _energies(entry, 1)
     return None if values is None or not np.isfinite(values[0]) else float(values[0])
 
 
 def read_energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
-    """float64 [n] keV of each frame; None where the file has no such list."""
+    """float64 [frame] keV; None if the file has no such list."""
     values = _energies(entry, n) if n > 1 else None
     return None if values is None or not np.isfinite(values).any() else values
 

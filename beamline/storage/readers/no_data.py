@@ -22,7 +22,9 @@ _FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
 
 
 class MarkedSource(WrappedSource):
-    """A ScanSource whose pixels without data are 0 in all frames, also in flats: what has no light is filled."""
+    """A ScanSource whose pixels without data are set to 0 in all frames, flats included, so that they are filled like
+    unlit ones.
+    """
 
     def __init__(self, base: ScanSource, no_data: Mask) -> None:
         super().__init__(base)
@@ -44,7 +46,7 @@ class MarkedSource(WrappedSource):
 
 
 def no_data_of(source: ScanSource) -> Mask | None:
-    """bool [row, col], pixels that the file's mask, or the end of their type in all frames, marks.
+    """bool [row, col], pixels without data by the file's mask, or at the maximum of their type in all frames.
 
     Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. Types
     of 8 and 16 bits may end by too much light, so that whole rows and columns alone are marks there, and nothing else
@@ -86,7 +88,7 @@ def _end_in(source: ScanSource, row: int) -> Mask:
 
 
 def counts_photons(source: ScanSource) -> bool:
-    """Whether flats vary from frame to frame as counted photons: by their mean, so that no offset is in them.
+    """Whether flats fluctuate like counted photons: with the variance of their mean, so that they have no offset.
 
     Of a camera the variance over the mean is its gain, times the share of the light in its counts.
     """

@@ -65,7 +65,7 @@ def _guarded(method: Callable[[NXtomoSource], _T]) -> Callable[[NXtomoSource], _
 
 
 class NXtomoSource(ScanSource):
-    """A scan in NXtomo's structure; see ScanSource."""
+    """A scan with the structure of NXtomo; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> None:
         """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units.
@@ -205,7 +205,7 @@ class NXtomoSource(ScanSource):
     @property
     @_guarded
     def attributes(self) -> dict[str, str | float | int]:
-        """What else the file says: sample, title, times, status, missing triggers, why it ended early."""
+        """Further metadata: sample, title, times, status, missing triggers, why the scan ended early."""
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
@@ -339,7 +339,7 @@ class NXtomoSource(ScanSource):
         return frozenset(self._altered)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, with all that the file knows about each."""
+        """The frames from `first` on, each with all its metadata in the file."""
         self.require_counts()
         with hdf5.readable(self.path):
             time = np.full(self.n, np.nan) if (known := self.times) is None else known

@@ -65,7 +65,7 @@ or in FORMATS of a folder of formats."""
 
 @dataclass(frozen=True, eq=False)
 class SourceOptions:
-    """A scan, and replacements for facts in its file.
+    """A scan file, and replacements for its metadata.
 
     Attributes:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
@@ -113,7 +113,7 @@ class SourceOptions:
     frames_per_view: int | None = 1
 
     def open(self, *, follow: bool = False) -> ScanSource:
-        """The scan with these replacements; see `open_scan`."""
+        """Open the scan with these replacements; see `open_scan`."""
         return open_scan(self, follow=follow)
 
 
@@ -248,7 +248,9 @@ def _references(base: ScanSource, options: SourceOptions, white: float | None) -
         flats = np.full_like(nothing, white) if options.flats is None else options.flats
         return nothing if options.darks is None else options.darks, flats
     if options.darks is not None or options.flats is not None:
-        raise DataError("--quantity transmission is of frames divided by their flats: leave out --darks and --flats.")
+        raise DataError(
+            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+        )
     if base.dtype.kind != "f":
         raise DataError(
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
@@ -302,7 +304,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
 
 
 def scan_format(path: Path) -> str | None:
-    """The name of the format of a scan that an HDF5 file holds; None: of none."""
+    """The name of the format of the scan in an HDF5 file; None if it is no scan."""
     with hdf5.readable(path):
         return next((kind.name for kind in FORMATS if kind.recognises(path, Opening())), None)
 

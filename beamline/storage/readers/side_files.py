@@ -31,7 +31,7 @@ _MOST = 20  # files beside a scan that are looked at
 
 @dataclass(frozen=True)
 class MakerKeys:
-    """Where a maker's file has what we need, as "section/key" in small letters; "" for what it does not state.
+    """Keys of a vendor's file, as "section/key" in lower case; "" for what it does not state.
 
     Attributes:
         sod, sdd: distances from the source to the axis and to the detector, mm.
@@ -90,7 +90,7 @@ _ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states 
 
 @dataclass(frozen=True, eq=False)
 class SideFile:
-    """What a maker's file states of a scan; None for what it does not.
+    """The geometry of a scan stated by a vendor's file; None for what it does not state.
 
     Attributes:
         cone: mm from the source to the rotation axis and to the detector.
@@ -120,14 +120,14 @@ class SideFile:
 
 
 class SidedSource(WrappedSource):
-    """A ScanSource with the distances and the pixel size of a maker's file."""
+    """A ScanSource with the distances and the pixel size of a vendor's file."""
 
     def __init__(self, base: ScanSource, side: SideFile) -> None:
         """Raises DataError where it is of another number of projections."""
         super().__init__(base)
         views = int((base.image_key == FrameKind.PROJECTION).sum())
         if views != side.count:
-            raise DataError(f"{side.path} is of {side.count} projections; {base.path} holds {views}.")
+            raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
         self.cone, self.pixel_size_mm, self.row_pitch_mm = side.cone, side.pixel_mm, None
         self._side = side
         self.not_used = tuple(field for field in base.not_used if field.where != side.path.name)
@@ -138,7 +138,7 @@ class SidedSource(WrappedSource):
 
 
 def read_side_file(path: Path) -> SideFile:
-    """Read a maker's file.
+    """Read a vendor's file.
 
     Raises:
         DataError: it is none of those, or lacks a distance, the pixel size or the number of projections.
@@ -151,11 +151,11 @@ def read_side_file(path: Path) -> SideFile:
         if keys.suffix == path.suffix.lower() and keys.sod in values:
             return _side_file(path, keys, values)
     known = ", ".join(f"{keys.maker} {keys.suffix}" for keys in MAKERS)
-    raise DataError(f"{path} is no file of a CT scanner that is read ({known}).")
+    raise DataError(f"{path} is not a supported file of a CT scanner ({known}).")
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The maker's file in or beside a folder of images, or a TIFF, if one alone is of as many projections."""
+    """The vendor's file in or beside a folder of images, or a TIFF, if exactly one has as many projections."""
     if not source.format.startswith("tiff"):
         return None
     views, found = int((source.image_key == FrameKind.PROJECTION).sum()), []
@@ -167,7 +167,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 
 
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
-    """What a maker's file beside these images states."""
+    """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
     return () if side is None else (NotUsed(side.path.name, str(side), f"--from {side.path} takes it", True),)
 
@@ -236,7 +236,7 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = partial(_number, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
-        raise DataError(f"{path} says {other}: its scan is not on a circle, which is not read.")
+        raise DataError(f"{path} says {other}: only scans on a circle are supported.")
     scale = (number(keys.scale) or 1.0) if keys.scale else 1.0
     given = {name: number(getattr(keys, name)) for name in ("sod", "sdd", "pixel", "count")}
     if lacking := [getattr(keys, name) for name, value in given.items() if value is None or not value > 0]:

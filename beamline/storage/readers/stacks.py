@@ -23,7 +23,7 @@ from drivers.base.frame import FrameKind
 
 
 class TurnedFrames:
-    """A dataset of three dimensions, read as [frame, row, col]."""
+    """A dataset of three dimensions in any order, read as [frame, row, col]."""
 
     def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
         """`order`: which dimensions of `item` are frames, rows and columns."""
@@ -33,7 +33,7 @@ class TurnedFrames:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes that are unpacked to read a frame."""
+        """Bytes that are decompressed to read a frame."""
         return bytes_unpacked(self._item, self._order[0])
 
     def __len__(self) -> int:
@@ -47,7 +47,7 @@ class TurnedFrames:
 
 
 def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
-    """Which of three named dimensions are frames, rows and columns; None where the names do not tell.
+    """Which of three named dimensions are frames, rows and columns; None if the names do not tell.
 
     x, u or columns; y, v or rows; the third, whatever its name (theta, rotation_angle), are frames.
     """
@@ -72,7 +72,7 @@ class FrameStack:
 
 
 class StacksSource(ScanSource):
-    """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
+    """A scan in stacks; see ScanSource. `finished` is always True: a scan in stacks cannot grow.
 
     Quantity: "counts" if there are darks and flats, otherwise "unknown".
     """
@@ -113,7 +113,7 @@ class StacksSource(ScanSource):
             raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order; darks and flats are cast to dtype."""
+        """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for stack, first, last in zip(self._stacks, self._starts[:-1], self._starts[1:], strict=True):
@@ -153,7 +153,8 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
 
 
 def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
-    """Radians of the dataset `where` of an HDF5 file, a list or a column, by `unit` or its attribute `units`.
+    """Angles in radians of the dataset `where` of an HDF5 file, a list or a column, with the unit `unit` or its
+    attribute `units`.
 
     Args:
         unit: "deg" or "rad", whatever the attribute says; None: as that says.
@@ -168,12 +169,12 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         stated = unit or hdf5.attribute(item, "units")
         if stated.lower() not in hdf5.ANGLE_UNITS:
             problem = f"the units {stated!r}" if stated else "no attribute `units`"
-            raise DataError(f"{where} in {path} has {problem}: say --angles-unit deg or --angles-unit rad.")
+            raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
         return hdf5.radians(item, unit)
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
-    """The dataset at a path. Without one, DataError lists the datasets of the file."""
+    """The dataset at a path. If there is none, the DataError lists the datasets of the file."""
     item = hdf5.dataset(file, where)
     if item is None:
         hdf5.refuse_broken(file, where)

@@ -58,7 +58,7 @@ class Entry:
 
 
 def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
-    """The fields that a file states and that are not used; a value that may change the volume is a doubt.
+    """The fields stated in a file but ignored; a value that may change the volume is a doubt.
 
     Numbers that would be used, were their unit known, are among them, and fields whose names are not known.
     """
@@ -88,7 +88,7 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
 
 def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
-    """The numbers that a file states and that are used."""
+    """The numbers stated in a file and used."""
     unused, used = {field.where for field in source.not_used}, []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
@@ -129,7 +129,7 @@ def _place(item: h5py.Dataset) -> tuple[int, int]:
 
 
 def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
-    """The texts that lie in another file, which holds no images."""
+    """The texts stored in another file without images, which are not copied."""
     items = [(where, hdf5.dataset(root, where)) for where in texts]
     return tuple(
         NotUsed(where, f"in the file {hdf5.file_of(item)}", "that holds no images, and its text is not a scan's", True)

@@ -34,7 +34,7 @@ Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radian
 
 
 def load_angles(angles: Angles) -> NDArray[np.float64]:
-    """Radians from a text file in degrees (one a line, # begins a comment), or from an array in radians."""
+    """Read radians from a text file in degrees (one per line, # begins a comment), or from an array in radians."""
     if isinstance(angles, Path | str):
         path = Path(angles)
         try:
@@ -53,7 +53,7 @@ def parse_angles(content: str, name: str) -> NDArray[np.float64]:
 
 
 def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
-    """Rows "a:b" of the angles, counted from 0, b not included; either may be left out."""
+    """Select rows "a:b" of the angles, counted from 0, b excluded; either may be left out."""
     match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
     if match is None:
         raise DataError(
@@ -69,7 +69,7 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
 def assign(
     source: ScanSource, angles: NDArray[np.float64], name: str, *, of_views: bool = False
 ) -> NDArray[np.float64]:
-    """Radians for each frame of a source, NaN where unknown.
+    """Assign an angle in radians to each frame of a source, NaN where unknown.
 
     There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
     each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
@@ -155,7 +155,7 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
 
 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
-    """First and last row of the n neighbouring rows with the most equal steps; None where that is no clear choice.
+    """First and last row of the n consecutive rows with the most equal steps; None if the choice is ambiguous.
 
     A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
     rows, other rows would do as well: then views were lost, and nothing tells which.
@@ -184,7 +184,7 @@ _LISTED = 8  # datasets that an error names
 
 
 def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Reference frames [frame, row, col], all in memory.
+    """Read reference frames [frame, row, col] into memory.
 
     In an HDF5 file they are the dataset that is named, or the frames of this kind by its image_key, or those of Data
     Exchange, or the only images of this shape.
@@ -204,7 +204,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return _of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape)
     if dataset:
-        raise DataError(f"{path} is no HDF5 file, so that it has no dataset {dataset}.")
+        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
     return _of_tiffs(path)
 
 

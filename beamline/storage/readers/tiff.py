@@ -27,7 +27,9 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it 
 
 
 class Complaints(logging.Handler):
-    """Collects tifffile's messages on a damaged file: it only logs them, and goes on with the pages that it finds."""
+    """Collects tifffile's messages on a damaged file: tifffile only logs them, and continues with the pages that it
+    finds.
+    """
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)
@@ -45,12 +47,14 @@ class Complaints(logging.Handler):
 
 
 def is_hidden(name: str) -> bool:
-    """Files that a system keeps beside others, such as a Mac's `._0001.tif`; they are no images."""
+    """Whether a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
     return name.rpartition("/")[2].startswith(".")
 
 
 def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
-    """All pages of a TIFF; [row, col] for one page. ValueError where it claims more bytes, or more than it can hold."""
+    """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if it claims more bytes than allowed, or
+    than it can contain.
+    """
     with tifffile.TiffFile(file) as tif:
         refuse_packed(tif)
         claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
@@ -60,7 +64,9 @@ def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
 
 
 def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of what `read_image` gives, by the heads of its pages. ValueError where they tell no type."""
+    """Shape and type of the result of `read_image`, from the headers of its pages. Raises ValueError if they state no
+    type.
+    """
     refuse_packed(tif)
     first = tif.series[0]
     if first.dtype is None:
@@ -69,7 +75,7 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
-    """ValueError for pixels of 10, 12 or 14 bits without a gap, where nothing unpacks them."""
+    """Raise ValueError for packed pixels of 10, 12 or 14 bits if no codec unpacks them."""
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(
@@ -79,7 +85,7 @@ def refuse_packed(tif: tifffile.TiffFile) -> None:
 
 
 def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
-    """Raises DataError for slices of a volume that this program wrote."""
+    """Raise DataError for slices of a volume that this program wrote."""
     if VOLUME in tif.pages.first.description:
         raise DataError(
             f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
@@ -96,7 +102,8 @@ def appended(tif: tifffile.TiffFile) -> bool:
 
 
 def pages_one_by_one(tif: tifffile.TiffFile) -> bool:
-    """Pages that were appended one at a time, each an image of its own to tifffile, but all alike: one stack."""
+    """Combine pages that were appended one at a time, each a separate image to tifffile, but all alike, into one
+    stack."""
     parts = tif.series
     alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
     return len(parts) > 1 and alike and len(parts) == len(tif.pages)

@@ -27,7 +27,7 @@ _COPIED = [name for name in ScanSource.__annotations__ if name not in _OWN]
 
 
 class WrappedSource(ScanSource):
-    """All of `base`. A subclass has what differs; its `_update` sets `image_key`, `angles`, `exposures`."""
+    """Forwards to `base`. A subclass overrides what differs; its `_update` sets `image_key`, `angles`, `exposures`."""
 
     def __init__(self, base: ScanSource) -> None:
         self._base = base
@@ -40,7 +40,7 @@ class WrappedSource(ScanSource):
         self.image_key, self.angles, self.exposures = base.image_key, base.angles, base.exposures
 
     def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Values [frame, ...] of `base` for the frames of this scan; None: not told."""
+        """Values [frame, ...] of `base` for the frames of this scan; None if unknown."""
         return known
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -79,9 +79,10 @@ for _name in _BY_FRAME:
 
 
 class BriefSource(WrappedSource):
-    """All of `base`, for who only describes it: LookedEnoughError, if `over` says so before a read, or for a read of
-    more than a moment's time and memory. The order of dimensions or the chunks of a file can make any frame cost all
-    of it."""
+    """Forwards to `base`, for callers that only describe it: raises LookedEnoughError if `over` returns True before a
+    read, or if a read would take long or much memory. The order of dimensions or the chunks of a file can make any
+    frame cost all of it.
+    """
 
     def __init__(self, base: ScanSource, over: Callable[[], bool]) -> None:
         super().__init__(base)
@@ -98,7 +99,9 @@ class BriefSource(WrappedSource):
 
 
 class CroppedSource(WrappedSource):
-    """A ScanSource of some columns of `base`; columns, such as the axis and regions of flags, count from the first."""
+    """A ScanSource of some columns of `base`; column numbers, such as the axis and regions of flags, count from the
+    first of them.
+    """
 
     def __init__(self, base: ScanSource, cols: tuple[int, int]) -> None:
         """Crop `base` to columns `cols`, the last not included.
@@ -108,7 +111,7 @@ class CroppedSource(WrappedSource):
         """
         first, end = cols
         if not 0 <= first < end <= base.shape[1]:
-            raise ConfigError(f"--cols {first}:{end} do not lie in the detector's 0:{base.shape[1]}.")
+            raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
         super().__init__(base)
         self.cols, self.shape = cols, (base.shape[0], end - first)
         self.axis_col = None if base.axis_col is None else base.axis_col - first
@@ -131,7 +134,7 @@ class CroppedSource(WrappedSource):
 
 
 class TurnedSource(WrappedSource):
-    """A ScanSource of the frames of `base` turned by a quarter turn: a horizontal rotation axis becomes vertical.
+    """A ScanSource of the frames of `base` rotated by a quarter turn: a horizontal rotation axis becomes vertical.
 
     What was the last column is the first row. Any rows take reading whole frames.
     """
@@ -160,7 +163,7 @@ class TurnedSource(WrappedSource):
 
 
 class KeyedSource(WrappedSource):
-    """A ScanSource whose frames are of the kinds that a caller says, or those of one energy."""
+    """A ScanSource whose kinds of frames are assigned by the caller, or which has only the frames of one energy."""
 
     def __init__(self, base: ScanSource, kinds: str) -> None:
         """Take `kinds` such as "darks=0:5,flats=5:10+95:100,views=10:95": rows of the scan, ends not included.
@@ -223,7 +226,7 @@ def in_words(energies: NDArray[np.float64]) -> str:
 
 
 def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
-    """(keV, number of frames) of each energy; what differs by a part in ten thousand is one."""
+    """(keV, number of frames) of each energy; energies within a part in ten thousand are the same."""
     known = np.sort(energies[np.isfinite(energies)])
     parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)
     return [(float(np.median(part)), int(part.size)) for part in parts if part.size]
@@ -253,7 +256,7 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
 
 
 class UnsignedSource(WrappedSource):
-    """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
+    """A ScanSource of unsigned counts that `base` stores as a signed type, so that large counts appear negative."""
 
     def __init__(self, base: ScanSource, dtype: np.dtype[Any]) -> None:
         super().__init__(base)
@@ -268,14 +271,15 @@ class UnsignedSource(WrappedSource):
 
 
 def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The same lowest bits as counts without a sign."""
+    """The same bits as unsigned counts."""
     if images.dtype.itemsize == dtype.itemsize:
         return images.view(dtype)
     return (images & np.iinfo(dtype).max).astype(dtype)
 
 
 def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The unsigned type of signed integers [..., col] whose sign bit is one of the counts; None: they are as they are.
+    """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
+    signed.
 
     Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
     without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
@@ -297,7 +301,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 
 class PartsSource(WrappedSource):
-    """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
+    """A ScanSource of the frames of `earlier`, which are complete, and then of `last`, whose path and metadata it has.
 
     Row numbers, such as the row that a frame replaces, count from the first frame of all files.
     """

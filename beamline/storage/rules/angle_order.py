@@ -23,8 +23,7 @@ RULE = "angle-order"
 
 
 def angles_in_order(source: ScanSource) -> Iterator[Finding]:
-    """No frames that follow one another look alike where they are stated far apart, and others stated side by side do
-    not.
+    """Consecutive frames look alike only if their angles are close, and close angles look alike.
 
     A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
     it where the list is shifted, so the places are looked at where angles jump.

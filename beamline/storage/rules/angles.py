@@ -52,7 +52,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def angles_spread(source: ScanSource) -> Iterator[Finding]:
-    """The projections look from different directions, over half a turn, and their angles can be degrees."""
+    """The projections have different directions, over half a turn, and their angles may be in degrees."""
     angles = source.angles[source.image_key == FrameKind.PROJECTION]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -180,7 +180,7 @@ class CoarseViews:
         return brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
 
     def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool, reach: float = 0.25) -> float:
-        """1 less the correlation of pairs of views; of mirror images about the one column that fits them best.
+        """1 minus the correlation of pairs of views; of mirror images, about the one column of best agreement.
 
         `reach`: how far mirror images are moved, of the field: twice as far as the axis is from its middle. It is
         doubled once where the best move is the farthest.
@@ -197,7 +197,7 @@ class CoarseViews:
 
 
 def coarse_views(source: ScanSource) -> CoarseViews | None:
-    """The views of a scan, if it has enough of them, and their line integrals are known."""
+    """The coarse views of a scan, if it has enough views, and their line integrals are known."""
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     kinds = set(source.image_key.tolist())
     counts = source.quantity == "counts"
@@ -211,7 +211,7 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
 
 
 def angles_seen(source: ScanSource) -> Iterator[Finding]:
-    """Views that are stated half a turn apart are mirror images (a whole turn: alike), and no others are.
+    """Views half a turn apart by their angles are mirror images (a whole turn: alike), and no others are.
 
     Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
     sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise

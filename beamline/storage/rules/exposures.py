@@ -22,19 +22,19 @@ LookAtRow = Callable[[int], ReferenceFrame]
 
 
 def usual_exposure(source: ScanSource) -> float:
-    """Seconds of the projections, their median; NaN where it is unknown."""
+    """The median exposure of the projections in s; NaN if it is unknown."""
     known = source.exposures[(source.image_key == FrameKind.PROJECTION) & (source.exposures > 0)]
     return float(np.median(known)) if known.size else np.nan
 
 
 def views_differ(source: ScanSource) -> bool:
-    """The projections have exposures of their own, and that of each is known."""
+    """Whether the exposures of the projections differ, and that of each is known."""
     views = source.exposures[source.image_key == FrameKind.PROJECTION]
     return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
 
 def by_exposure(source: ScanSource, rows: NDArray[np.int64]) -> list[tuple[float, NDArray[np.int64]]]:
-    """The rows of each exposure among these frames; one group, of NaN, where one is unknown or all are alike."""
+    """The rows of each exposure among these frames; one group, of NaN, if one is unknown or all are alike."""
     seconds = source.exposures[rows]
     if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
         return [(np.nan, rows)]
@@ -49,7 +49,7 @@ _darks: WeakKeyDictionary[ScanSource, tuple[bytes, Darks, Darks]] = WeakKeyDicti
 
 
 def levelled(source: ScanSource, frame: ReferenceFrame, seen: LookAtRow) -> ReferenceFrame:
-    """A frame as if it had the dark of the shortest exposure and, of projections that differ, the usual exposure.
+    """A frame corrected to the dark of the shortest exposure and, for projections that differ, to the usual exposure.
 
     Args:
         seen: the frame of a row as it is.
@@ -86,7 +86,7 @@ def _dark_levels(source: ScanSource, seen: LookAtRow) -> tuple[Darks, Darks]:
 
 
 def one_energy(source: ScanSource) -> Iterator[Finding]:
-    """All views were taken at one energy, because a volume has one."""
+    """All views were taken at one energy, as a volume requires."""
     if (energies := source.energies) is None:
         return
     of_views = energies[source.image_key == FrameKind.PROJECTION]

@@ -10,7 +10,8 @@ Severity = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True)
 class Finding:
-    """Severity "error": not fit for reconstruction or not a valid file; `rule`: the name of the rule that found it."""
+    """A finding of a rule. Severity "error": not fit for reconstruction or not a valid file; `rule`: name of the
+    rule."""
 
     severity: Severity
     rule: str

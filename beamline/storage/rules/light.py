@@ -50,7 +50,7 @@ OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 
 
 def views_scaled(source: ScanSource) -> Iterator[Finding]:
-    """Each view has a scale of its own: it runs from the same least to the same largest number, at other pixels."""
+    """Each view was rescaled on its own: all have the same least and largest number, at different pixels."""
     rows = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if rows.size < VIEWS:
         return
@@ -81,7 +81,7 @@ def views_scaled(source: ScanSource) -> Iterator[Finding]:
 def light_beside_flats(
     source: ScanSource, groups: ReferenceGroups, level: float, air: bool, accepted: bool = False
 ) -> Iterator[Finding]:
-    """The air of views has the light of their flats, but for what a beam does within a scan.
+    """The air of views is as bright as their flats, apart from the usual drift of a beam during a scan.
 
     Args:
         groups: the references that are used.
@@ -114,7 +114,7 @@ def light_beside_flats(
 
 
 def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
-    """Darks are images, no place of the views has fewer counts, as light only adds, and counts do not end in the air.
+    """Darks are images, nowhere brighter than the views, and air is not saturated.
 
     Args:
         accepted: all are used as they are, so that a fault is a warning.
@@ -267,7 +267,7 @@ def _gain(net: F32, light: F32) -> float:
 
 
 def exposures_agree(source: ScanSource) -> Iterator[Finding]:
-    """Darks are exposed as long as the projections, or darks of two exposures tell those of any other."""
+    """Darks have the exposure of the projections, or two exposures from which darks of any other follow."""
     if source.quantity != "counts":
         return
     usual = usual_exposure(source)

@@ -65,13 +65,13 @@ class ReferenceGroups:
     brighter: float | None = None
 
     def good(self) -> ReferenceGroups:
-        """The groups without a fault; for a kind without a good group, all groups."""
+        """The groups without a fault; for a kind without such a group, all groups."""
         ok = [not group.faults for group in self.judged]
         dark_ok, flat_ok = ok[: len(self.darks)], ok[len(self.darks) :]
         return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
 
     def lacking(self) -> tuple[GroupVerdict, ...]:
-        """The groups of a kind where all are bad."""
+        """The groups of a kind of which all are faulty."""
         return tuple(
             group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
         )
@@ -82,8 +82,7 @@ def _kept(groups: tuple[Frames, ...], ok: list[bool]) -> tuple[Frames, ...]:
 
 
 def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
-    """Rows of the references of a kind, by groups: those of one part with no projection between them were taken
-    together."""
+    """Rows of the references of a kind, by groups: references of one part with no projection between them."""
     rows = np.flatnonzero(source.image_key == kind)
     before = np.cumsum(source.image_key == FrameKind.PROJECTION)[rows]
     before += np.searchsorted(source.part_starts, rows, "right")  # neither decreases, so that the sum tells both
@@ -91,7 +90,7 @@ def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
 
 
 def groups_taken(source: ScanSource) -> ReferenceGroups:
-    """The references of a scan as they were taken, whatever is wrong with them."""
+    """All reference groups of a scan, faulty ones included."""
     return ReferenceGroups(groups_of(source, FrameKind.DARK), groups_of(source, FrameKind.FLAT), ())
 
 
@@ -100,7 +99,8 @@ _last: WeakKeyDictionary[ScanSource, tuple[tuple[object, ...], ReferenceGroups]]
 
 
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
-    """The references of a scan of counts, judged frame by frame and as groups; flats beside those of their part.
+    """The reference groups of a scan of counts, checked frame by frame and as groups; flats are compared within their
+    part.
 
     They are judged once, until the scan grows or another of its frames turns out to be unreadable.
     """
@@ -163,7 +163,7 @@ def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
 
 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
-    """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out.
+    """Flats are lit, complete and even, and darks are dark; a faulty group is left out if there is a good one.
 
     An error where all groups of a kind are bad, a warning for others that have a fault.
 
@@ -227,7 +227,7 @@ _seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDiction
 
 
 def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
-    """Statistics of a frame of any kind, with its cells, as of one dark; it is read once."""
+    """Statistics of a frame of any kind, with its cells, treated like a dark; the frame is read once."""
     return levelled(source, _as_it_is(source, row), lambda other: _as_it_is(source, other))
 
 
@@ -240,7 +240,7 @@ def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
 
 
 def exposures_of(source: ScanSource) -> NDArray[np.float64]:
-    """Seconds of each frame, NaN where unknown.
+    """Exposure of each frame in s, NaN where unknown.
 
     Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the first
     for which no place of the views is brighter than the flats.
@@ -263,14 +263,14 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
 
 
 def mean_cells(source: ScanSource, rows: Frames) -> NDArray[np.float32]:
-    """Cells of the mean of frames, of those that can be read."""
+    """Cells of the mean of the readable frames."""
     cells = dict(zip(rows.tolist(), cells_of(source, rows), strict=True))
     known = [cells[row] for row in cells if row not in source.unreadable] or list(cells.values())
     return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
 
 
 def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:
-    """Cells of each of some frames."""
+    """Cells of some frames, one by one."""
     return [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
 
 

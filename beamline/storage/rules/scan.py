@@ -35,12 +35,12 @@ _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans hav
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
-    """Findings of the rules of this module on an open scan."""
+    """Findings of the rules in this module on an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
 
 
 def scan_ended(source: ScanSource) -> Iterator[Finding]:
-    """The writer closed the file, and the scan ended as it was planned; else what can be done."""
+    """The writer closed the file, and the scan ended as planned; else a remedy."""
     ending, n = source.ending, count(source.image_key.size, "frame")
     if not source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
@@ -71,7 +71,7 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
 
 
 def quantity_stated(source: ScanSource) -> Iterator[Finding]:
-    """The quantity of the pixels is known: a forgotten or a second logarithm ruins a volume without a sign."""
+    """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
     if source.quantity == "unknown":
         note = source.attributes.get("quantity")
         note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
@@ -84,7 +84,7 @@ def quantity_stated(source: ScanSource) -> Iterator[Finding]:
 
 
 def references_present(source: ScanSource) -> Iterator[Finding]:
-    """Counts come with darks and flats."""
+    """Scans of counts have darks and flats."""
     if source.quantity != "counts":
         return
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
@@ -128,7 +128,7 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
 
 
 def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
-    """Counts have the order of bytes and the sign that their type has; beyond a signed type, they are read without."""
+    """Counts have the byte order and sign of their type; counts beyond a signed type are read as unsigned."""
     views = _sample(source, FrameKind.PROJECTION) if source.dtype.kind in "ui" and source.dtype.itemsize > 1 else None
     if views is not None and _roughness(views) > _SWAPPED * _roughness(views.astype(source.dtype).byteswap()):
         yield Finding(
@@ -143,7 +143,7 @@ def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
 
 
 def axis_vertical(source: ScanSource) -> Iterator[Finding]:
-    """The rotation axis lies along the columns: each row then holds the same matter in every view of a sample."""
+    """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     if source.emission is not None or source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
         return
@@ -161,7 +161,7 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
-    """How much the sums of rows of [view, row, col] change from view to view, over what those of columns do; squared.
+    """Squared change of the row sums of [view, row, col] from view to view, relative to that of the column sums.
 
     About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
     are. What a drifting beam does to rows is in their ends, too, and so is matter that leaves a narrow field, from each
@@ -202,7 +202,7 @@ def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]
 
 
 def views_first(source: ScanSource) -> Iterator[Finding]:
-    """Where there are as many views as rows, the first dimension counts views, and the second rows.
+    """If there are as many views as rows, the first dimension is that of the views, and the second that of the rows.
 
     In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
     moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
@@ -249,7 +249,7 @@ def _roughness(views: NDArray[Any]) -> float:
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:
-    """No trigger without a frame, and no number left out of a series of files."""
+    """Every trigger has a frame, and no number is missing in a series of files."""
     missing = source.attributes.get("missing_triggers", 0)
     if missing:
         yield Finding("warning", "missing-frames", f"{missing} triggers gave no frame; the file lists them.")
@@ -259,7 +259,7 @@ def series_complete(source: ScanSource) -> Iterator[Finding]:
 
 
 def scale_known(source: ScanSource) -> Iterator[Finding]:
-    """Pixel size, without which a volume has no scale."""
+    """The pixel size is known; without it a volume has no scale."""
     if source.pixel_size_mm is None:
         yield Finding("info", "pixel-size", "No pixel size: lengths will be in pixels, densities per pixel.")
     elif not 0 < source.pixel_size_mm < 10:
@@ -267,14 +267,14 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def stated_used(source: ScanSource) -> Iterator[Finding]:
-    """All that the file states is used, or reported: as a warning if it may change the volume."""
+    """Everything that the file states is used or reported: as a warning if it may change the volume."""
     for field in source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
         yield Finding("warning" if field.doubt else "info", "not-used", message)
 
 
 def pixels_square(source: ScanSource) -> Iterator[Finding]:
-    """Pixels are square, or each row is a slice of its own."""
+    """Pixels are square, or each row is a separate slice."""
     width, height = source.pixel_size_mm, source.row_pitch_mm
     if height is None:
         return

@@ -25,7 +25,7 @@ MARGIN = 0.25  # of the region's shorter side, on all sides
 
 @dataclass(frozen=True, eq=False)
 class Treatment:
-    """The treatment of the views of a scan.
+    """How the flagged views of a scan are treated.
 
     Attributes:
         flags: of all frames, those that count.
@@ -56,7 +56,7 @@ class Treatment:
 
 
 def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
-    """Treatment of these views, whose frames have this shape, by `beamline recon` unless it ignores flags.
+    """How `beamline recon` treats these views, whose frames have this shape, unless it ignores flags.
 
     A view in which the sample jumped is as good as those after it. Flags of views from opposite sides for the same jump
     then do not count.
@@ -72,7 +72,7 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
 
 
 def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
-    """Whether each frame [frame] is flagged, and only in parts."""
+    """Whether each frame [frame] is flagged only in some regions."""
     whole = np.zeros(flags.bits.size, np.bool_)
     if flags.regions is None:
         return whole
@@ -85,7 +85,7 @@ def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
 def boxes_of(
     flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
 ) -> Iterator[tuple[int, PixelBox | None]]:
-    """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it.
+    """Frames that a check flagged, each with its region and a margin; None for (nearly) the whole view.
 
     A view that a check marked when it had seen later ones has no region in the file. It takes the region to which these
     lead on a straight line.

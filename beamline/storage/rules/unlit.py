@@ -23,7 +23,7 @@ _TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
 
 @dataclass(frozen=True, eq=False)
 class ViewLight:
-    """The light of whole views beside that of the flats; no band of rows, in which a sample may be opaque.
+    """Brightness of whole views relative to the flats; not of single bands of rows, where a sample may be opaque.
 
     Attributes:
         dark, flat: float32 [cell row, cell col], means; a scan of line integrals has none.
@@ -39,7 +39,7 @@ class ViewLight:
 
     @classmethod
     def of(cls, source: ScanSource, used: ReferenceGroups | None) -> ViewLight:
-        """The light by these darks and flats, and some views; None if the scan holds line integrals."""
+        """The light from these darks and flats, and some views; None if the scan has line integrals."""
         views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
         if used is None:
             return cls(source, None, None, 1.0)
@@ -48,7 +48,7 @@ class ViewLight:
         return cls(source, dark, flat, float(np.percentile(seen, BRIGHT)) if seen else 1.0)
 
     def suspect(self, data: NDArray[np.generic], dark: F32 | None, flat: F32 | None) -> NDArray[np.bool_]:
-        """bool [view]: views whose pixels read, maybe in a band of rows, are dark or all the same.
+        """bool [view]: views that are dark or uniform in the pixels read, which may be a band of rows.
 
         Args:
             data: [view, row, col], as read.
@@ -67,7 +67,7 @@ class ViewLight:
         return uniform | dim
 
     def unlit(self, frame: int) -> bool:
-        """Whether a whole view has no light, or one value where the flats vary."""
+        """Whether a whole view is dark, or uniform while the flats are not."""
         if frame not in self.known:
             self.known[frame] = not self._unlit(frame)
         return not self.known[frame]
@@ -86,7 +86,8 @@ class ViewLight:
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:
-    """Share of the flats' light in a view's bright part, without what noise alone brings there; of images of cells."""
+    """Brightness of a view's bright part relative to the flats, corrected for the bias by noise; from images of
+    cells."""
     light = flat - dark
     lit = lit_places(light)
     if not lit.any():

@@ -25,7 +25,7 @@ from recon.base.volume import Grid, Volume
 
 @dataclass(frozen=True)
 class Pixels:
-    """The stored form of a voxel.
+    """How a voxel is stored.
 
     Attributes:
         bits: 32: float32, the value itself; 16 or 8: a grey value.
@@ -41,7 +41,7 @@ class Pixels:
 
 
 class Slices:
-    """The slices of a volume as they are stored, one after another.
+    """The slices of a volume in stored form, one by one.
 
     `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite; `checksums`
     are those of the slices passed.
@@ -89,16 +89,16 @@ class VolumeFormat(Protocol):
 
     @property
     def greys(self) -> bool:
-        """Whether it holds grey values of 8 and 16 bits."""
+        """Whether the format stores grey values of 8 and 16 bits."""
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
-        """Write a new file, slice by slice. OSError where the disk refuses."""
+        """Write a new file, slice by slice. Raises OSError if the disk refuses."""
 
     def holds(self, path: Path) -> bool:
         """Whether the file is a volume in this format, written by this program; False if it cannot be read."""
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
-        """The record of such a file; its volume's data are read where they are sliced along z.
+        """The record of such a file; the volume's voxels are read when they are sliced along z.
 
         Raises:
             DataError: cut off or damaged.
@@ -107,7 +107,7 @@ class VolumeFormat(Protocol):
 
 @runtime_checkable
 class VolumeScale(Protocol):
-    """A volume in chunks, read box by box.
+    """A volume stored in chunks, read box by box.
 
     Attributes:
         coarser: the same with fewer voxels.
@@ -128,7 +128,7 @@ class VolumeScale(Protocol):
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
-    """Facts of a volume as JSON, for formats without fields of their own: all but arrays and the history."""
+    """Metadata of a volume as JSON, for formats without fields for them: all but arrays and the history."""
     grid = record.volume.grid
     scalars = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}
     return {
@@ -150,7 +150,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
 
 
 def marked(text: str) -> dict[str, Any] | None:
-    """The facts in a description; None where another program wrote it."""
+    """The metadata in a description; None if another program wrote it."""
     if VOLUME not in text:
         return None
     try:
@@ -161,7 +161,7 @@ def marked(text: str) -> dict[str, Any] | None:
 
 
 def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
-    """The record that `facts_of` describes, of these values [z, y, x]; a window is among its parameters.
+    """The record with the metadata of `facts_of` and the values [z, y, x]; a grey window is among its parameters.
 
     Raises:
         DataError: somebody has changed the facts.
@@ -189,7 +189,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
 
 
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
-    """The record of a volume without other facts; `spacing` (z, y, x) in mm."""
+    """The record of a volume without other metadata; `spacing` (z, y, x) in mm."""
     dz, dy, dx = spacing or (1.0, 1.0, 1.0)
     if 0 in values.shape:
         raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class FormatEntry:
-    """A format of volume files.
+    """A registry entry of a format of volume files.
 
     Attributes:
         suffixes: that a file's name ends in, the usual one first; "" for a folder.

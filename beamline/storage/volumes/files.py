@@ -34,7 +34,7 @@ _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
 
 def format_of(path: Path) -> VolumeFormat:
-    """The format that the suffix of a name stands for.
+    """The format of a file name, by its suffix.
 
     Raises:
         ValueError: for none; the message lists those that there are.
@@ -57,7 +57,7 @@ def format_of(path: Path) -> VolumeFormat:
 
 
 def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
-    """Write a volume in the format that the suffix of `path` names, slice by slice: as a whole, or not at all.
+    """Write a volume in the format of the suffix of `path`, slice by slice; on an error no file remains.
 
     Each slice is read back from the file and compared by its checksum; those of HDF5 as bytes, see `DiskFile`.
 
@@ -75,7 +75,7 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
     kind, pixels = format_of(path), pixels or Pixels()
     if record.series is not None:
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"volumes in time go into an HDF5 file, not into {kind.name}")
+            raise ValueError(f"a time series can only be written to HDF5, not to {kind.name}")
         write_reconstruction(path, record, replace=replace)
         return 0
     if pixels.window is not None and not kind.greys:
@@ -99,8 +99,9 @@ def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
 
 
 def volume_format(path: Path) -> VolumeFormat | None:
-    """The format of a volume that this program wrote, or of an .npy that is no scan, or of a NeXus file that plots one;
-    None for scans and all else."""
+    """The format of a volume that this program wrote, of an .npy that is no scan, or of a NeXus file with a volume as
+    its plot; None for other files.
+    """
     kind_of_file = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
     # Voxels alone say nothing of where they come from: a reader of scans goes first.
     if isinstance(kind_of_file, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
@@ -111,7 +112,7 @@ def volume_format(path: Path) -> VolumeFormat | None:
 def whole_volume(
     path: Path, dataset: str | None = None
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """As `read_volume`, also of every format that this program writes, with the voxel that it states.
+    """`read_volume`, also for every format that this program writes, with the voxel size that the file states.
 
     Raises:
         DataError: as `opened_volume`.
@@ -125,7 +126,7 @@ def whole_volume(
 
 
 def times_of(path: Path) -> tuple[float, ...]:
-    """Time of each of several volumes, in s from the first view on; empty if the file has no such series."""
+    """Time of each of several volumes, in s from the first view on; empty if the file has no time series."""
     if not NXtomoproc().holds(path):
         return ()
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -134,7 +135,8 @@ def times_of(path: Path) -> tuple[float, ...]:
 
 @contextmanager
 def opened_volume(path: Path, dataset: str | None = None, at: int | None = None) -> Iterator[ReconRecord]:
-    """Any volume file: ours is read where it is sliced along z, others as a whole (see `read_volume`).
+    """Open any volume file: one of this program is read when it is sliced along z, others are read wholly (see
+    `read_volume`).
 
     Args:
         at: number of one of several volumes in time.

@@ -45,7 +45,7 @@ def entries() -> Registry[FormatEntry]:
 
 @cache
 def formats() -> tuple[VolumeFormat, ...]:
-    """Every format that volumes are written in."""
+    """Every format in which volumes are written."""
     return tuple(getattr(import_module(entry.module), entry.cls)() for entry in entries().values())
 
 

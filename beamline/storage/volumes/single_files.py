@@ -52,7 +52,8 @@ class NXtomoproc:
 
 @dataclass(frozen=True)
 class NexusVolume:
-    """HDF5 whose default plot has the axes z, y, x: a truth of `simulate`, labels of `segment`; read, never written."""
+    """HDF5 whose default plot has the axes z, y, x: a reference volume of `simulate`, labels of `segment`; only
+    read."""
 
     name: str = "HDF5 (NXdata)"
     suffixes: tuple[str, ...] = ()

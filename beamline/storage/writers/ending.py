@@ -25,7 +25,7 @@ THETA = {"data": "theta", "data_white": "theta_white", "data_dark": "theta_dark"
 
 
 def add_exchange_view(file: h5py.File) -> None:
-    """Fill /exchange with the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
+    """Add to /exchange the rows recorded so far. Kinds without a frame get no dataset; invalid frames are omitted."""
     source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
     units = file["/entry/record/quantity"].asstr()[()]
     there = {*group}  # of a recovery that was stopped
@@ -50,7 +50,7 @@ def has_exchange_view(file: h5py.File) -> bool:
 
 
 def with_exchange_view(overlay: Overlay) -> Overlay:
-    """A closed file of a scan with the view, to be carried out.
+    """A closed scan file with the view, as an overlay still to be written.
 
     What changes are the group, which frames do not hang on, and the head; all else is added at the end.
 
@@ -95,7 +95,7 @@ class ScanEnding:
 
 
 def ending_in(file: h5py.File) -> ScanEnding:
-    """The ending that a scan file of ours states."""
+    """The ending stated by a scan file of this program."""
     for path in (layout.STATUS, layout.MISSING):
         hdf5.look_again(file[path])
     status = hdf5.text_of(file[layout.STATUS]) or RUNNING
@@ -103,7 +103,7 @@ def ending_in(file: h5py.File) -> ScanEnding:
 
 
 def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
-    """Write the ending into a file that `layout.create` made, or into its open datasets, by path.
+    """Write the ending into a file created by `layout.create`, or into its open datasets, by path.
 
     Files of older versions have no place for the reason.
     """
@@ -114,14 +114,15 @@ def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanE
 
 
 def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
-    """Write only status and reason, which takes no space on the disk."""
+    """Write only status and reason, which needs no further space on the disk."""
     if layout.REASON in datasets:
         datasets[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()
     datasets[layout.STATUS][()] = ending.status.encode()
 
 
 def complete(file: hdf5.NewFile, ending: ScanEnding) -> None:
-    """State that a file that `layout.create` made holds all frames of its scan, and how that ended; add /exchange."""
+    """State that a file created by `layout.create` has all frames of its scan, and how the scan ended; add
+    /exchange."""
     file[layout.COMMITTED][()] = len(file[layout.DATA])
     state_ending(file, ending)
     file[layout.FINISHED][()] = 1

@@ -45,6 +45,7 @@ from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, VALID, write_le
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
+# Not "latest": that writes datatypes that HDF5 1.14 cannot open.
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
@@ -123,7 +124,7 @@ Description = Mapping[str, str | int | float]
 
 @dataclass(frozen=True)
 class ScanInfo:
-    """Facts about a scan before its first frame; None if unknown.
+    """Metadata of a scan before its first frame; None if unknown.
 
     Attributes:
         sample: name; title: one line for people.
@@ -173,7 +174,7 @@ def create(
     preview_bin: int,
     start: float | None,
 ) -> None:
-    """Make every group, dataset and attribute that the file will have while it grows, with no frame in it yet."""
+    """Create every group, dataset and attribute that the file has while it grows, without any frame."""
     rows, cols = frame_shape
     definition = NXTOMO if dtype.kind in "iu" else FLOAT_DEFINITION
     _groups(file)
@@ -286,7 +287,7 @@ def _columns(
 
 
 def state_field_of_view(file: h5py.File) -> None:
-    """Write whether a full turn saw half of the sample at a time, as far as its views tell."""
+    """Write whether each view of a full turn saw only half of the sample, as far as the views tell."""
     field = field_of_view(file)
     if field and FIELD_OF_VIEW in file:
         file[FIELD_OF_VIEW][()] = field.encode()
@@ -295,7 +296,7 @@ def state_field_of_view(file: h5py.File) -> None:
 
 
 def field_of_view(file: h5py.File) -> str:
-    """`Half` where a full turn saw half of the sample at a time; "" where angles or the axis are not known."""
+    """`Half` if each view of a full turn saw only half of the sample; "" if angles or the axis are unknown."""
     angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
     axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
     return _field_of_view(angles, file[DATA].shape[1:], axis_col)

@@ -66,7 +66,7 @@ def _new_file(path: Path) -> h5py.File:
             why = no_locks_sentence(path.parent, error.errno)
             raise DataError(f"{path} cannot be created: {why}. Nothing is left of it.") from error
         why = hdf5.reason(error)
-        raise DataError(f"{path} cannot be created ({why}). Is its folder there and writable?") from error
+        raise DataError(f"{path} cannot be created ({why}). Check that its folder exists and is writable.") from error
 
 
 class NXtomoWriter:
@@ -133,7 +133,7 @@ class NXtomoWriter:
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
 
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
-        """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found, in rows before it too.
+        """Write the next row; `frame.index` must be `rows`. `flags`: findings of the monitor, also for earlier rows.
 
         DataError for a wrong shape, type or index; nothing is written then. Also for a disk that does not take the
         frame; the frames before stay readable, and nothing more can be appended.
@@ -166,13 +166,15 @@ class NXtomoWriter:
 
     @property
     def committed(self) -> int:
-        """Number of frames that are complete in the file: readers see them, and a crash of this process keeps them."""
+        """Number of frames that are complete in the file: readers see them, and they survive a crash of this
+        process."""
         return self._committed
 
     @property
     def safe(self) -> int:
-        """Committed frames that are known to be on the disk: after a failed fsync it may have lost all since the last
-        successful one."""
+        """Committed frames that are known to be on the disk: after a failed fsync all since the last successful one may
+        be lost.
+        """
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:

@@ -40,7 +40,7 @@ _MISSING, _ADDING, _DONE = range(3)
 
 @dataclass(frozen=True, eq=False)
 class PartialVolume:
-    """A volume with some finished slabs; no other process can add slabs while this value lives.
+    """A volume of which some slabs are finished; no other process can add slabs while this object exists.
 
     Attributes:
         slabs: all of them.
@@ -57,7 +57,7 @@ class PartialVolume:
 
     @property
     def volume(self) -> NDArray[np.float32]:
-        """float32 [z, y, x], a memory map; slices of slabs to come are zero."""
+        """float32 [z, y, x], a memory map; slices of missing slabs are zero."""
         return self._maps["volume"]
 
     def has(self, n: int) -> bool:
@@ -70,7 +70,7 @@ class PartialVolume:
         return sum(slab.own.stop - slab.own.start for n, slab in enumerate(self.slabs) if self.has(n))
 
     def add(self, n: int, data: NDArray[np.float32] | None) -> None:
-        """Slab n, [z, y, x] of all slices that were reconstructed for it; None: zero."""
+        """Store slab n, [z, y, x] of all slices that were reconstructed for it; None: zero."""
         slab, state, volume = self.slabs[n], self._maps["state"], self.volume
         if data is not None:
             shared = _shared(slab)
@@ -103,7 +103,7 @@ class PartialVolume:
 def create_partial(
     path: Path, record: ReconRecord, slabs: Sequence[Slab], made_from: Mapping[str, Value], kept: Mapping[str, Any]
 ) -> PartialVolume:
-    """A new file without any slab; the arguments are the attributes of `PartialVolume`, `record` without its voxels.
+    """Create a file without any slab; the arguments are the attributes of `PartialVolume`, `record` without its voxels.
 
     Raises:
         DataError: the path exists, or the disk has no room; nothing is left there.
@@ -152,12 +152,13 @@ def open_partial(path: Path) -> PartialVolume:
 
 
 def can_become(target: Path) -> bool:
-    """Whether a partial volume can become `target` where it lies: of that format; Windows renames no file in use."""
+    """Whether a partial volume can be renamed to `target`: the format fits; Windows renames no file in use."""
     return target.suffix.lower() in SUFFIXES and sys.platform != "win32"
 
 
 def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = False) -> None:
-    """A partial volume with all its slabs becomes the reconstruction file `target` of `record`; no voxel is copied.
+    """Turn a partial volume with all its slabs into the reconstruction file `target` of `record`, without copying
+    voxels.
 
     Raises:
         DataError: `target` exists and `replace` is not set, or the disk refuses; the partial volume stays.
@@ -229,7 +230,9 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 
 def _refuse_unusable(path: Path) -> None:
     if not is_partial(path):
-        raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
+        raise DataError(
+            f"{path} is not a partial volume; `beamline recon` leaves one if it is stopped after the first slab."
+        )
     if held(path):
         raise DataError(
             f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
@@ -241,7 +244,7 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a file is a partial volume, by its content; also one whose completion was cut short."""
+    """Whether a file is a partial volume, by its content; also one whose completion was interrupted."""
     if not path.is_file():
         return False
     if completion_cut_short(path):
@@ -256,7 +259,7 @@ def is_partial(path: Path) -> bool:
 
 
 def completion_cut_short(path: Path) -> bool:
-    """Whether a partial volume is half of the output that it was to become; opening it to add slabs undoes that."""
+    """Whether the completion of a partial volume was interrupted; opening the file to add slabs undoes it."""
     return path.is_file() and _structure_of(path).is_file()
 
 

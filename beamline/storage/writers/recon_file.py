@@ -54,7 +54,7 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
 
 
 def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> None:
-    """Write the new file `path`, sixteen slices at a time. OSError on a disk error.
+    """Write the new file `path`, sixteen slices at a time. Raises OSError on a disk error.
 
     Args:
         empty: without the voxels, for which there is one place, of zeros.
@@ -65,7 +65,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
 
 
 def rewrite_facts(path: Path, record: ReconRecord) -> None:
-    """Replace all but voxels and axes by the values of `record`. OSError on a disk error."""
+    """Replace everything but voxels and axes by the values of `record`. Raises OSError on a disk error."""
     with hdf5.changed(path) as file:
         entry = file["entry"]
         for name in set(entry) - {"data"}:
@@ -150,7 +150,7 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
 
 
 def read_reconstruction(path: Path) -> ReconRecord:
-    """The record that `write_reconstruction` wrote.
+    """Read the record written by `write_reconstruction`.
 
     Raises:
         DataError: if the file is missing or is not such a file.
@@ -164,7 +164,7 @@ def read_reconstruction(path: Path) -> ReconRecord:
 
 @contextmanager
 def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRecord]:
-    """As `read_reconstruction`, without voxels in memory: the volume's data are read where they are sliced along z.
+    """`read_reconstruction` without loading voxels: they are read when the volume is sliced along z.
 
     Args:
         at: number of one of several volumes in time.
@@ -191,7 +191,7 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
 
 
 def volumes_in_time(file: h5py.File) -> int:
-    """Number of volumes in time of a file of ours; 0: it has one volume."""
+    """Number of volumes of a time series in a file of this program; 0 if the file has a single volume."""
     stored = file["entry/data/data"]
     return int(stored.shape[0]) if stored.ndim == 4 else 0
 
@@ -238,7 +238,7 @@ def _own_value(node: h5py.Dataset) -> Value:
 
 
 def value_of(node: h5py.Dataset, most: float = hdf5.BRIEF) -> Value:
-    """Value of a dataset of at most so many bytes, as plain text or number if it is one."""
+    """Value of a dataset of at most so many bytes, as text or number if it is one."""
     value = hdf5.values_of(node, most)
     if isinstance(value, bytes):
         return value.decode()
@@ -264,7 +264,7 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Put `checkpoint` at `path`, in place of an older one in one step.
+    """Write `checkpoint` to `path`, atomically replacing an older one.
 
     Raises:
         DataError: the disk refuses; an older checkpoint stays as it was.
@@ -279,7 +279,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """The checkpoint that `write_checkpoint` wrote.
+    """Read the checkpoint written by `write_checkpoint`.
 
     Raises:
         DataError: there is none, the file is something else, or damaged: its content differs from its digest.

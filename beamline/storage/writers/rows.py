@@ -40,7 +40,9 @@ class Record:
 
 
 def image_key_of(kind: FrameKind) -> int:
-    """The number of NXtomo, which has none for alignment frames: who does not know them must use none."""
+    """NXtomo's image key of a kind of frame. NXtomo has no key for alignment frames: programs that do not know them
+    must not use them.
+    """
     return int(FrameKind.INVALID if kind is FrameKind.ALIGNMENT else kind)
 
 
@@ -57,7 +59,7 @@ def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
 
 
 def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
-    """Rows whose record differs from its checksum; they are counted from `first`, where the search begins.
+    """Rows whose record differs from its checksum, from the row `first` on.
 
     Raises:
         ValueError: a column is not as `create` made it.
@@ -83,7 +85,7 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
 
 
 def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
-    """Raise ValueError where a row claims to replace itself or a later one. replaces: [row]; -1: none."""
+    """Raise ValueError if a row claims to replace itself or a later one. replaces: [row]; -1: none."""
     wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
     if wrong.size:
         row = int(wrong[0])
@@ -91,7 +93,7 @@ def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
 
 
 class Rows:
-    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete.
+    """Writes rows into a file made by create(). It has access to datasets only: it cannot create or delete.
 
     Pixels are written at once, metadata at `flush`: the columns of several rows cost as much as those of one row.
     """
@@ -104,7 +106,7 @@ class Rows:
         self._first, self._said = 0, list[dict[str, Any]]()
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Write row `row`, an existing one or the next: pixels now, metadata at the next `flush`.
+        """Write row `row`, an existing one or the next: pixels at once, metadata at the next `flush`.
 
         A view that it replaces becomes an invalid frame, so that no program takes both.
         """
@@ -136,7 +138,7 @@ class Rows:
                 self._columns[path][record.replaces] = int(FrameKind.INVALID)
 
     def flush(self) -> None:
-        """Write the metadata of the rows since the last call. The file's own flush comes after it."""
+        """Write the metadata of the rows since the last call. The caller then flushes the file."""
         if not self._said:
             return
         n, record = len(self._said), dict[str, NDArray[Any]]()
@@ -154,7 +156,7 @@ class Rows:
         self._first, self._said = self._first + n, []
 
     def add_flags(self, rows: range, bits: int) -> None:
-        """Mark rows that exist: a check that has seen later frames found something in them."""
+        """Flag existing rows: a check that has seen later frames found a fault in them."""
         self.flush()
         flags = self._columns[FLAGS][rows.start : rows.stop]
         marked = flags | np.uint64(bits)
@@ -163,7 +165,8 @@ class Rows:
             self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
     def add_place(self, check: int, frame: int, score: float, regions: Mapping[int, Sequence[int]]) -> None:
-        """The score of a flag in its frame, and its regions, in rows that exist; `check`: its place in the legend."""
+        """Store the score of a flag in its frame, and its regions, in existing rows; `check`: its index in the
+        legend."""
         self._columns[SCORES][frame, check] = score
         for row, box in regions.items():
             self._columns[REGIONS][row, check] = box

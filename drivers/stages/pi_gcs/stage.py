@@ -150,7 +150,7 @@ class PiGcsStage(LineStage):
         self._told = code
         raise DeviceError(
             self.name,
-            f"since its last move something happened to it: {meaning(code)}",
+            f"the axis was disturbed since its last move: {meaning(code)}",
             reply=str(code),
             expected="an axis that stood still",
             advice=f"{advice(code)}. What was measured since then may have been at another angle",

@@ -265,7 +265,7 @@ class ZaberStage(LineStage):
         assert fault is not None, status.flags
         raise DeviceError(
             self.name,
-            f"since its last move something happened to it: {fault.text}",
+            f"the stage was disturbed since its last move: {fault.text}",
             reply=status.raw,
             expected="a stage that stood still",
             advice=f"{fault.advice}. What was measured since then may have been at another angle",

@@ -20,12 +20,12 @@ _LEAST_EXPLAINED = 0.9  # share of the variance of line integrals that thickness
 
 
 class NoCurveError(ValueError):
-    """The line integrals do not show a curve of hardening; the message says why."""
+    """The line integrals do not determine a hardening curve; the message gives the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Corrected line integrals by measured ones.
+    """Corrected line integrals as a function of measured ones.
 
     Attributes:
         measured: float64 [node], ascending from 0.
@@ -53,7 +53,7 @@ class Curve:
 
 
 def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: float) -> Curve:
-    """The curve of a material whose attenuation is `attenuations`, in any unit, at the energies of a beam.
+    """The hardening curve of a material whose attenuation is `attenuations`, in any unit, at the energies of a beam.
 
     Args:
         weights: shares of the light detected at these energies, of any sum.
@@ -67,7 +67,7 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The curve of two energies closest to line integrals over paths through the material.
+    """The curve of two energies that fits line integrals over paths through the material best.
 
     (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) It always rises, with a falling slope.
 

@@ -54,7 +54,7 @@ _SURE = 2.0  # see `beyond_chance`
 
 @dataclass(frozen=True, eq=False)
 class LearntBackground:
-    """Surfaces of all views.
+    """Background surfaces of all views.
 
     Attributes:
         coefficients: float64 [term], of `TERMS`; 0 where the views held out confirm no step.
@@ -87,7 +87,7 @@ def learn_background(
     measured: Mask | None = None,
     progress: Callable[[int, int], object] = lambda n, of: None,
 ) -> LearntBackground:
-    """The background that views held out confirm; see `background_memory`.
+    """Find the background of the views, as far as held-out views confirm it; see `background_memory`.
 
     Args:
         projections: line integrals [view, row, col], finite.
@@ -99,7 +99,7 @@ def learn_background(
         ValueError: fewer than 24 views.
     """
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few to hold some out; {LEAST_VIEWS} are needed")
+        raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {LEAST_VIEWS} are needed")
     total = len(TERMS) + _ROUNDS
     data = _Views.of(projections, geometry, times, measured)
     seen, unseen = data.parts()
@@ -124,7 +124,7 @@ def learn_background(
 
 
 def background_memory(geometry: Geometry) -> int:
-    """Most bytes that `learn_background` takes beside the views, about."""
+    """Approximate peak memory of `learn_background` in bytes, without the views."""
     factor = factor_within(geometry.detector_shape, _VOXELS)
     small = geometry.select(slice(min(geometry.n_views, _VIEWS))).binned(factor)
     rays = small.n_views * math.prod(small.detector_shape)

@@ -41,7 +41,7 @@ _VOLUMES, _RAYS, _WEIGHTS = 8.5, 7.0, 5.0  # float32 copies at most
 
 @dataclass(frozen=True, eq=False)
 class LearntGains:
-    """Gains of all pixels, in line integrals.
+    """Gains of all pixels, as offsets of line integrals.
 
     Attributes:
         pixels: float32 [row, col]; 0 where the views held out do not confirm them.
@@ -62,7 +62,7 @@ def learn_gains(
     measured: Mask | None = None,
     progress: Callable[[int, int], object] = lambda n, of: None,
 ) -> LearntGains:
-    """The gains that views held out confirm; see `gains_memory`.
+    """Find the gains of the pixels, as far as held-out views confirm them; see `gains_memory`.
 
     Rows of a parallel beam are taken in bands of 16; those with most matter come first, and judge. The time is that of
     FISTA-TV with its weight given, and 24 sweeps.
@@ -104,7 +104,7 @@ def learn_gains(
 
 
 def gains_memory(geometry: Geometry) -> int:
-    """Most bytes that `learn_gains` takes beside the views, about."""
+    """Approximate peak memory of `learn_gains` in bytes, without the views."""
     rows, cols = geometry.detector_shape
     outer = min(_height(geometry) + 2 * _HALO, rows)
     band = geometry if outer == rows else geometry.rows(0, outer)

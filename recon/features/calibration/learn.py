@@ -32,7 +32,7 @@ _SURE = 2.0  # see `beyond_chance`
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Measures how well a geometry predicts views held out.
+    """Measures how well a geometry predicts held-out views.
 
     Attributes:
         views: float32 [view, row, col], line integrals.
@@ -47,7 +47,7 @@ class Judge:
     placed: bool
 
     def deviations(self, geometry: Geometry) -> F64:
-        """[view held out] root mean square residual, by a volume of the others in this geometry."""
+        """[held-out view] root mean square residual of a volume from the other views in this geometry."""
         method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
         unseen, images = predicted_views(method, self.views, geometry, self.grid, self.known, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
@@ -73,7 +73,8 @@ def _without_smooth(image: F32) -> F64:
 
 
 def better(one: F64, other: F64) -> bool:
-    """The first deviations [view] are surely less than the second, by the scatter from view to view."""
+    """Whether the first deviations [view] are significantly less than the second, given the scatter from view to
+    view."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
     return bool(share.mean() > _LEAST) and beyond_chance(share, _SURE)
 
@@ -90,7 +91,7 @@ _NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller change
 
 @dataclass(frozen=True, eq=False)
 class LearntGeometry:
-    """The learnt change of a geometry, as far as it is confirmed.
+    """The calibrated change of a geometry, as far as it is confirmed.
 
     Attributes:
         change: in pixels of the views; what was not confirmed is zero.
@@ -105,7 +106,7 @@ class LearntGeometry:
     after: float
 
     def in_words(self, binning: int = 1) -> str:
-        """The result as a sentence, in pixels smaller by `binning`."""
+        """The result as a sentence, in unbinned pixels."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: the views show no error of it that matters; it is left as it was."
@@ -116,7 +117,7 @@ class LearntGeometry:
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
-        """Values for the file of a volume, by name, in pixels smaller by `binning`."""
+        """Values for the file of a volume, by name, in unbinned pixels."""
         return {
             "calibrate_confirmed": ",".join(self.confirmed) or "none",
             "calibrate_axis_change_px": self.change.axis * binning,
@@ -134,7 +135,7 @@ def learn_geometry(
     progress: Callable[[int, int], None] = lambda n, total: None,
     known: F32 | None = None,
 ) -> LearntGeometry:
-    """The geometry by which a volume explains the views best, as far as views held out confirm it.
+    """Find the geometry in which a volume explains the views best, as far as held-out views confirm it.
 
     Args:
         projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.

@@ -29,7 +29,8 @@ _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not see
 
 
 def attenuation_factors(mu: Volume, geometry: Geometry) -> F32:
-    """exp(-∫ μ) [view, row, col]: the share of pairs of photons that leave the sample, wherever on the line they begin.
+    """exp(-∫ μ) [view, row, col]: the fraction of photon pairs that leave the sample, wherever on the line they are
+    emitted.
 
     Args:
         mu: attenuation at 511 keV, 1/mm.
@@ -157,7 +158,7 @@ def passes_by_halves(
     rng: np.random.Generator,
     go_on: Callable[[int], bool] = lambda done: True,
 ) -> int | None:
-    """The iterations of `mlem`, up to `most`, after which activity is nearest to the truth, by counts held out.
+    """The number of iterations of `mlem`, up to `most`, for which held-out counts are predicted best.
 
     Each count goes to one of two halves by a coin, which makes them independent Poisson counts of half the mean
     (Kingman 1993, Poisson Processes, section 5.1), of all lines. Activity x of one half meets lines q = (y - b) / s of
@@ -216,7 +217,7 @@ _FLOOR = 1e-6  # of the mean line integral
 
 @dataclass(frozen=True)
 class Mlem(Checked):
-    """See `mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
+    """See `mlem`; each iteration raises the likelihood. No voxel is negative.
 
     Line integrals that come without counts are taken for counts with their weights as survival.
 
@@ -232,12 +233,12 @@ class Mlem(Checked):
     iterations: Count | None = None
 
     def parts(self, views: int) -> int:
-        """Number of subsets of so many views."""
+        """Number of subsets for so many views."""
         return 1
 
     @property
     def most_iterations(self) -> int:
-        """Largest number of iterations that counts held out may choose."""
+        """Largest number of iterations that held-out counts may choose."""
         return UPDATES // self.parts(UPDATES)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -267,7 +268,7 @@ class Mlem(Checked):
         return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """The most work: counts held out may choose fewer iterations, after as many trials on halves of them."""
+        """The most work: held-out counts may choose fewer iterations, after as many trials on halves of them."""
         iterations = self.most_iterations if self.iterations is None else self.iterations
         step = sweep(geometry, grid) + on_volume("pass", grid, 6 * self.parts(geometry.n_views))
         return Costs({self.name: (iterations + 0.5) * step})
@@ -279,7 +280,7 @@ class Mlem(Checked):
 
 @dataclass(frozen=True)
 class Osem(Mlem):
-    """`Mlem` by subsets of the views, about as many times faster; without the promise of a likelihood that rises."""
+    """`Mlem` with subsets of the views, faster by about their number; the likelihood need not rise."""
 
     name: ClassVar[str] = "osem"
     label: ClassVar[str] = "OSEM"

@@ -30,20 +30,20 @@ _NOTHING = 1e-20  # singular value of materials that attenuate nothing
 
 
 def refuse_alike(cross_sections: F64) -> None:
-    """Raises ValueError where cross sections [energy, material] are not finite, or do not tell the materials apart."""
+    """Raise ValueError if cross sections [energy, material] are not finite, or do not distinguish the materials."""
     n, materials = cross_sections.shape
     if not np.isfinite(cross_sections).all():
         raise ValueError("cross_sections must be finite")
     values = np.linalg.svd(cross_sections, compute_uv=False)
     if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
         raise ValueError(
-            f"views of {n} energies do not tell {materials} materials apart: give more energies, or fewer materials"
+            f"views of {n} energies cannot distinguish {materials} materials: give more energies, or fewer materials"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyViews:
-    """Views of one sample, each of a mixture of volumes: at its energy, of what materials attenuate there.
+    """Views of one sample, each of a mixture of volumes: with the attenuation of each material at its energy.
 
     A series in time is the same: each moment counts as an energy, each volume as a material.
 
@@ -87,7 +87,7 @@ class EnergyViews:
         return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
 
     def parted(self, n: int) -> NDArray[np.intp]:
-        """The part 0 ... n - 1 of each view: each part sees all energies, and directions all around.
+        """The part 0 ... n - 1 of each view: each part has views of all energies, and directions all around.
 
         Of more energies than a part has views, neighbours count as one.
         """
@@ -102,7 +102,7 @@ class EnergyViews:
 
 
 def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid]:
-    """So many rows with most matter, for trials, and their slices; all where rows do not show slices."""
+    """The rows with most matter, so many of them, for trials, and their slices; all if rows do not show slices."""
     if not views.geometry.rows_show_slices:
         return slice(None), grid
     rows = busiest_rows(views.projections, height)
@@ -124,7 +124,7 @@ class _Part(NamedTuple):
 
 @dataclass(eq=False)
 class EnergyFit:
-    """The volumes of `fit_materials`, and its steps.
+    """The volumes of `fit_materials`, and the steps of the fit.
 
     Attributes:
         motion: of the volume at each energy; None: it does not move.
@@ -178,7 +178,7 @@ class EnergyFit:
         self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
 
     def move(self, motion: Motion) -> None:
-        """Use this motion of the volume from here on."""
+        """Use this motion of the volume from now on."""
         self.motion = motion
         self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
 
@@ -197,11 +197,11 @@ class EnergyFit:
         return bound
 
     def image(self, energy: int) -> F32:
-        """The volume [y, x, z] at an energy, before it moves."""
+        """The volume [y, x, z] at an energy, before it is displaced."""
         return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
-        """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares.
+        """Write minus the gradient of the views of a subset at z into `out`. Returns their weighted sum of squares.
 
         Raises:
             _StoppedError: `stop` said so.

@@ -35,7 +35,7 @@ _BLOCKS, _ONE_BLOCK_IN = 32, 4  # of the scan's time, and one of so many held ou
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
-    """Pixels in a voxel, and turns, of each level for so many pixels across."""
+    """Voxel size in pixels, and number of turns, of each resolution level for so many pixels across."""
     last = 1 if cols <= _FINE else 2
     widths = [last]
     while cols // (2 * widths[0]) >= _COARSEST:
@@ -49,7 +49,7 @@ def motion_sweeps(cols: int) -> int:
 
 
 class OfMoments(NamedTuple):
-    """Views of a sample that changes, as of some moments.
+    """Views of a changing sample, each assigned to one of some moments.
 
     Attributes:
         views: each `energy` is a moment, each material a knot of the densities.
@@ -65,8 +65,8 @@ class OfMoments(NamedTuple):
 def unseen_squares(
     coarse: OfMoments, fine: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> F64 | None:
-    """What volumes that do not move, and volumes that do, leave of views held out: squares [2, block], over the mean
-    of the views' own; None: stopped.
+    """Residual of held-out views for volumes without and with motion: squares [2, block], relative to the mean of the
+    views' own; None if stopped.
 
     Views that follow each other are held out in blocks. Where angles rise with time, volumes in time predict a single
     view from those before and after it, even of a sample that moves. The motion is learnt from `coarse` moments of the
@@ -117,7 +117,7 @@ def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, gri
 def learnt_motion(
     of_moments: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> Motion | None:
-    """The motion on the voxels of `Grid.matching`; None: stopped.
+    """Find the motion on the voxels of `Grid.matching`; None if stopped.
 
     Args:
         go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
@@ -181,7 +181,7 @@ STEPS = sum(rounds for _, rounds in _LEVELS) + 1
 def register_energies(
     views: EnergyViews, progress: Callable[[int, int], None] = lambda n, most: None
 ) -> tuple[EnergyViews, tuple[Displacement, ...]]:
-    """Correct the views by where the sample stood in the scan of each energy, and by the optics; a parallel beam.
+    """Align the scans of all energies, correcting the views for the sample's position and the optics; a parallel beam.
 
     The energy with the most views is the reference. A volume of it predicts the others, each scaled by what it absorbs
     in the mean. The sample is shifted along x, y and z and turned about the axis. The image is shifted along the rows

@@ -29,7 +29,7 @@ _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned vi
 
 @dataclass(frozen=True)
 class TimeSeries(Checked):
-    """Volumes at even times of one scan of a sample that changes, see `fit_series`.
+    """Volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
         volumes: 2 or more, from the first view to the last; each needs twelve views or more.
@@ -91,7 +91,7 @@ class TimeSeries(Checked):
 
 @dataclass(frozen=True)
 class EnergySeries:
-    """A volume of each material, from views of one sample at several energies, see `fit_materials`.
+    """One volume per material, from views of one sample at several energies, see `fit_materials`.
 
     Attributes:
         materials: their names, one for each column of `Energies.cross_sections`.
@@ -259,7 +259,7 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     if weights is not None:
         data = np.where(weights > 0, data, np.float32(0))
     if not data.max() > 0:
-        raise ValueError("no line integral that is finite and has a weight is above 0: these views hold no matter")
+        raise ValueError("no line integral that is finite and has a weight is above 0: these views show no matter")
     return data, weights
 
 

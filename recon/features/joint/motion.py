@@ -62,7 +62,7 @@ class Motion:
         return _spline(self.times, knots) - _spline(np.array([MIDDLE]), knots)
 
     def at(self, time: int, control: F64 | None = None) -> F32:
-        """u [3, y, x, z] at a time, of other control points if given."""
+        """u [3, y, x, z] at a time, from other control points if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
         some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
         wide = np.einsum("yp,dpqr->dyqr", y, some)
@@ -91,7 +91,7 @@ def _spline(at: F64, knots: int) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Views at one time, as lines [view, col, row]; `weight` None: one."""
+    """Views at one time, as lines [view, col, row]; `weight` None: all weights 1."""
 
     time: int
     projector: Projector
@@ -100,7 +100,9 @@ class Seen:
 
 
 def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
-    """Minus the gradient of half the weighed squares by the control points, and the slopes of W x by u of each time."""
+    """Minus the gradient of half the weighted squares by the control points, and the derivatives of W x by u at each
+    time.
+    """
     right, slope = np.zeros_like(motion.control), list[F32]()
     for part in seen:
         u, x = motion.at(part.time), image(part.time)
@@ -139,7 +141,7 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
 
 
 def weighed(lines: F32, weight: F32 | None) -> F32:
-    """The lines by the weights of their rays, if they have some."""
+    """The lines multiplied by the weights of their rays, if there are any."""
     return lines if weight is None else weight * lines
 
 
@@ -156,7 +158,7 @@ def _rough(control: F64) -> F64:
 def conjugate_gradients(
     normal: Callable[[A], A], left: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
 ) -> None:
-    """Steps of conjugate gradients (Hestenes & Stiefel 1952), which improve `found` in place.
+    """Steps of conjugate gradients (Hestenes & Stiefel 1952) that improve `found` in place.
 
     Args:
         left: the right side less `normal` of what was found so far; overwritten.

@@ -40,7 +40,7 @@ class _StoppedError(Exception):
 
 @dataclass
 class Countdown:
-    """Tells a listener how many steps may follow, and remembers that it ended them."""
+    """Tells a listener how many steps may remain, and records whether it stopped them."""
 
     go_on: Callable[[int], bool]
     left: int
@@ -60,7 +60,7 @@ class Countdown:
 
 @dataclass(frozen=True, eq=False)
 class Proportions:
-    """The problem above. Volumes are [y, x, z], factors [k, y, x, z], views lines [view, col, row].
+    """The least-squares problem above. Volumes are [y, x, z], factors [k, y, x, z], views lines [view, col, row].
 
     Attributes:
         projector: of all views.
@@ -81,7 +81,7 @@ class Proportions:
     stop: Callable[[], bool] = lambda: False
 
     def select(self, views: NDArray[np.intp]) -> Proportions:
-        """The problem of some views."""
+        """The problem restricted to some views."""
         return replace(
             self, projector=self.projector.subset(views), kind=self.kind[views], data=self.data[views],
             weight=self.weight[views],
@@ -100,14 +100,14 @@ class Proportions:
             yield kind
 
     def shown(self, factors: F32) -> F32:
-        """Views [view, col, row] by these factors: A f Σ c s."""
+        """Views [view, col, row] predicted by these factors: A f Σ c s."""
         out = np.empty_like(self.data)
         for projector, own, shares in self._each_kind():
             out[own] = projector.forward_lines(self.matter * np.tensordot(shares.astype(np.float32), factors, 1))
         return out
 
     def explained(self, lines: F32) -> F32:
-        """The transpose of `shown`, of weighed lines."""
+        """The transpose of `shown`, for weighted lines."""
         out = np.zeros((self.shares.shape[1], *self.matter.shape), np.float32)
         for projector, own, shares in self._each_kind():
             back = self.matter * projector.adjoint_lines(self.weight[own] * lines[own])
@@ -116,7 +116,7 @@ class Proportions:
         return out
 
     def left(self, factors: F32) -> F64:
-        """Weighed squares [view] that factors leave of the views."""
+        """Weighted squares [view] of the residual for these factors."""
         residual = self.data - self.shown(factors)
         return np.einsum("vij,vij,vij->v", self.weight, residual, residual, dtype=np.float64)
 
@@ -159,7 +159,7 @@ class Proportions:
 
 
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
-    """The `smooth` of `solved` with which the views of `fit` predict those of `judge`, and what these are left.
+    """The `smooth` of `solved` for which the views of `fit` predict those of `judge` best, and the residual of these.
 
     Made lighter from a heavy one until it predicts worse twice. The heaviest that predicts as well as the best is
     taken: to one standard error of the difference over the views of `judge` (Breiman et al. 1984, section 3.4.3).
@@ -195,7 +195,7 @@ def fit_share(
     go_on: Callable[[int], bool] = lambda left: True,
     stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
-    """Densities of two states of one material anew: the same sum, with the share of each smooth within matter.
+    """Refit the densities of two states of one material: the same sum, with the fraction of each smooth within matter.
 
     Views held out, one in eight of some rows, choose how smooth. Memory: ten volumes, six times the projections.
 
@@ -227,7 +227,7 @@ def fit_share(
 
 
 def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], grid: Grid) -> Proportions:
-    """Each ray weighs as many photons as the densities let through, which is one over the variance of its noise."""
+    """Each ray is weighted by the photons that the densities let through, the inverse variance of its noise."""
     projector, sections = Projector(views.geometry, grid), views.cross_sections
     of_view = sections[views.energy].astype(np.float32)[:, :, None, None]
     data = projection_lines(views.projections)

@@ -51,7 +51,7 @@ _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends hav
 
 @dataclass(frozen=True, eq=False)
 class TimedViews:
-    """Views of a sample that changes.
+    """Views of a changing sample.
 
     Attributes:
         projections: line integrals, float32 [view, row, col], finite.
@@ -82,7 +82,7 @@ class TimedViews:
 
 @dataclass(frozen=True, eq=False)
 class TimedVolumes:
-    """A volume that changes, linear between knots in time, and moves.
+    """A changing volume, linear between knots in time, with motion.
 
     Attributes:
         times: float64 [knot], in the unit of the views' times, evenly from the first view to the last.
@@ -106,7 +106,7 @@ class TimedVolumes:
     smooth: float | None = None
 
     def at(self, time: float) -> F32:
-        """The volume [z, y, x] at a time; before the first and after the last knot that of the knot."""
+        """The volume [z, y, x] at a time; before the first and after the last knot it is constant."""
         before = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
         if self.motion is None:
             return before
@@ -116,7 +116,7 @@ class TimedVolumes:
 
 
 def hats(at: ArrayLike, knots: F64) -> F64:
-    """Shares [time, knot] of linear interpolation between even knots; those of the ends beyond them."""
+    """Weights [time, knot] of linear interpolation between evenly spaced knots; constant beyond the ends."""
     place = np.interp(np.atleast_1d(at), knots, np.arange(knots.size))
     return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
 
@@ -247,7 +247,7 @@ def smooth_factors(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> float | None:
-    """The best smoothness of factors of the mean; None: separate volumes predict views held out as well.
+    """The best smoothness of factors of the mean; None if separate volumes predict held-out views as well.
 
     Of some rows, from seven of eight views.
     """
@@ -276,7 +276,7 @@ def smooth_factors(
 
 
 def refuse_few(knots: int, n: int) -> None:
-    """ValueError where so many views are too few for so many volumes."""
+    """Raise ValueError if so many views are too few for so many volumes."""
     if not 2 <= knots <= n // _LEAST_VIEWS:
         raise ValueError(
             f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
@@ -284,7 +284,7 @@ def refuse_few(knots: int, n: int) -> None:
 
 
 def series_costs(geometry: Geometry, knots: int, motion: bool | None, sweeps: int = SWEEPS) -> Costs:
-    """The work of `fit_series`: of a sample at rest, and of one that moves, where these are open.
+    """The work of `fit_series`: without motion, and with it, where that is undecided.
 
     Raises:
         ValueError: the views do not suffice for so many volumes.

@@ -49,7 +49,8 @@ class Materials:
     residual: float
 
     def share(self, of: int, others: Sequence[int], least: float) -> F32:
-        """The share [z, y, x] of a material in the density of itself and others, 0 ... 1, such as a state of charge.
+        """The fraction [z, y, x] of a material in the summed density of itself and others, 0 ... 1, such as a state of
+        charge.
 
         Args:
             least: summed density below which there is nothing to take a share of: NaN there.
@@ -100,7 +101,7 @@ def fit_materials(
 
 
 def weight_of(light: F32) -> F32:
-    """Weights of rays that so much of the light passes, up to 1."""
+    """Weights of rays with this transmission, up to 1."""
     return np.clip(light / _LITTLE, _LEAST, 1)
 
 
@@ -185,7 +186,7 @@ def weights_by_views(
     *,
     alike: bool = False,
 ) -> F64:
-    """Weights of total variation [component], by one view in eight held out.
+    """Weights of total variation [component], chosen with one view in eight held out.
 
     First one weight for all components, halved until it predicts worse. Those that hold differences then get the
     heaviest that predicts within 1 % of the best: they have less structure, and the same noise.

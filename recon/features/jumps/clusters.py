@@ -14,7 +14,7 @@ LEAST = 6
 
 
 def jump_clusters(sizes: I64) -> list[tuple[int, int]]:
-    """First and last number of jumps between which no part [its size] is long enough for a displacement of its own."""
+    """First and last number of jumps between which no part [its size] is long enough for its own displacement."""
     clustered: list[tuple[int, int]] = []
     for jump in range(sizes.size - 1):
         if clustered and sizes[jump] < LEAST:
@@ -39,7 +39,9 @@ def part_groups(sizes: I64, clusters: Sequence[tuple[int, int]]) -> I64:
 
 
 def thinned(group: I64, most: int, short: int) -> I64:
-    """[view] indices of about `most` views at most, evenly spread in each group [view]; all of groups up to `short`."""
+    """[view] indices of at most about `most` views, evenly spread in each group [view]; all views of groups up to
+    `short`.
+    """
     step = max(1, math.ceil(group.size / most))
     keep = [
         np.flatnonzero(group == at)[:: 1 if (group == at).sum() <= short else step] for at in range(group.max() + 1)

@@ -40,7 +40,7 @@ _TOP = 0.98  # share of the highest density that counts as reached
 
 @dataclass(frozen=True)
 class FieldMethod(Checked, ABC):
-    """Settings of every neural field.
+    """Settings that all neural fields share.
 
     Attributes:
         steps: of one view each.
@@ -76,7 +76,7 @@ class FieldMethod(Checked, ABC):
 
     @abstractmethod
     def network(self, across: int) -> Field:
-        """The network for a box of so many voxels along its longest edge, without values."""
+        """The network for a box of so many voxels along its longest edge, without trained values."""
 
     def samples_of(self, across: int) -> int:
         count = math.ceil(1.25 * across) if self.samples is None else self.samples
@@ -91,7 +91,7 @@ class FieldMethod(Checked, ABC):
         return replace(self, steps=2, seconds=None, early_stop=False, rays=min(self.rays, 16))
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """The method for a share of a volume: in its share of the seconds."""
+        """The method for a share of a volume: with its share of the seconds."""
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
@@ -138,7 +138,7 @@ class _Views:
 
 
 def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
-    """Fit the field to the views, and take its density at the centres of voxels.
+    """Fit the field to the views, and sample its density at the centres of voxels.
 
     Raises:
         ValueError: views held out that do not exist, views without matter, an early stop without views held out, or a
@@ -154,14 +154,14 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device {problem.device!r} cannot be used: {error}. Give 'cpu', or 'cuda'") from error
     if geometry.width:
-        warnings.warn(f"a neural field takes rays without a width: it does not know {geometry.width}", stacklevel=2)
+        warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
     used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
     grid = Grid.for_fit(geometry, problem.grid, wider=wider_than_field(data[used], seen))
     unit = density_unit(first_volume(data[used], seen, grid))
     if unit <= 0 or not (data[used] > 0).any():
-        raise ValueError("the views hold no matter: nothing absorbs. A field needs views of a sample")
+        raise ValueError("the views show no absorbing matter. A field needs views of a sample")
     edge = float(np.ptp(grid.edges, axis=0).max())
     if weights is not None:
         weights = weights / np.float32(weights[weights > 0].mean(dtype=np.float64))

@@ -29,7 +29,7 @@ are split in error, with it 1. With it 38 of 40 pairs of touching balls are sepa
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Sizes and places, one entry a particle.
+    """Sizes and positions, one entry for each particle.
 
     Attributes:
         label: int32 [particle], in the labelled volume.
@@ -81,7 +81,7 @@ def bodies_outside(mask: Mask, box: tuple[slice, slice, slice]) -> int:
 
 
 def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
-    """Opened, closed, holes filled, and parts of fewer than `smallest` voxels removed.
+    """The mask opened and closed, with holes filled, and parts of fewer than `smallest` voxels removed.
 
     The volume is continued beyond its faces, so that a particle there loses nothing.
 
@@ -138,7 +138,7 @@ def parted(mask: Mask, neck: float = NECK) -> Labels:
 def measured(
     labels: Labels, spacing: tuple[float, float, float] = (1, 1, 1), origin: tuple[float, float, float] = (0, 0, 0)
 ) -> Particles:
-    """Sizes and places of the particles in a labelled volume.
+    """Sizes and positions of the particles in a labelled volume.
 
     Args:
         labels: int [z, y, x], 0 outside.

@@ -148,7 +148,7 @@ def stripe_score(sinogram: F32) -> float:
 
 @dataclass(frozen=True, eq=False)
 class WithoutRings:
-    """Views without stripes.
+    """Line integrals with the stripes removed.
 
     Attributes:
         data: float32 [view, row, col], line integrals.
@@ -167,7 +167,7 @@ def remove_rings(
     rings: Rings = "auto",
     axis_col: float | None = None,
 ) -> WithoutRings:
-    """A copy of line integrals without the stripes that make rings, for use between `recon.correct` and a method.
+    """A copy of line integrals without the stripes that cause rings, for use between `recon.correct` and a method.
 
     Args:
         projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
@@ -192,7 +192,7 @@ def remove_rings(
 def remove_rings_in_place(
     views: F32, angles: NDArray[np.float64], rings: Rings, axis_col: float | None = None
 ) -> tuple[F32, str]:
-    """Stripes out of all rows of line integrals [view, row, col], in place.
+    """Remove stripes from all rows of line integrals [view, row, col], in place.
 
     Args:
         views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
@@ -234,7 +234,7 @@ def remove_rings_in_place(
 
 
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
-    """A sentence where pixels answer so unequally that rings are seen, with what removes them; otherwise ""."""
+    """A sentence if pixels respond so unequally that rings are visible, with the remedy; otherwise ""."""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return ""
     steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
@@ -264,7 +264,7 @@ def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]
 
 
 def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
-    """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
+    """Peak memory of `remove_rings_in_place` in bytes, without the views, for a detector (rows, cols)."""
     rows, cols = shape
     looked_at = views * min(rows, _ROWS) * cols
     if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:

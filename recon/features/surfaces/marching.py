@@ -49,7 +49,7 @@ _WORK = 3  # copies of a mesh while it is joined
 
 
 class BySlices(Protocol):
-    """Voxels that are read by slices: an array, or a dataset of a file."""
+    """Voxels that are read slice by slice: an array, or a dataset of a file."""
 
     def __getitem__(self, z: slice, /) -> NDArray[np.number]: ...
 

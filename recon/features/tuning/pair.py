@@ -43,7 +43,7 @@ class PairAlignment:
 
 
 def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> PairAlignment:
-    """The axis by two views half a turn apart.
+    """Find the axis from two views half a turn apart.
 
     Args:
         p0, p180: float [row, col], line integrals.
@@ -64,7 +64,8 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> PairAlig
 
 
 def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Pixels over which a view changes: its contrast over its slope, both from two frames of it, so without noise.
+    """Pixels over which a view changes: its contrast divided by its slope, both from two frames of it, so free of
+    noise.
 
     It is smaller the sharper the picture is, for the same sample at the same angle. NaN where there is only noise.
 

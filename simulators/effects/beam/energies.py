@@ -65,7 +65,7 @@ class BeamHardening(ImageEffect):
         if given is None or (self.energies is not None and self.ratios is not None):
             raise ValueError(f"give either energies in keV or ratios of attenuations, got {self}")
         if len(given) != len(self.weights) or not self.weights:
-            raise ValueError(f"weights must be as many as energies or ratios, and one at least, got {self}")
+            raise ValueError(f"there must be one weight for each energy or ratio, and at least one, got {self}")
         if not sum(self.weights) > 0:
             raise ValueError(f"one of the weights must be positive, got {self.weights}")
 

@@ -198,7 +198,7 @@ def by_mass(name: str, density: float, parts: Mapping[str, float]) -> Material:
 
 
 def by_volume(name: str, one: Material, other: Material, share: float) -> Material:
-    """`share` of the volume is `one`, the rest `other`."""
+    """A mixture of two materials: the fraction `share` of the volume is `one`, the rest `other`."""
     masses = (share * one.density, (1 - share) * other.density)
     total: dict[int, float] = {}
     for mass, material in zip(masses, (one, other), strict=True):
@@ -290,7 +290,8 @@ class Palette:
         return material
 
     def filters(self, name: str) -> Attenuation:
-        """The attenuation of a material, for `spectrum.light`. Raises ValueError as above."""
+        """The attenuation of a material as a filter, for `spectrum.light`. Raises ValueError for an unknown
+        material."""
         return self(name).attenuation
 
 

@@ -69,7 +69,7 @@ class Constituent:
     instead_of: Material | None = None
 
     def attenuation(self, energies: ArrayLike) -> Reals:
-        """1/mm, minus that of the displaced material, at energies in keV; same shape as the energies."""
+        """Attenuation in 1/mm, minus that of the displaced material, at energies in keV; same shape as the energies."""
         if self.material is None:
             return np.ones(np.shape(energies))
         own = self.material.attenuation(energies)
@@ -102,7 +102,7 @@ class Mixture:
         return self.whole.names
 
     def thickness(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
-        """mm of each constituent along each ray, float64 [constituent, row, col]."""
+        """Thickness in mm of each constituent along each ray, float64 [constituent, row, col]."""
         return np.stack([c.chords.line_integrals(angle, detector) for c in self.constituents])
 
     def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:

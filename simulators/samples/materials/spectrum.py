@@ -40,7 +40,7 @@ class Spectrum:
 
     @classmethod
     def of(cls, energies: ArrayLike, weights: ArrayLike) -> Spectrum:
-        """From weights of any sum; energies without weight are dropped."""
+        """A spectrum from weights of any sum; energies without weight are dropped."""
         e, w = np.asarray(energies, dtype=np.float64), np.asarray(weights, dtype=np.float64)
         return cls(e[w > 0], w[w > 0] / w.sum())
 

@@ -85,12 +85,12 @@ class NemaPhantom:
 
     @property
     def activity(self) -> Phantom:
-        """1 in the body."""
+        """Relative activity: 1 in the body."""
         return self._phantom(1.0, [rod.activity for rod in self.rods.values()])
 
     @property
     def mu(self) -> Phantom:
-        """1/mm at 511 keV."""
+        """Attenuation in 1/mm at 511 keV."""
         return self._phantom(WATER, [rod.mu for rod in self.rods.values()])
 
 
@@ -126,7 +126,7 @@ class Lines:
 
     @property
     def angles(self) -> NDArray[np.float64]:
-        """[view], radians."""
+        """Angles [view] in radians."""
         return np.linspace(0, math.pi, self.views, endpoint=False)
 
 

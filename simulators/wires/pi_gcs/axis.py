@@ -159,7 +159,7 @@ class GcsAxis(MovedAxis):
         self._at_end = self._found
 
     def brake(self) -> None:
-        """HLT: slow down to a whole count and stand."""
+        """HLT: decelerate to a whole count and stand."""
         if self.moving():
             self._cut(self.move.slowed(self._clock.now(), self.deceleration * self.per_degree))
         self.error = 10
@@ -171,7 +171,7 @@ class GcsAxis(MovedAxis):
         self.error = 10
 
     def switch_trigger(self, output: PiOutput, on: bool) -> None:
-        """TRO."""
+        """TRO: switch the trigger output on or off."""
         self.catch_up()
         if output is self._wired.settings:
             self._wired.switch(on, self.move, self._zero, self._clock.now())

@@ -162,7 +162,7 @@ class WiredOutput:
         self._high_until, self._pulses = -math.inf, 0
 
     def switch(self, on: bool, move: TrapezoidMove, zero: int, now: float) -> None:
-        """TRO. `zero` is the count of the axis' position 0."""
+        """TRO: switch the output on or off. `zero` is the count of the axis' position 0."""
         owed = self._settle(now)
         self.settings.on, self._zero = on, zero
         self._done_until = move.position(now)
@@ -175,7 +175,7 @@ class WiredOutput:
         self._schedule(move, now, owed)
 
     def cut(self, move: TrapezoidMove, now: float) -> None:
-        """The move in progress gets another end."""
+        """Give the move in progress another end."""
         self._schedule(move, now, self._settle(now))
 
     def _window(self) -> Window:

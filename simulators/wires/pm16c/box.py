@@ -81,7 +81,7 @@ class HomeSwitch:
         return self._found
 
     def forget_search(self) -> None:
-        """Another move begins: the search is over."""
+        """Forget the last search, because another move begins."""
         self.found()
         self._searched_for = None
 
@@ -100,7 +100,7 @@ class Channel:
 
     @property
     def acceleration(self) -> float:
-        """pps²."""
+        """Acceleration in pps²."""
         return 1e6 / ms_per_1000_pps(self.rate)
 
     @property
@@ -170,11 +170,11 @@ class PM16CBox:
         self.channels[sample] = Channel(self.sample, build.home_at)
 
     def moving(self) -> int:
-        """How many motors move."""
+        """Number of moving motors."""
         return sum(channel.motor.moving() for channel in self.channels.values())
 
     def standing(self, c: str) -> Channel:
-        """The channel; raises Refused if it moves."""
+        """The channel, if it stands; raises Refused if it moves."""
         if self.channels[c].motor.moving():
             raise Refused(Pm16cError.COMMAND)
         return self.channels[c]

@@ -135,7 +135,7 @@ def test_lost_frames_raise_what_the_command_says_and_leave_the_result(connected:
         ({"scan.angles.views": 0}, "--set scan.angles.views=0"),
         ({"scan.angels": 3}, "--set scan.angels=3"),
         ({"sample.name": "a/b"}, "a/b"),
-        ({"scan.period_s": object()}, "a configuration cannot hold"),
+        ({"scan.period_s": object()}, "scan.period_s: "),
         ({"devices.stage.max_speed_deg_s": 3}, "belongs to devices that are open"),
         ({"simulation.seed": 3}, "belongs to devices that are open"),
         ({"scan.period_s": 1e-3}, "nothing was started"),

@@ -52,7 +52,7 @@ def test_schema_is_json() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("show", "absent.yaml"), "there is no file absent.yaml"),
+        (("show", "absent.yaml"), "absent.yaml does not exist"),
         (("show",), "Missing argument 'CONFIG'"),
         (("init", "--nonsense"), "--nonsense"),
         (("frobnicate",), "frobnicate"),

@@ -74,7 +74,7 @@ def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
 def test_what_is_wrong_is_said_in_a_line(foreign: Path, command: str) -> None:
     for arguments, said in (
         ((), "/p/a (30 x 2 x 40)"),
-        (NAMES, "say --angles-unit"),
+        (NAMES, "--angles-unit"),
         ((*LAYOUT, "--data-path", "/p/b"), "has no dataset /p/b. It has /p/a (30 x 2 x 40)"),
     ):
         result = beamline(command, "f.h5", *arguments)

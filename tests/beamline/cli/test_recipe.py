@@ -85,11 +85,11 @@ def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
         ("method: r3\n", "r3"),
         ("rows: 5\n", "FIRST:END"),
         ("method: fbp\niterations: 3\n", "--iterations is of fista-tv, os-sirt-tv, pnp-dct, mlem, osem, sirt"),
-        ("just text\n", "is no recipe"),
-        ("a: b: c\n", "is no YAML"),
+        ("just text\n", "expected lines such as"),
+        ("a: b: c\n", "YAML"),
         ("method: &a [x, x]\n" + "".join(f"b{i}: &b{i} [*a, *a, *a]\n" for i in range(9)), "expected one value"),
-        ("method: " + "[" * 1000, "is no YAML"),
-        ("\x00", "is no YAML"),
+        ("method: " + "[" * 1000, "YAML"),
+        ("\x00", "YAML"),
     ],
 )
 def test_a_recipe_that_is_wrong_is_refused_before_any_work(folder: Path, text: str, said: str) -> None:
@@ -115,7 +115,7 @@ def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
     assert "residual" in lines[-1]
     assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5").exit_code == 5
     assert beamline("recon", "none.h5", "-m", "fbp", "--log", "bad.txt").exit_code == 5
-    assert "none.h5 is not there" in (folder / "bad.txt").read_text().splitlines()[-1]
+    assert "none.h5" in (folder / "bad.txt").read_text().splitlines()[-1]
     said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
     shown = [line.split()[1] for line in said.splitlines()]
     steady = [[kind for kind in each if kind != "progress:"] for each in (shown, kinds[1:])]  # that comes by the clock

@@ -190,7 +190,7 @@ def test_a_fit_whose_last_checkpoint_is_lost_writes_its_volume_and_says_so(
     options = ("--steps", "6", "--gaussians", "50", "--axis", "20.7", "--finish", "0", "--no-report")
     result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--checkpoint", "fit.h5")
     assert (result.exit_code, left(folder)) == (5, {"scan.h5", "out.h5"}), result.output
-    assert "last checkpoint was left out: fit.h5 could not be written" in result.stderr
+    assert "last checkpoint could not be written: fit.h5 could not be written" in result.stderr
     assert read_reconstruction(folder / "out.h5").volume.data.any()
 
 

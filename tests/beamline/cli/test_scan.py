@@ -84,7 +84,7 @@ def test_a_rehearsal_says_what_the_scan_takes_and_leaves_nothing_if_asked(tmp_pa
     series = ["--set", "devices.monochromator={kind: manual, range_kev: [5, 30]}", "--set", "scan.energies=[10, 11]"]
     for queue in (real, [*real[:2], *real[1:]]):  # one scan, and two in turn
         done = CliRunner().invoke(main, [*queue, *series, "--rehearse", "--discard"])
-        assert done.exit_code == 2 and "--discard does not go with scan.energies" in done.stderr, done.output
+        assert done.exit_code == 2 and "scan.energies" in done.stderr, done.output
     assert not list(tmp_path.iterdir())
 
 
@@ -319,7 +319,7 @@ def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypat
     monkeypatch.setattr(run_module, "connect", connect)
     result = scan("-o", str(tmp_path / "runs"))
     assert result.exit_code == 130
-    assert "before anything was acquired" in result.stderr
+    assert "before the first frame" in result.stderr
     assert not (tmp_path / "runs").exists()
     assert instrument.log == ["close"]
 

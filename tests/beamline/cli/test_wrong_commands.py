@@ -24,7 +24,7 @@ CASES = {
     "a file for a template": (["config", "init", "my.yaml"], 2, ["config init > my.yaml"]),
     "a missing colon": (["check", "bad.yaml"], 2, ["bad.yaml:3", "colon is missing"]),
     "an axis outside": (["recon", "scan.h5", "--axis", "900"], 2, ["column 900", "0 to 39"]),
-    "no such run": (["stop", "nosuch"], 2, ["no folder nosuch", "no scan runs in runs"]),
+    "no such run": (["stop", "nosuch"], 2, ["no folder nosuch", "runs"]),
     "no such file": (["watch", "nosuch.h5"], 2, ["no file or folder nosuch.h5", "no runs in runs"]),
 }
 

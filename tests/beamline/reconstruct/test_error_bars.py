@@ -123,7 +123,7 @@ def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: py
     monkeypatch.setattr("recon.error_bars.solve", interrupted)
     result = beamline(*FISTA, "-o", "out.h5")
     assert result.exit_code == 0, result.output
-    assert "The error bars were left out: as they were stopped." in result.stderr
+    assert "There are no error bars: their computation was stopped." in result.stderr
     record = read_reconstruction(Path("out.h5"))
     assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters
 
@@ -149,7 +149,7 @@ def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
         (("-m", "sirt"), "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
         (("-m", "sirt", "--dry-run"), "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
         (("-m", "fbp", "-o", "out.tif"), "give -o out.h5"),
-        (("-m", "r2", "--finish", "0"), "r2 has no finish there with --finish 0"),
+        (("-m", "r2", "--finish", "0"), "--finish 0"),
         (("-m", "fbp", "--views", "fixed:6"), "at least 8 views are needed, got 6"),
         (("-m", "r2", "--seconds", "5"), "--uncertainty does not go with"),
         (("-m", "r2", "--follow"), "--uncertainty does not go with"),

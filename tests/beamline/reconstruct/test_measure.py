@@ -47,14 +47,14 @@ def test_truths_that_are_none(tmp_path: Path) -> None:
         file["something"] = DATA
     np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
     for name in ("two.npz", "flat.npz", "text.npz", "other.h5", "objects.npy"):
-        with pytest.raises(DataError, match="holds no volume"):
+        with pytest.raises(DataError, match="readable volume"):
             read_truth(str(tmp_path / name))
     with pytest.raises(DataError, match="neither"):
         read_truth(str(tmp_path / "text.npz"))
     np.save(tmp_path / "good.npy", DATA)
     with pytest.raises(ConfigError, match=r"slices 2:9 do"):
         read_truth(f"{tmp_path / 'good.npy'}:2:9")
-    with pytest.raises(ConfigError, match="no such file"):
+    with pytest.raises(ConfigError, match=r"missing\.npy"):
         read_truth(str(tmp_path / "missing.npy"))
 
 
@@ -172,7 +172,7 @@ def test_a_volume_file_is_measured_by_masks_that_somebody_drew(tmp_path: Path, r
     }
     for wrong, said in {"3": labels + 2, "shape": labels[:3]}.items():
         tifffile.imwrite(tmp_path / f"{wrong}.tif", said, photometric="minisblack")
-        with pytest.raises(DataError, match="cannot be measured so"):
+        with pytest.raises(DataError, match="cannot be measured"):
             measured_file(tmp_path / "v.npy", None, tmp_path / f"{wrong}.tif")
 
 
@@ -183,5 +183,5 @@ def test_a_volume_file_is_measured_against_a_truth(tmp_path: Path, rng: np.rando
     found = measured_file(tmp_path / "v.npy", str(tmp_path / "t.npy"), None)
     assert set(found) == {"psnr", "nrmse", "ssim3d", "ssim_slices"}
     assert found["ssim_slices"] == pytest.approx(ssim_of_whole_slices(truth, truth / 2))
-    with pytest.raises(DataError, match="cannot be measured so"):
+    with pytest.raises(DataError, match="cannot be measured"):
         measured_file(tmp_path / "v.npy", f"{tmp_path / 't.npy'}:0:7", None)

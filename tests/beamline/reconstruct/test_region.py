@@ -76,7 +76,7 @@ def test_fbp_of_a_region_reports_no_residual() -> None:
     ("options", "code", "said"),
     [
         (("--roi", "38:60,10:40"), 2, "is not Z0:Z1,Y0:Y1,X0:X1"),
-        (("--roi", "38:97,10:40,4:29"), 2, "slices 38:97 do not lie in the volume's 0:96"),
+        (("--roi", "38:97,10:40,4:29"), 2, "slices 38:97"),
         (("--roi", "38:60,10:40,4:49"), 2, "x 4:49 does not lie in the volume's 0:48"),
         (("--roi", "38:60,10:40,4:29", "--cone", "50:70"), 2, "is a cone"),
         (

@@ -60,7 +60,7 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
     assert [data["value"] for event, data in told if event == "beam"] == [1.5, 2.5, 3.5]
     warnings = [data["message"] for event, data in told if event == "warning"]
     assert len(warnings) == 4
-    assert warnings[0] == f"{SILENT} The scan goes on without readings until it answers again."
+    assert warnings[0] == f"{SILENT} The scan continues without readings until the monitor answers again."
     assert "answers again after 3 failed readings." in warnings[1]
     assert "ZeroDivisionError: a defect" in warnings[2]
     assert "after 1 failed reading." in warnings[3]
@@ -100,7 +100,7 @@ def test_a_monitor_that_fails_stops_no_scan(tmp_path: Path, error: Exception) ->
     path, events = scan(tmp_path, Scripted(*[error] * 100_000))
     assert [event.data["status"] for event in events if event.event == "scan_done"] == ["complete"]
     warnings = [event.data["message"] for event in events if event.event == "warning"]
-    assert len([message for message in warnings if "The scan goes on" in message]) == 1
+    assert len([message for message in warnings if "The scan continues" in message]) == 1
     with h5py.File(path) as file:
         assert file[f"{BEAM}/value"].shape == (0,)
         assert file["entry/progress/status"][()] == b"complete"

@@ -94,7 +94,7 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     for run in runs:
         run.mkdir(parents=True)
         (run / "scan.h5").touch()
-    assert "no scan runs in runs" in CliRunner().invoke(main, ["pause"]).stderr
+    assert "no scan is running in runs" in CliRunner().invoke(main, ["pause"]).stderr
     stop = StopRequest()
     (runs[0] / "events.jsonl").write_text('{"event": "frame"}\n{"event": "state", "state": "acquiring"}\n{"event": "st')
     locks = [WriterLock(runs[0] / "scan.h5")]
@@ -117,7 +117,7 @@ def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control, "ANSWER_WITHIN", 0.2)
-    with pytest.raises(ConfigError, match="no scan runs"):
+    with pytest.raises(ConfigError, match="no scan is running"):
         tell(tmp_path, Verb.PAUSE)
     (tmp_path / "control").mkdir(mode=0o700)
     with pytest.raises(ConfigError, match="does not answer"):

@@ -165,9 +165,9 @@ def test_the_writers_lock_is_given_back_when_it_is_killed(tmp_path: Path) -> Non
     ("damage", "said"),
     [
         (lambda data: data[:2000], "is damaged"),
-        (lambda data: data[:20] + bytes([data[20] ^ 1]) + data[21:], "no HDF5 file that this program wrote"),
+        (lambda data: data[:20] + bytes([data[20] ^ 1]) + data[21:], "not an HDF5 file"),
         (lambda data: data[:48] + bytes(400) + data[448:], "is damaged"),
-        (lambda data: b"", "no HDF5 file"),
+        (lambda data: b"", "not an HDF5 file"),
     ],
 )
 def test_a_damaged_file_is_refused_and_stays_as_it_is(

@@ -146,7 +146,7 @@ def test_arrays_tiffs_and_hdf5_are_read(tmp_path: Path) -> None:
         ("two.npz", "c", "has no array 'c'"),
         ("v.h5", "entry/data", "has no dataset 'entry/data'"),
         ("v.npy", "volume", "holds one volume"),
-        ("none.npy", None, "There is no volume"),
+        ("none.npy", None, "does not exist"),
     ):
         with pytest.raises(DataError, match=said):
             read_volume(tmp_path / name, dataset)

@@ -255,7 +255,7 @@ OF_MOTION = (
     FaultElsewhere(
         "a slip: stalled and recovered, displaced, moved by its knob (Zaber WS, WM, NC); an error of the motion "
         "(PI 504, 1024, 1025)",
-        "since its last move something happened to it",
+        "disturbed since its last move",
         ("drivers/stages/zaber/test_stage.py", "test_a_slip_between_two_moves_is_told_once_by_the_next"),
     ),
     FaultElsewhere(

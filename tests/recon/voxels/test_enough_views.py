@@ -23,7 +23,7 @@ def test_the_gain_predicted_falls_with_the_views(rng: np.random.Generator) -> No
     data, planned = data[order], geometry.select(order)
     few, most = (np.mean(predicted_gains(data[:n], planned, rng, 2)) for n in (10, 85))
     assert few > most + 1 and abs(most) < 1
-    with pytest.raises(ValueError, match="nothing to predict"):
+    with pytest.raises(ValueError, match="no view to predict"):
         predicted_gains(data, planned, rng, 1)
     with pytest.raises(ValueError, match=r"zero|matter"):
         predicted_gains(np.zeros_like(data[:20]), planned, rng, 1)

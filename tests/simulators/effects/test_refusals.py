@@ -35,9 +35,9 @@ BELOW_ONE = "must be less than 1, got"
         (
             "beam_hardening",
             {"weights": [1.0, 2.0], "energies": [20.0]},
-            "weights must be as many as energies",
+            "one weight for each energy",
         ),
-        ("beam_hardening", {"weights": [], "energies": []}, "weights must be as many as energies"),
+        ("beam_hardening", {"weights": [], "energies": []}, "one weight for each energy"),
         ("beam_hardening", {"weights": [1.0], "energies": [0.0]}, rf"energies\[0\] {POSITIVE}"),
         ("beam_hardening", {"weights": [0.0], "ratios": [1.0]}, "one of the weights must be positive"),
         ("beam_hardening", {"weights": [-1.0, 2.0], "ratios": [1.0, 2.0]}, rf"weights\[0\] {NOT_NEGATIVE}"),
@@ -106,8 +106,8 @@ BELOW_ONE = "must be less than 1, got"
         ("pixel_area", {"rays": 9}, "rays must be less than or equal to 8, got 9"),
         ("prnu", {"spread": 0.5}, r"spread must be less than or equal to 0\.2"),
         ("prnu", {"seed": -1}, f"seed {NOT_NEGATIVE}"),
-        ("quantum_efficiency", {}, "give either value or wavelength_nm"),
-        ("quantum_efficiency", {"value": 0.5, "wavelength_nm": 500.0}, "give either value or wavelength_nm"),
+        ("quantum_efficiency", {}, "give one of value, wavelength_nm"),
+        ("quantum_efficiency", {"value": 0.5, "wavelength_nm": 500.0}, "give one of value, wavelength_nm"),
         ("quantum_efficiency", {"value": 1.2}, f"value {TO_ONE} 1.2"),
         (
             "quantum_efficiency",

@@ -28,7 +28,7 @@ PvUrl = Annotated[str, without(pv_problem)]
 
 
 class ElectrometerConfig(BeamMonitorSection):
-    """An electrometer or picoammeter on a serial port that answers a query with a line that holds a number."""
+    """An electrometer or picoammeter on a serial port that answers a query with a line containing a number."""
 
     kind: Literal["electrometer"]
     port: Annotated[str, Field(min_length=1)]
@@ -54,7 +54,7 @@ class ElectrometerConfig(BeamMonitorSection):
 
     @property
     def end(self) -> bytes:
-        """Of lines, both ways."""
+        """The line ending, in both directions."""
         return {"crlf": b"\r\n", "cr": b"\r", "lf": b"\n"}[self.line_end]
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:

@@ -25,7 +25,7 @@ class EpicsShutter(section_of("EpicsShutterKeys", FoundShutter, declared(Shutter
     """A shutter behind EPICS process variables."""
 
     def connect(self, clock: Clock) -> PvShutter:
-        """See `FoundShutter`."""
+        """Connect the shutter, see `FoundShutter`."""
         return PvShutter(read_from(self, ShutterPvs), clock)
 
 
@@ -41,7 +41,7 @@ class EpicsFilter(section_of("EpicsFilterKeys", FoundFilter, _KIND | declared(Fi
         return self
 
     def connect(self, clock: Clock) -> PvFilter:
-        """See `FoundFilter`."""
+        """Connect the filter, see `FoundFilter`."""
         return PvFilter(read_from(self, FilterPvs), clock)
 
 
@@ -53,7 +53,7 @@ class EpicsMonochromator(section_of("EpicsMonoKeys", FoundMonochromator, _KIND |
         return self.stop_pv is not None
 
     def connect(self, clock: Clock) -> PvMonochromator:
-        """See `FoundMonochromator`."""
+        """Connect the monochromator, see `FoundMonochromator`."""
         return PvMonochromator(read_from(self, MonochromatorPvs), clock)
 
 

@@ -48,7 +48,7 @@ def _model(text: str) -> str | None:
 
 @dataclass(frozen=True)
 class Hardening:
-    """How beam hardening is corrected.
+    """Settings of the beam hardening correction.
 
     Attributes:
         model: "fit": by a curve that is fitted on the views; `material:beam` as the user said it; None: not at all.
@@ -98,7 +98,8 @@ class Hardening:
 
 
 def in_beam(material: str, beam: str) -> tuple[F64, F64]:
-    """Mass attenuation of a material at the energies of a beam, cm²/g, and their shares of the light detected.
+    """Mass attenuation of a material at the energies of a beam, cm²/g, and the share of each energy in the detected
+    light.
 
     Args:
         material: a known one, or a chemical formula.
@@ -127,7 +128,9 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
 
 
 def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | None, str]:
-    """The curve of a scan's line integrals [view, row, col], and a sentence about it; None where none is to be used."""
+    """The hardening curve for a scan's line integrals [view, row, col], and a sentence about it; None for no
+    correction.
+    """
     from recon.features.beam_hardening.curve import NoCurveError, curve_of_spectrum
 
     highest = max(float(view.max()) for view in views)
@@ -146,7 +149,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
 
 
 def curve_memory(geometry: Geometry, step: Hardening) -> int:
-    """Most bytes that the curve of such views takes, and their correction by it."""
+    """Peak memory in bytes of finding the hardening curve of such views and applying it."""
     from recon.voxels.fbp import fbp_memory
 
     view = _CURVED * 4 * math.prod(geometry.detector_shape)
@@ -158,7 +161,7 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 
 def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
-    """Fit the curve to path lengths from a first reconstruction, with the sample taken as one material.
+    """Fit the curve to path lengths from a first reconstruction, assuming one material.
 
     The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of
     views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).
@@ -176,7 +179,9 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     from recon.voxels.projector import project
 
     if geometry.is_cone:
-        raise NoCurveError("that takes a parallel beam, whose views all hold the same mass: state material and beam")
+        raise NoCurveError(
+            "a fit needs a parallel beam, in which all views show the same mass: state material and beam"
+        )
     some, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
     grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
@@ -198,7 +203,7 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
                     f"{uneven:.2%}, as where a sample is denser outside"
                 )
             return curve, explained
-    raise NoCurveError(f"the curve does not settle in {_ROUNDS} rounds")
+    raise NoCurveError(f"the curve does not converge in {_ROUNDS} iterations")
 
 
 def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:

@@ -47,7 +47,7 @@ def _terms(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """What is learnt from the views.
+    """Which terms of geometry, background and gains are calibrated from the views.
 
     Attributes:
         terms: names; none: nothing.
@@ -68,12 +68,12 @@ class Calibrate:
 
     @property
     def geometry(self) -> frozenset[str]:
-        """The terms that change the geometry."""
+        """The calibrated terms that change the geometry."""
         return frozenset(self.terms).intersection(GEOMETRY)
 
     @property
     def may_lean(self) -> bool:
-        """Whether views may come out rolled or tilted: a row then shows several slices."""
+        """Whether the calibration may find a roll or tilt of the views: a detector row then shows several slices."""
         return not self.geometry.isdisjoint({"roll", "tilt"})
 
     @property
@@ -91,7 +91,7 @@ class Calibrate:
         return StepMemory(alone=max([_search_memory(part, self.geometry), *terms]))
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
-        """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+        """Raise DataError for terms that need more views, or more binned columns, than the scan has."""
         if not self.terms:
             return
         from recon.features.calibration import background, gains
@@ -114,7 +114,7 @@ class Calibrate:
         geometry_before: GeometryOf,
         progress: Callable[[int, int], None],
     ) -> Calibrated:
-        """The geometry of these frames as `calibrated` learns it, by the step's own terms."""
+        """Calibrate the geometry of these frames with the terms of this step."""
         return calibrated(source, selection, frames, geometry_before, self.geometry, progress)
 
     def apply(
@@ -132,7 +132,7 @@ class Calibrate:
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What was learnt of the geometry of some views.
+    """The calibrated geometry of some views.
 
     Attributes:
         frames: rows of the file, in order.
@@ -162,7 +162,7 @@ class Calibrated:
         return self.change.axis + self.off_middle * math.tan(self.change.roll)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
-        """The geometry of these rows of the file, which may be binned, as it was learnt."""
+        """The calibrated geometry of these rows of the file, which may be binned."""
         at = np.searchsorted(self.frames, view_ids)
         change = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
         return with_pivot(change.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
@@ -176,7 +176,7 @@ def calibrated(
     terms: frozenset[str],
     progress: Callable[[int, int], None],
 ) -> Calibrated:
-    """The geometry of these frames, learnt from a band in the middle of the rows used.
+    """Calibrate the geometry of these frames from a band in the middle of the rows used.
 
     Args:
         frames: rows of the file, in order.
@@ -200,7 +200,9 @@ def calibrated(
             views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
-        raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
+        raise DataError(
+            f"{source.path}: the geometry could not be calibrated: {error}. Leave out --calibrate."
+        ) from error
     looked, middle = rows_of(source, band), (source.shape[0] - 1) / 2
     whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
@@ -236,7 +238,7 @@ def _band(source: ScanSource, selection: Selection) -> Selection:
 
 
 def without_learnt_background(views: PreparedProjections, progress: Progress) -> StepDone:
-    """Take the background of the beam off the views where views held out confirm it, see `learn_background`."""
+    """Subtract the background of the beam from the views if held-out views confirm it, see `learn_background`."""
     from recon.features.calibration.background import learn_background
 
     data, ids = views.projections.data, views.projections.view_ids
@@ -267,7 +269,7 @@ def without_learnt_background(views: PreparedProjections, progress: Progress) ->
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
-    """Take gains of pixels off the views where views held out confirm them, see `learn_gains`."""
+    """Correct the views for pixel gains if held-out views confirm them, see `learn_gains`."""
     from recon.features.calibration.gains import NEAR_AXIS, learn_gains
 
     try:

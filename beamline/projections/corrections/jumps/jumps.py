@@ -44,7 +44,7 @@ _COPIES = 28  # float32 copies of the views looked at while they are registered
 
 @dataclass(frozen=True)
 class Jumps:
-    """What becomes of views on either side of an alarm of motion.
+    """How views on either side of a motion alarm are treated.
 
     Attributes:
         mode: "correct": see `find_jumps`. "ignore": they are used as they are.
@@ -63,7 +63,7 @@ class Jumps:
 
     @property
     def corrects_jumps(self) -> bool:
-        """Whether they are, in a finished scan."""
+        """Whether sample jumps are corrected, in a finished scan."""
         return self.mode == "correct"
 
     def memory(self, part: ScanPart) -> StepMemory:
@@ -88,7 +88,7 @@ class Jumps:
 
 @dataclass(frozen=True, eq=False)
 class SampleJumps:
-    """Where the sample was in the views of a scan in which it jumped.
+    """Sample positions in the views of a scan in which the sample jumped.
 
     Attributes:
         starts: int64, rows of the file at which a part begins, without the first.
@@ -104,11 +104,11 @@ class SampleJumps:
 
     @property
     def done(self) -> StepDone:
-        """What the step did; the file of a volume records jumps where there were some."""
+        """What the step did; the volume's file records the jumps, if there were any."""
         return StepDone(self.sentence, {"jumps": self.sentence} if self.sentence else {}, warned=True)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
-        """The geometry of these rows of the file, views shifted and turned as the sample was."""
+        """The geometry of these rows of the file, with views shifted and turned like the sample."""
         from recon.voxels.displacement import Displacement, displaced
 
         if all(move == Displacement() for move in self.moves):
@@ -124,7 +124,7 @@ def find_jumps(
     axis_col: float,
     progress: Callable[[int, int], None] = lambda n, most: None,
 ) -> SampleJumps:
-    """Where the sample was in each part of a scan between jumps, and which of the views can be used.
+    """Find the sample position in each part of a scan between jumps, and which views can be used.
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
     A part stays where views held out of the longest part are predicted with it as well as without, and its own views

@@ -39,7 +39,7 @@ def _unsharp(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Phase:
-    """How phase is retrieved.
+    """Settings of the phase retrieval.
 
     Attributes:
         material: the ratio of delta to beta, or a material, as the user said it; None: it is not retrieved.
@@ -81,9 +81,9 @@ class Phase:
     def __post_init__(self) -> None:
         others = self.distance_mm, self.energy_kev, self.unsharp
         if self.material is None and any(other is not None for other in others):
-            raise ValueError("--distance-mm, --energy-kev and --unsharp are for --phase.")
+            raise ValueError("--distance-mm, --energy-kev and --unsharp need --phase.")
         if (ratio := self._ratio) is not None and not 0 <= ratio < math.inf:
-            raise ValueError(f"--phase: delta/beta is 0 or more, got {self.material}.")
+            raise ValueError(f"--phase: delta/beta must be 0 or more, got {self.material}.")
 
     @property
     def _ratio(self) -> float | None:
@@ -94,7 +94,7 @@ class Phase:
             return None
 
     def delta_beta(self, energy_kev: float) -> float:
-        """The ratio of delta to beta. ValueError: the material is not known."""
+        """The ratio of delta to beta. Raises ValueError for an unknown material."""
         if (ratio := self._ratio) is not None:
             return ratio
         from recon.prep.matter import delta_beta
@@ -119,7 +119,7 @@ class Phase:
         return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
-        """The filter for the pixels that the selection makes, and a sentence about it.
+        """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
             ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.
@@ -128,7 +128,7 @@ class Phase:
         from recon.features.phase.paganin import Paganin, length_of
 
         if source.row_pitch_mm is not None:
-            raise ConfigError(f"--phase needs square pixels; {source.path} has others.")
+            raise ConfigError(f"--phase needs square pixels; those of {source.path} are not square.")
         cone, pitch = cone_of(source, selection), pixel_size(source, selection)
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm

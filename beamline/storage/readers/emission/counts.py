@@ -22,7 +22,7 @@ SETS = ("attenuation", "normalisation", "randoms", "scatter")
 
 
 class EmissionSource(StacksSource):
-    """A scan of a sample that emits. Its pixels are line integrals of the activity; `emission` has what was counted."""
+    """An emission scan. Its pixels are line integrals of the activity; `emission` has the counts."""
 
     def __init__(self, path: Path, file: h5py.File) -> None:
         views = dataset_at(file, f"{GROUP}/counts")
@@ -73,7 +73,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
 
 def _open(path: Path, opening: Opening) -> EmissionSource:
     if opening.follow:
-        raise DataError(f"{path} holds counts of an emission, which do not grow. Leave out --follow.")
+        raise DataError(f"{path} is an emission scan, which cannot be followed. Leave out --follow.")
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
         return EmissionSource(path, file)

@@ -30,12 +30,14 @@ _DATE = 100_000  # from which a number beside that of the image is a date or a t
 
 
 def kind_of(name: str) -> FrameKind:
-    """The kind that a file's name relative to the scan's folder says; the name itself goes before folders above it."""
+    """The kind of image by a file's name relative to the scan's folder; the name itself takes precedence over
+    folders."""
     return _by(_REFERENCE, name)
 
 
 def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
-    """The kind of each image of a scan. One series is the projections, whatever the sample is called.
+    """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
+    called.
 
     Words for references (dark, flat, white, open beam; ob, df, dc as whole words) tell. If they leave no projection,
     the sample is named by such a word: it is the one series with another word in its name, or the only series, or the
@@ -100,14 +102,14 @@ def _without_common_folder(names: Sequence[str]) -> list[str]:
 
 
 def without_angle(name: str) -> str:
-    """A file's name without the angle in it, which is another in each file of one series."""
+    """A file's name without its angle, which differs in each file of a series."""
     stem, dot, suffix = name.rpartition(".")
     stem = _DEGREES_AND_THOUSANDTHS.sub("", stem)
     return _TAGGED.sub("", stem).rstrip("_- =") + dot + suffix
 
 
 def angles_of(names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Radians [file] where each name states its angle; None where not all do, or they are no angles of a scan.
+    """Radians [file] if each name states its angle; None if not all do, or they are no angles of a scan.
 
     As a number beside `angle`, `theta`, `ang` or `deg`, or by three digits of degrees and three of their thousandths
     before the number of the frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
@@ -130,7 +132,7 @@ def angles_of(names: Sequence[str]) -> NDArray[np.float64] | None:
 
 @dataclass(frozen=True, eq=False)
 class NamedImages:
-    """The images of a scan as their names order them: darks, flats, then the projections by their numbers.
+    """The images of a scan ordered by their names: darks, flats, then the projections by number.
 
     Attributes:
         names: of the files.
@@ -148,7 +150,7 @@ class NamedImages:
 
     @property
     def references(self) -> int:
-        """How many darks and flats come first."""
+        """Number of darks and flats, which come first."""
         return int((self.kinds != FrameKind.PROJECTION).sum())
 
 
@@ -227,7 +229,7 @@ def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 
 def two_orders(names: Sequence[str]) -> bool:
-    """Names hold two numbers that count the images in even steps, each in an order of its own."""
+    """Whether names have two numbers that count the images in even steps, each in a different order."""
     digits = [re.findall(r"\d+", name) for name in names]
     if len({len(each) for each in digits}) != 1:
         return False

@@ -48,7 +48,7 @@ _SECOND_NUMBER = NotUsed(
 
 
 class TiffSeriesSource(ScanSource):
-    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series."""
+    """A folder or .zip with one image per file; see ScanSource. Frames: darks, flats, then the series."""
 
     format = "tiff_series"
 
@@ -80,7 +80,7 @@ class TiffSeriesSource(ScanSource):
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
-        """Name and content of the one file that is named after angles, or None. DataError: it is too large for them."""
+        """Name and content of the one file named after angles, or None. Raises DataError if it is too large."""
         return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -178,7 +178,7 @@ class TiffSeriesSource(ScanSource):
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
         if len(shape) != 2:
             raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
         require_real(dtype, f"{name} in {self.path}")

@@ -29,7 +29,7 @@ MANY_PAGES = 500  # pages; tifffile takes the square of their number to tell how
 
 
 class TiffStackSource(ScanSource):
-    """One TIFF with a page for each frame, read page by page; see ScanSource. Angles come from the caller."""
+    """One TIFF with one page per frame, read page by page; see ScanSource. The caller supplies the angles."""
 
     format = "tiff_stack"
 

@@ -30,7 +30,7 @@ _ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
 
 
 class TxrmFile:
-    """The streams of a file. Used within hdf5.readable, which turns its errors into a DataError."""
+    """The streams of a .txrm file. Used within hdf5.readable, which converts its errors to a DataError."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -42,25 +42,25 @@ class TxrmFile:
         self._ole = olefile.OleFileIO(path)
 
     def bytes_of(self, name: str) -> bytes:
-        """The content of a stream; KeyError where there is none."""
+        """The content of a stream; KeyError if there is none."""
         if not self._ole.exists(name):
             raise KeyError(f"there is no stream {name}")
         return bytes(self._ole.openstream(name).read())
 
     def numbers(self, name: str, dtype: str, n: int = 1) -> NDArray[Any] | None:
-        """The first n numbers of a stream; None where there is none, or fewer."""
+        """The first n numbers of a stream; None if it is missing or shorter."""
         if not self._ole.exists(name):
             return None
         content, wanted = self.bytes_of(name), n * np.dtype(dtype).itemsize
         return np.frombuffer(content[:wanted], dtype) if len(content) >= wanted else None
 
     def number(self, name: str) -> int | None:
-        """The first whole number of a stream; None where there is none."""
+        """The first integer of a stream; None if there is none."""
         numbers = self.numbers(name, "<i4")
         return None if numbers is None else int(numbers[0])
 
     def image(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """An image [row, col]; ValueError where the stream has another size."""
+        """An image [row, col]; ValueError if the stream has another size."""
         return np.frombuffer(self.bytes_of(name), dtype).reshape(shape)
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class _Views:
 
 
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
-    """Open. `own_angles` False: the caller brings the angles, so the file may lack them.
+    """Open a .txrm file. `own_angles` False: the caller supplies the angles, so the file may lack them.
 
     DataError where olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
     """

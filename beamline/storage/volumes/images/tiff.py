@@ -27,7 +27,7 @@ _UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them
 
 @dataclass(frozen=True)
 class TiffVolume:
-    """One TIFF, a hyperstack of ImageJ; from 4 GB on, which ImageJ's own cannot hold, a BigTIFF in the way of OME.
+    """One TIFF, an ImageJ hyperstack; from 4 GB on, the limit of that format, a BigTIFF with OME metadata.
 
     Both say the edges of a voxel in x, y and z; the facts are JSON in ImageJ's `Info` or OME's `Description`.
     """
@@ -67,7 +67,7 @@ class TiffVolume:
 
 @dataclass(frozen=True)
 class TiffFolderVolume:
-    """A folder of `slice_00000.tif` and so on; every file has the facts, its own number and how many there are."""
+    """A folder of `slice_00000.tif` and so on; every file has the metadata, its own number and the number of slices."""
 
     name: str = "folder of TIFFs"
     suffixes: tuple[str, ...] = REGISTRY["tiff_folder"].suffixes

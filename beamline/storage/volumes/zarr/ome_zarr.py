@@ -37,7 +37,7 @@ _KEY = "splatline"
 
 @dataclass(frozen=True)
 class OmeZarr:
-    """OME-Zarr; every scale halves the one before by means of 2 x 2 x 2; the facts are JSON in `splatline`."""
+    """OME-Zarr; every scale averages 2 x 2 x 2 voxels of the one before; the metadata are JSON in `splatline`."""
 
     name: str = "OME-Zarr"
     suffixes: tuple[str, ...] = REGISTRY["ome_zarr"].suffixes

@@ -158,7 +158,7 @@ def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
 
 
 def inner_radius(grain: Grain) -> float:
-    """mm, of the largest sphere around a grain's centre that lies inside it."""
+    """Radius in mm of the largest sphere around a grain's centre that lies inside it."""
     return min(grain.semi_axes) if isinstance(grain, Ellipsoid) else float(grain.hull().distances.min())
 
 
@@ -219,12 +219,12 @@ class Cathode(PieceBuilder):
 
     @property
     def inner_radius(self) -> float:
-        """mm, of the can."""
+        """Inner radius of the can in mm."""
         return self.diameter / 2 - self.wall_um * 1e-3
 
     @property
     def bed_height(self) -> float:
-        """mm, of the space for the grains."""
+        """Height of the space for the grains in mm."""
         return self.height - (self.collector_um + self.separator_um) * 1e-3
 
     @property

@@ -257,9 +257,9 @@ def test_frames_behind_a_link_to_another_file_are_refused(tmp_path: Path) -> Non
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "lab.tif", SCAN.counts(), photometric="minisblack")
-    with pytest.raises(DataError, match=r"no HDF5 scan.*ingest"):
+    with pytest.raises(DataError, match=r"lab\.tif.*ingest"):
         archive(tmp_path / "lab.tif", tmp_path / "small.h5")
-    with pytest.raises(DataError, match="not there"):
+    with pytest.raises(DataError, match=r"none\.h5"):
         archive(tmp_path / "none.h5", tmp_path / "small.h5")
 
 

@@ -89,9 +89,9 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),
         (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
-        (["-o", "g.tif", "--window", "0:1"], 2, "give --bits 8"),
+        (["-o", "g.tif", "--window", "0:1"], 2, "needs --bits 8"),
         (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
-        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "no window"),
+        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "not a window"),
         (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
         (["-o", "v.gif"], 2, "--film goes with the suffixes .gif and .mp4"),
         (["-o", "v.tif", "--film", "z"], 2, "--film goes with the suffixes .gif and .mp4"),
@@ -145,7 +145,7 @@ def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None
     )
     (folder / "empty").mkdir()
     assert "empty is a folder without TIFF slices" in beamline("export", "empty", "-o", "w.npy").stderr
-    assert "There is no volume none" in beamline("export", "none", "-o", "w.npy").stderr
+    assert "none does not exist" in beamline("export", "none", "-o", "w.npy").stderr
 
 
 def test_what_is_no_volume_is_refused(volume: Path) -> None:
@@ -156,7 +156,7 @@ def test_what_is_no_volume_is_refused(volume: Path) -> None:
         ("g.tif", "grey values"),
         ("scan.h5", "is a scan"),
         ("empty", "is a folder"),
-        ("none.h5", "no vol"),
+        ("none.h5", "does not exist"),
     ):
         result = beamline("export", name, "-o", "out.nrrd")
         assert (result.exit_code, said in result.stderr) == (5, True), result.output

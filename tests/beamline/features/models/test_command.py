@@ -102,7 +102,7 @@ REFUSED = [
     (("render", "f.h5", "-o", "x.tif"), 2, "views are HDF5"),
     (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "names no angles"),
     (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "names no angles"),
-    (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "is no box"),
+    (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "is not a box"),
     (("export", "f.h5", "-o", "x.ply"), 2, "--gaussians goes with the suffix .ply"),
     (("export", "f.h5", "-o", "x.tif", "--gaussians"), 2, "--gaussians goes with the suffix .ply"),
     (("export", "f.h5", "-o", "x.ply", "--gaussians", "--bits", "8"), 2, "does not go with"),

@@ -113,7 +113,7 @@ def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
     values, folder = np.arange(60, dtype=np.float32).reshape(3, 4, 5), runs / "2026-01-01T000000_a"
     write_volume(folder / "recon.h5", bare_record(folder / "scan.h5", values))
     assert np.array_equal(device.Slice, values[1])
-    with pytest.raises(tango.DevFailed, match="no scan runs"):
+    with pytest.raises(tango.DevFailed, match="no scan is running"):
         device.Abort()
 
 

@@ -50,7 +50,7 @@ def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     shown = np.concatenate((data.shown, data.shown_held_out))
     np.testing.assert_allclose(np.degrees(angles) / 6, shown)  # a view each 6 degrees and second
     assert data.geometry.n_views == 27 and shown.size == 30
-    assert any("states no time" in warning for warning in said)
+    assert any("no times of the views" in warning for warning in said)
     assert "over 29 s" in table.scan["views used"]
     assert [outcome.trial.group for outcome in table.outcomes] == ["method", "parts", "parts", *["one fit"] * 3]
 

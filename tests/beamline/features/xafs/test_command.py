@@ -130,7 +130,7 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
         (["scan.h5", "--region", "0:99,0:1"], 2, "is not in frames of 20 x 24 pixels"),
         (["plain", "--from", "8.3", "--to", "8.4"], 2, "has a material"),
         (["nowhere", "--from", "8.3", "--to", "8.4"], 2, "scene 'nowhere' is unknown"),
-        (["nowhere.h5"], 5, "nowhere.h5 is not there"),
+        (["nowhere.h5"], 5, "nowhere.h5 does not exist"),
         (["mu.csv", "--unit", "eV", "-o", "it.jpg"], 2, "give a .png file"),
         (["mu.csv", "--unit", "eV", "-o", "no/it.png"], 5, "does not exist"),
     ],
@@ -338,7 +338,7 @@ def test_no_map_stays_where_its_picture_cannot_be_written(tmp_path: Path, monkey
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("edge_scan", "--states", "0,2", "--from", "8.32", "--to", "8.38"), "no states of charge"),
+        (("edge_scan", "--states", "0,2", "--from", "8.32", "--to", "8.38"), "expected numbers from 0 to 1"),
         (("mu.csv", "--states", "0,1"), "--states is for scenes"),
         ((".",), "no folder of a series of scans"),
         (("mu.csv", "--least", "0.4"), "--least is for a map"),

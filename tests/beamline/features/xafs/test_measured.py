@@ -251,7 +251,7 @@ def test_other_units_missing_files_and_text_are_refused(tmp_path: Path) -> None:
         file["energy"].attrs["units"] = "nm"
     with pytest.raises(DataError, match="energies are in 'nm', which is neither"), open_measured(path, None, None):
         pass
-    with pytest.raises(DataError, match="is not there"), open_measured(tmp_path / "none.h5", None, None):
+    with pytest.raises(DataError, match=r"none\.h5"), open_measured(tmp_path / "none.h5", None, None):
         pass
     (tmp_path / "mu.csv").write_text("8.3 1\n8.4 one", encoding="utf-8")
     with (

@@ -319,7 +319,7 @@ def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
-    with pytest.raises(NotReadyError, match="is not there"):
+    with pytest.raises(NotReadyError, match="does not exist"):
         open_scan(tmp_path / "soon.h5", follow=True)
     (tmp_path / "soon.h5").write_bytes(b"")
     with pytest.raises(NotReadyError, match="cannot be followed yet"):

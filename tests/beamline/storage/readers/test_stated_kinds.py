@@ -75,7 +75,7 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
         assert source.read(slice(None))[:, 1, 1].tolist() == list(range(10))
         np.testing.assert_allclose(np.degrees(source.angles[5:]), 10.0 * np.arange(5, 10))
         assert source.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
-    with pytest.raises(DataError, match=r"gone\.nxs is not there"):
+    with pytest.raises(DataError, match=r"gone\.nxs does not exist"):
         open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
     with pytest.raises(DataError, match="cannot be followed with --then"):
         open_scan(SourceOptions(paths[0], then=(paths[1],)), follow=True)

@@ -240,7 +240,7 @@ def test_what_is_no_images_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="TIFFs"):
         load_images(tmp_path / "t.txt", FrameKind.DARK)
     tifffile.imwrite(tmp_path / "t.tif", IMAGES, photometric="minisblack")
-    with pytest.raises(DataError, match="is no HDF5 file"):
+    with pytest.raises(DataError, match="not an HDF5 file"):
         load_images(f"{tmp_path / 't.tif'}::/a", FrameKind.DARK)
     with h5py.File(tmp_path / "v.h5", "w") as file:
         drawn = h5py.VirtualLayout(IMAGES.shape, np.uint16)

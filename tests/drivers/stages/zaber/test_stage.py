@@ -170,7 +170,7 @@ def test_a_slip_between_two_moves_is_told_once_by_the_next(flag: str, words: str
     stage.start_move(math.radians(10), SPEED)
     stage.wait(LONG)
     rig.controller.device.axis.disturb(lambda time: 5_000, flag)
-    with pytest.raises(DeviceError, match=rf"since its last move something happened to it: {words} \({flag}\).*15\."):
+    with pytest.raises(DeviceError, match=rf"disturbed since its last move: {words} \({flag}\).*15\."):
         stage.start_move(math.radians(20), SPEED)
     assert rig.controller.device.axis.position(rig.clock.now()) == 15_000
     stage.start_move(math.radians(20), SPEED)

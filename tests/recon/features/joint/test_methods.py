@@ -19,7 +19,7 @@ ONES = np.ones((40, 2, 8), np.float32)
 def test_views_without_matter_are_refused(
     method: recon.TimeSeries | recon.EnergySeries, data: np.ndarray, weights: np.ndarray | None
 ) -> None:
-    with pytest.raises(ValueError, match="hold no matter"):
+    with pytest.raises(ValueError, match="show no matter"):
         recon.reconstruct(data, VIEWS, method, use=DataUse(weights))
 
 

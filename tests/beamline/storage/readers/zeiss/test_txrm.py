@@ -131,7 +131,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         ({"ImageInfo__ImageHeight": np.int32(0)}, r"s\.txrm says that its images have 0 x 40 pixels: it is damaged\."),
         ({"ImageInfo__ImageWidth": np.int32(2**30)}, "4 x 1073741824 pixels: it is damaged"),
         ({"ImageInfo__ImageWidth": None}, "no stream ImageInfo/ImageWidth"),
-        ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged, or not laid out as it should be"),
+        ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged, or its structure"),
         ({"ImageInfo__NoOfImages": np.int32(0)}, "holds no projections"),
         (
             {"ImageInfo__NoOfImages": np.int32(2**31 - 1), "ImageInfo__ImagesTaken": None},
@@ -140,7 +140,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         ({"ImageInfo__AcquisitionMode": np.int32(2)}, "a volume"),
         ({"ImageInfo__MosiacRows": np.int32(2)}, "is a mosaic"),
         ({"Alignment__Y-Shifts": np.full(120, np.nan, "<f4")}, "120 of its views' shifts are no numbers"),
-        ({"ReferenceData__Image": b"1234"}, "damaged, or not laid out as it should be"),
+        ({"ReferenceData__Image": b"1234"}, "damaged, or its structure"),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_a_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
