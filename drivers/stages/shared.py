@@ -14,8 +14,6 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.serial.line import LineRules, Probe, SerialLine
-from drivers.stages.settings import Wiring
 from drivers.stages.travel import Travel
 
 
@@ -71,16 +69,6 @@ class FoundSettings:
         if self._store is not None:
             self._store.clear()
             self._store = None
-
-
-def line_to(wiring: Wiring, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
-    connection: dict[str, Any] = {
-        "timeout": wiring.timeout,
-        "baudrate": wiring.baudrate,
-        "transcript": wiring.transcript,
-    }
-    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **connection)
 
 
 class Stops:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
-from drivers.serial.line import Probe
-from drivers.stages.shared import FoundSettings, line_to, while_it_moves
+from drivers.serial.line import Probe, line_to
+from drivers.stages.shared import FoundSettings, while_it_moves
 from drivers.stages.zaber.packet import (
     INTERRUPTED,
     REASONS,
