@@ -183,7 +183,7 @@ class OutputShutter:
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
-                f"the output {self._output.name} is not at the level that was set",
+                f"{self._output.name} is not at the level that was set",
                 request="high" if level else "low",
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",

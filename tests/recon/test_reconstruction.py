@@ -147,7 +147,7 @@ MODELS = "r2", "r2-published", "naf", "intratomo", "sax-nerf"
 @pytest.mark.parametrize("method", [name for name in names_of_one_volume() if name not in MODELS])
 def test_no_argument_silently_does_nothing(noisy: np.ndarray, method: str) -> None:
     for name, argument in OF_A_FIT.items():
-        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} {OWNERS.get(name, OF_FITS)}"):
+        with pytest.raises(ValueError, match=rf"method '{method}' has no option {name} {OWNERS.get(name, OF_FITS)}"):
             recon.reconstruct(noisy, VIEWS, method, **argument)  # type: ignore[arg-type]
 
 

@@ -80,7 +80,7 @@ def test_a_rehearsal_says_what_the_scan_takes_and_leaves_nothing_if_asked(tmp_pa
     planned = json.loads(CliRunner().invoke(main, [*real, "--dry-run", "--json"]).stdout)["duration"]
     assert f"At the instrument the plan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
     assert "discarded" in done.stdout and not list(tmp_path.iterdir())
-    assert "give --rehearse" in CliRunner().invoke(main, [*real, "--discard"]).stderr
+    assert "--rehearse" in CliRunner().invoke(main, [*real, "--discard"]).stderr
     series = ["--set", "devices.monochromator={kind: manual, range_kev: [5, 30]}", "--set", "scan.energies=[10, 11]"]
     for queue in (real, [*real[:2], *real[1:]]):  # one scan, and two in turn
         done = CliRunner().invoke(main, [*queue, *series, "--rehearse", "--discard"])

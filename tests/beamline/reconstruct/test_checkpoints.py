@@ -175,4 +175,4 @@ def test_a_file_in_the_way_is_refused_before_the_work(tmp_path: Path) -> None:
 def test_a_disk_that_refuses_does_not_end_the_fit(tmp_path: Path) -> None:
     said: list[str] = []
     CheckpointOptions(tmp_path / "no" / "fit.h5").write({}, 0, said.append, {})
-    assert "left out" in said[0]
+    assert "fit.h5 could not be written" in said[0]

@@ -47,7 +47,7 @@ def test_everything_else_is_as_in_the_whole_scan(path: Path) -> None:
 
 @pytest.mark.parametrize("cols", [(0, 6), (5, 6), (3, 3)])
 def test_columns_outside_the_detector_are_refused(path: Path, cols: tuple[int, int]) -> None:
-    with pytest.raises(ConfigError, match="detector's 0:5"):
+    with pytest.raises(ConfigError, match="columns 0:5"):
         open_scan(SourceOptions(path, cols=cols))
 
 

@@ -100,7 +100,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
         ({"angles_path": "/raw/before/one"}, r"is \(4, 6\); expected a list of angles"),
         ({"angles_path": "/note"}, "expected a list of angles"),
-        ({"angles_path": "/motors/plain"}, "has no attribute `units`: say --angles-unit"),
+        ({"angles_path": "/motors/plain"}, "has no attribute `units`: give --angles-unit"),
         ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),
         ({"angles": [0.0] * 5}, "--angles and --angles-path name the same thing twice"),
         ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path name the same thing twice"),

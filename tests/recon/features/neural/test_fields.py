@@ -119,7 +119,7 @@ def test_what_a_field_cannot_do_is_refused() -> None:
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(early_stop=True))
     with pytest.raises(ValueError, match="no matter"):
         recon.reconstruct(np.zeros_like(data), VIEWS["parallel"], recon.NAF())
-    with pytest.raises(ValueError, match=r"'naf' does not take resume"):
+    with pytest.raises(ValueError, match=r"'naf' has no option resume"):
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(), control=RunControl(resume={}))
     with pytest.raises(ValueError, match="'nowhere'"):
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(), device="nowhere")
