@@ -117,7 +117,7 @@ def test_what_a_field_cannot_do_is_refused() -> None:
     _, data = box(VIEWS["parallel"])
     with pytest.raises(ValueError, match="early_stop"):
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(early_stop=True))
-    with pytest.raises(ValueError, match="no matter"):
+    with pytest.raises(ValueError, match="no absorbing matter"):
         recon.reconstruct(np.zeros_like(data), VIEWS["parallel"], recon.NAF())
     with pytest.raises(ValueError, match=r"'naf' has no option resume"):
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(), control=RunControl(resume={}))
