@@ -283,13 +283,7 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    edges = FieldEdges.of(projections.data, geometry)
-    if sides := edges.beyond():
-        warn(cut_sentence(sides))
-        if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
-            warn(change)
-    elif ranges := edges.passing():
-        warn(passing_sentence(ranges, geometry.n_views))
+    _warn_of_the_field(source, selection, projections, geometry, warn)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
@@ -324,6 +318,19 @@ def assemble(
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
     )
+
+
+def _warn_of_the_field(
+    source: ScanSource, selection: Selection, projections: Projections, geometry: Geometry, warn: Warn
+) -> None:
+    """Warn of matter beyond the field of view, and of the ring current where no air corrects it."""
+    edges = FieldEdges.of(projections.data, geometry)
+    if sides := edges.beyond():
+        warn(cut_sentence(sides))
+        if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
+            warn(change)
+    elif ranges := edges.passing():
+        warn(passing_sentence(ranges, geometry.n_views))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

@@ -99,15 +99,13 @@ def run_energies(
 
     Args:
         place: the folder in which the series gets its own; None: the configured one.
-        sinks: get the events of all scans.
-        stop: ends the scan that runs, and with it the series.
+        stop: ends the scan that runs, and with it the series. `sinks`, `ask`: as of `run_scan`, for all scans.
         commands: of the reconstruction of each scan.
         series: the folder of a series that goes on: scans that lack nothing stay, one that ended early goes on.
-        ask: as of `run_scan`.
 
     Raises:
-        ConfigError: a limit is violated at one of the energies; nothing has moved.
-        What `run_scan` raises: the scans before it are complete, and a warning names the folder that can go on.
+        ConfigError: a limit is violated at one of the energies; nothing has moved. What `run_scan` raises: the scans
+            before it are complete, and a warning names the folder that can go on.
     """
     each = at_energies(config)
     with ExitStack() as held:
@@ -124,8 +122,7 @@ def run_energies(
             clock = clock_of(config.simulation.clock, not_before=last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
         folder = series or _new_folder(config, place or Path(config.storage.folder))
-        scans: list[tuple[float, Path]] = []
-        results: list[RunResult] = []
+        scans, results = list[tuple[float, Path]](), list[RunResult]()
         for n, (one, job) in enumerate(zip(each, jobs, strict=True), 1):
             energy = one.scan.energy or 0.0
             if isinstance(job, Path):

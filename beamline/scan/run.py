@@ -86,8 +86,7 @@ def run_scan(
         ask: puts a request to the operator, if the shutter or the sample is moved by hand.
 
     Raises:
-        ConfigError: the plan breaks a limit, or the instrument is not that of the run that goes on; nothing has moved
-            and no folder was made.
+        ConfigError: the plan breaks a limit, or the instrument is another than the run began with; nothing has moved.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
