@@ -179,7 +179,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
     wrong.write_text("kev,fresh\n8.3,1\n")
     for words, said in (
         ([*scans, "--spectra", narrow], "from 8.34 to 8.36 keV"),
-        ([scans[0], "--spectra", spectra(tmp_path)], "do not tell 2 materials apart"),
+        ([scans[0], "--spectra", spectra(tmp_path)], "cannot distinguish 2 materials"),
         ([*scans, "--spectra", wrong], "no table of spectra"),
         ([*scans, "--spectra", tmp_path / "absent.csv"], "no table of spectra"),
     ):
@@ -199,7 +199,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
         ("energy_kev," + 200_000 * "a" + "\n8.3,1\n8.4,2\n", "field larger than"),
         ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "'8.4,1' are not 3 numbers"),
         ("\n", "no table of spectra"),
-        ("energy_kev,a,b\n8.3,0,0\n8.4,0,0\n", "do not tell 2 materials apart"),
+        ("energy_kev,a,b\n8.3,0,0\n8.4,0,0\n", "cannot distinguish 2 materials"),
     ],
 )
 def test_a_hostile_table_is_refused(scans: list[Path], tmp_path: Path, table: str, said: str) -> None:
