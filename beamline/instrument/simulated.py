@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from uuid import uuid4
 
@@ -77,7 +78,6 @@ def simulated_devices(
     Raises:
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
-
     scene = scene_of(config)
     line = TriggerLine(clock)
     wanted = config.devices.shutter
@@ -89,8 +89,7 @@ def simulated_devices(
     if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
         number, output = wanted.output, stage.digital_output(wanted.output)
         shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
-        open_high = wanted.open_high
-        beam_is_on = lambda: controller.output_is_high(number) is open_high  # noqa: E731
+        beam_is_on = partial(_is_at_level, controller, number, wanted.open_high)
     sample: SampleMover
     sample = simulated = SimulatedSampleMover()
     sample_is_in = simulated.is_in
@@ -98,8 +97,7 @@ def simulated_devices(
         axis = TriggerLine(clock)
         sample = motor = mover.connect(clock, _wire("sample_mover.stage", mover.stage, clock, axis)[1])
         opened.callback(motor.close)
-        inside = math.radians(mover.in_deg)
-        sample_is_in = lambda: abs(axis.angle_at(clock.now()) - inside) < IN_PLACE  # noqa: E731
+        sample_is_in = partial(_stands_at, axis, clock, math.radians(mover.in_deg))
     changer: Filter | None = None
     if isinstance(wheel := config.devices.filter, MotorFilter):
         changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
@@ -120,12 +118,19 @@ def simulated_devices(
     return Devices(stage, camera, shutter, sample, changer, monochromator), known
 
 
+def _is_at_level(controller: Controller, output: int, high: bool) -> bool:
+    return controller.output_is_high(output) is high
+
+
+def _stands_at(axis: TriggerLine, clock: Clock, angle: float) -> bool:
+    return abs(axis.angle_at(clock.now()) - angle) < IN_PLACE
+
+
 def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
     """A simulated controller that turns `axis`, and its port. Two in one process must not share one.
 
     ConfigError: it lacks what the section of the device asks for.
     """
-
     try:
         controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
     except ValueError as error:
@@ -142,7 +147,6 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     Raises:
         ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
     """
-
     stated_scene = config.simulation.scene if config.simulation else {}
     # Paths in a scene that stands in the configuration itself are full ones by now.
     folder = config_folder() if isinstance(stated_scene, dict) else (config_folder() / stated_scene).parent
@@ -202,7 +206,6 @@ def _rehearse(camera: SimulatedOrcaQuest) -> None:
 def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
     """The simulation's clock: real, virtual or faster. The last two start at `not_before` (s since the Unix epoch) or
     later."""
-
     if isinstance(kind, Speed):
         return ScaledClock(SystemClock(), kind.speed, not_before)
     return VirtualClock(max(VIRTUAL_START, not_before)) if kind == "virtual" else SystemClock()
@@ -222,7 +225,6 @@ def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
 
 def simulated_beam_monitor(name: str, config: BeamMonitorSection, clock: Clock) -> str:
     """The URL of the simulated counterpart with this name, which shows a constant intensity."""
-
     modules = in_folders("simulators.wires", "BEAM_MONITORS")
     wire = import_module(modules[name]).matching(config, clock)
     return register(f"{name}-{uuid4().hex}", wire)

@@ -23,7 +23,7 @@ from recon.base.arrays import median_deviation
 
 SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
-SAMPLED = 5  # cells, of which one is enough for a spread
+SAMPLED = 5  # every fifth cell is enough to estimate a spread
 LEAST_VARYING = 0.1  # share of a shift's change that must differ from row to row
 MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not known
 
@@ -142,7 +142,7 @@ def _fit(basis: CellValues, change: CellValues, weight: CellValues) -> tuple[NDA
     return np.asarray(solution, np.float64), np.asarray(np.diag(np.linalg.inv(normal)).clip(0), np.float64)
 
 
-CALIBRATION = 12  # figures before the scatter means anything
+CALIBRATION = 12  # first figures, from which their scatter is estimated
 MEMORY = 0.02  # weight of the newest figure
 NORMAL = 1.2533  # standard deviation of a normal distribution over its mean absolute deviation: sqrt(pi / 2)
 OUTLIER = 4.0  # mean absolute deviations that a single figure may add

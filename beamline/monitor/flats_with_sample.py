@@ -209,8 +209,8 @@ def with_sample(
 
 
 def _like_a_view(image: Places, others: Sequence[Places], views: Sequence[Places]) -> tuple[float, float, int] | None:
-    """By how much a flat differs from the most similar of other flats, and from the most similar view, and which that
-    is; None: it is none of a view."""
+    """How much a flat differs from the most similar other flat and from the most similar view, and the number of that
+    view; None if the flat does not show the sample."""
     if not others:
         return None
     lit = lit_places(np.maximum.reduce([image, *others]))

@@ -110,7 +110,7 @@ class ShownScan:
         """The mean [row, col] of the views that were read so far, or of the first flats or darks.
 
         Raises:
-            DataError: there are none.
+            DataError: the scan has no frames of this kind.
         """
         if (mean := self._means().get(kind)) is None:
             raise DataError(f"There are no {kind} to average.")

@@ -256,7 +256,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
         unknown: lines may hold nan, as the log of a scan has it for darks and flats.
 
     Raises:
-        ValueError: a line holds no finite number, or there is none; it names the line.
+        ValueError: a line is not a finite number (the message names it), or the file has no line.
     """
     degrees = []
     for number, line in enumerate(text.splitlines(), start=1):

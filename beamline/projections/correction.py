@@ -153,7 +153,7 @@ class ScanCorrection:
         return replace(merge_and_empty(kept, out[:at]), masked=masked)
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
-        """Line integrals of the next frames; None if there are none yet, since the newest view waits for its successor.
+        """Line integrals of the next frames; None while none is ready: the newest view waits for its successor.
 
         Args:
             frames: rows of the file, those after the frames fed before; may be none where `last`.

@@ -37,7 +37,7 @@ _LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least a
 
 @dataclass(frozen=True, eq=False)
 class OpenBeam:
-    """The open beam by which the views of a scan of counts are divided.
+    """The open beam that divides the views of a scan in counts.
 
     Attributes:
         references: of the detector rows that are read, binned.

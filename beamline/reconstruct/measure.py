@@ -85,8 +85,8 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a reference, without their rims, to assess volumes of the same sample; None if there
-    are none.
+    """Dense and empty regions of a reference, without their rims, to assess volumes of the same sample; None if it has
+    no such regions.
 
     They are those of `metrics.sampled` of the volume.
     """

@@ -1,4 +1,4 @@
-"""Run: a method on prepared views, the one call by which every command makes a volume; its time and its error bars."""
+"""Run a method on prepared views, as every command does that makes a volume; its time and its error bars."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def newest(folder: Path) -> Path:
-    """The running scan of a folder, or else its newest run. Raises ConfigError if there is none."""
+    """The folder of the scan that is running, else of the newest run. Raises ConfigError if there is no run."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
         raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")

@@ -64,7 +64,7 @@ def labels_path(scan: Path) -> Path:
 
 
 def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None:
-    """Write the labels, even if there are none. The file is complete or absent.
+    """Write the labels; a scan without anomalies gets an empty list. The file is complete or absent.
 
     Raises:
         DataError: `path` exists or cannot be written.
@@ -82,7 +82,6 @@ def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None
 
 def volumes_beside(folder: Path) -> ReadVolume:
     """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
-
     from simulators.samples.sample import Stored
 
     meshes = in_folders("beamline.storage", "MESHES")

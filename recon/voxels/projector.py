@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.declared_types import check_settings
-from recon.base.geometry import Geometry, require_views
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume, bands_of
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
@@ -256,24 +256,6 @@ projection_images = projection_lines
 def project(volume: Volume, geometry: Geometry) -> F32:
     """Line integrals [view, row, col] of a volume; see `Projector`."""
     return Projector(geometry, volume.grid).forward(volume.data)
-
-
-def residual_norms(
-    volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
-) -> tuple[float, float]:
-    """||A x - p|| and ||p||: their ratio is the share of the line integrals [view, row, col] that the volume leaves.
-
-    Args:
-        weights: of the rays; None: equal weights. Rays of weight 0 do not count.
-
-    Raises:
-        ValueError: `projections` do not fit the geometry.
-    """
-    require_views(geometry, projections)
-    root = np.float32(1) if weights is None else np.sqrt(weights)
-    known = projections if weights is None else np.where(weights > 0, projections, np.float32(0))
-    left = float(np.linalg.norm(root * (project(volume, geometry) - known)))
-    return left, float(np.linalg.norm(root * known))
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import torch
 
 from recon.base.arrays import F32
@@ -13,7 +14,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.optimise import FitState, step
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import FitSettings
-from recon.voxels.projector import residual_norms
+from recon.voxels.projector import project
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
@@ -61,6 +62,11 @@ def run_steps(
 
 
 def data_residual(volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None = None) -> float:
-    """||A x - p|| / ||p||: the share of the line integrals [view, row, col] that the volume does not explain."""
-    left, scale = residual_norms(volume, projections, geometry, weights)
-    return left / scale
+    """||A x - p|| / ||p||: the share of the line integrals [view, row, col] that the volume does not explain.
+
+    Args:
+        weights: of the rays; None: equal weights. Rays of weight 0 do not count.
+    """
+    root = np.float32(1) if weights is None else np.sqrt(weights)
+    known = projections if weights is None else np.where(weights > 0, projections, np.float32(0))
+    return float(np.linalg.norm(root * (project(volume, geometry) - known)) / np.linalg.norm(root * known))

@@ -53,7 +53,7 @@ class DosePlan:
     period: float
     light: float
     frames_per_view: int = 1
-    start: float = 0.0  # views, by which the first one is displaced
+    start: float = 0.0  # offset of the first view, in steps between views
 
 
 def plans_of(views: int, exposure: float, period: float) -> list[DosePlan]:

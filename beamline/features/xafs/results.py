@@ -42,7 +42,6 @@ class XafsResult:
     @property
     def tabulated(self) -> str:
         """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
-
         low, high = (float(end) for end in self.curve.energies[[0, -1]])
         return edge_sentence(self.material, self.elements, low, high, self.edge.energy)
 
