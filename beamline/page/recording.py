@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.structure import require_inside
 from beamline.storage.writers import layout
@@ -77,20 +77,20 @@ class Recording:
         if n:
             hdf5.look_again(times)
         newest = _json_number(times[n - 1]) if n else None
-        return ScanProgress(n, hdf5.text_of(status) if finished[()] else "running", newest)
+        return ScanProgress(n, datasets.text_of(status) if finished[()] else "running", newest)
 
     def facts(self) -> dict[str, Any]:
         """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
-        pixel = hdf5.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", hdf5.LENGTH_UNITS)
-        axis = hdf5.dataset(self._file, layout.AXIS_COL)
+        pixel = datasets.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", datasets.LENGTH_UNITS)
+        axis = datasets.dataset(self._file, layout.AXIS_COL)
         return {
-            "sample": hdf5.text_at(self._file, "/entry/sample/name"),
-            "title": hdf5.text_at(self._file, "/entry/title"),
+            "sample": datasets.text_at(self._file, "/entry/sample/name"),
+            "title": datasets.text_at(self._file, "/entry/title"),
             "shape": self.shape,
             "preview_bin": self.preview_bin,
             "pixel_mm": pixel,
             "axis_col": None if axis is None else _json_number(axis[()]),
-            "monitored": hdf5.text_at(self._file, "/entry/record/plan") not in ("", "{}"),
+            "monitored": datasets.text_at(self._file, "/entry/record/plan") not in ("", "{}"),
             "checks": [
                 {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(self._file)
             ],

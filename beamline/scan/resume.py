@@ -20,7 +20,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.parts import (
     JOINED,
     end_references_missing,
@@ -212,7 +212,7 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
         raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
     devices = stored["/entry/instrument/devices"]
     for device, description in ready.info.devices.items():
-        group = hdf5.resolve(devices, device.replace("/", "_")) or {}
+        group = datasets.resolve(devices, device.replace("/", "_")) or {}
         before, now = _identity({key: group[key][()] for key in group}), _identity(description)
         if before != now:
             raise ConfigError(
@@ -230,8 +230,8 @@ def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
             with hdf5.open_hdf5(path) as stored:
                 devices = stored["/entry/instrument/devices"]
                 for device, description in ready.info.devices.items():
-                    group = hdf5.resolve(devices, device.replace("/", "_")) or {}
-                    earlier = {key: hdf5.text(group[key][()]) for key in group}
+                    group = datasets.resolve(devices, device.replace("/", "_")) or {}
+                    earlier = {key: datasets.text(group[key][()]) for key in group}
                     before, now = _identity(earlier), _identity(description)
                     if "port" in description and earlier.get("port") == description["port"] and before != now:
                         differing.append(
@@ -243,7 +243,7 @@ def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
 
 
 def _identity(said: Mapping[str, Any]) -> dict[str, str]:
-    return {key: hdf5.text(said[key]) for key in _IDENTITY if key in said}
+    return {key: datasets.text(said[key]) for key in _IDENTITY if key in said}
 
 
 def _words(identity: Mapping[str, str]) -> str:

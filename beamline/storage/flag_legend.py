@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, ALARMS, CHECKS, bitmask
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 
 FLAGS = "/entry/frame_log/flags"
 SCORES = "/entry/frame_log/flag_scores"
@@ -211,11 +211,11 @@ def write_legend(file: h5py.File) -> None:
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
     """The legend of a scan file. Raises ValueError for impossible bits."""
     items = [file[f"{LEGEND}/{name}"] for name in ("name", "bit", "unit", "meaning")]
-    if any(map(hdf5.is_foreign, items)):
+    if any(map(datasets.is_foreign, items)):
         raise ValueError(f"{LEGEND} lies in another file")
-    columns = (hdf5.values_of(item) for item in items)
+    columns = (datasets.values_of(item) for item in items)
     legend = tuple(
-        FlagBit(hdf5.text(name), int(bit), hdf5.text(unit), hdf5.text(meaning))
+        FlagBit(datasets.text(name), int(bit), datasets.text(unit), datasets.text(meaning))
         for name, bit, unit, meaning in zip(*columns, strict=True)
     )
     bits = [entry.bit for entry in legend]

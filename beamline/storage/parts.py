@@ -24,7 +24,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import add_exchange_view, ending_in, state_ending
@@ -222,13 +222,13 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
     if layout.PARTS not in joined:
         return "it does not say what its parts are"
     names, frames, digests = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames", "digest"))
-    parts = [folder / hdf5.text(name) for name in names]
+    parts = [folder / datasets.text(name) for name in names]
     for part, n, digest in zip(parts, frames, digests, strict=True):
         if not part.is_file():
             return f"its part {part} is not there"
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             committed = int(file[layout.COMMITTED][()])
-            if committed != n or _digest(file) != hdf5.text(digest):
+            if committed != n or _digest(file) != datasets.text(digest):
                 return f"its part {part} has {committed} frames that are not the {n} which it was made of"
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
     return f"it lacks those of {others[0]}" if others else ""
@@ -258,7 +258,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         virtual = h5py.VirtualLayout((firsts[-1], *item.shape[1:]), item.dtype)
         for file, name, first, n in zip(files, names, firsts[:-1], rows, strict=True):
             virtual[first : first + n] = h5py.VirtualSource(name, path, file[path].shape)[:n]
-        hdf5.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
+        datasets.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
     for path, item in _links(files[0]):
         joined[path] = joined[item]
     del joined[layout.END_TIME]
@@ -280,7 +280,7 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
         item = file[path]
         maxshape, chunks = (None, *item.shape[1:]), (1, *item.shape[1:])
         made = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
-        hdf5.copy_attributes(item, made)
+        datasets.copy_attributes(item, made)
         for row in range(n):
             made[row] = item[row]
             target.require_taken()
@@ -303,7 +303,7 @@ def _name_parts(files: Sequence[h5py.File], names: Sequence[str], rows: Sequence
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
     """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
-    hdf5.copy_attributes(source, target)
+    datasets.copy_attributes(source, target)
     for name, item in source.items():
         path = f"{source.name.rstrip('/')}/{name}"
         if path in _MADE_ANEW or path in _VIRTUAL or _target(item) not in ("", path):
@@ -311,7 +311,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)
         elif path in values:
-            hdf5.copy_attributes(item, target.create_dataset(name, data=values[path]))
+            datasets.copy_attributes(item, target.create_dataset(name, data=values[path]))
         else:
             source.copy(name, target)
 
@@ -323,7 +323,7 @@ def _links(file: h5py.File) -> list[tuple[str, str]]:
 
 
 def _target(item: h5py.HLObject) -> str:
-    return hdf5.attribute(item, "target")
+    return datasets.attribute(item, "target")
 
 
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:

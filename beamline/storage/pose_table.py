@@ -16,7 +16,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
 from beamline.core.text import csv_text
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.readers.nexus import choose, find
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -206,7 +206,7 @@ def _of_vectors(path: Path, by: Key, keys: F64, vectors: F64, *, cone: bool) -> 
 
 def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        if ways is not None or hdf5.text_at(file, "entry/definition") != "NXtomoproc":
+        if ways is not None or datasets.text_at(file, "entry/definition") != "NXtomoproc":
             return _of_nexus(path, file, ways)
     with opened_reconstruction(path) as record:
         return _of_volume(path, record)
@@ -238,19 +238,19 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
     """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
     places = choose(file, find(file))
-    keys = np.ravel(hdf5.values_of(places.image_key))
+    keys = np.ravel(datasets.values_of(places.image_key))
     shown = keys == FrameKind.PROJECTION
     moved: dict[str, F64] = {}
     for axis in "xyz":
-        item = hdf5.dataset(places.entry, f"sample/{axis}_translation")
+        item = datasets.dataset(places.entry, f"sample/{axis}_translation")
         if item is None:
             continue
-        hdf5.require_real(item.dtype, f"{item.name} in {path}")
-        unit = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
-        values = np.ravel(np.asarray(hdf5.values_of(item), np.float64))
+        datasets.require_real(item.dtype, f"{item.name} in {path}")
+        unit = datasets.LENGTH_UNITS.get(datasets.attribute(item, "units").lower())
+        values = np.ravel(np.asarray(datasets.values_of(item), np.float64))
         if unit is None or values.size not in (1, keys.size):
             raise _NoPosesError(
-                f"{path}: {item.name} has {values.size} values in the units {hdf5.attribute(item, 'units')!r}; "
+                f"{path}: {item.name} has {values.size} values in the units {datasets.attribute(item, 'units')!r}; "
                 f"expected one for each of {keys.size} frames, in a unit of length"
             )
         values = np.broadcast_to(values * unit, keys.shape)

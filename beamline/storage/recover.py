@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.overlay import Overlay, PartlyChangedError
 from beamline.storage.parts import copy_rows, gaps_in, require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
@@ -348,7 +348,7 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
     image, damaged = np.empty((1, *data.shape[1:]), data.dtype), []
     for row in range(first, len(data)):
         try:
-            hdf5.read_frames(data, np.array([row]), slice(None), image)
+            datasets.read_frames(data, np.array([row]), slice(None), image)
             whole = has_checksum(image[0], int(checksums[row]))
         except DataError:
             whole = False

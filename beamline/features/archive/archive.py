@@ -23,7 +23,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import run_of, whole_file
 from beamline.core.text import count, spans
 from beamline.monitor.digest import checksum_of, has_checksum
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.parts import joined_file_of, other_parts, to_join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.scan import altered_sentence
@@ -90,8 +90,8 @@ def archive(
     if altered and not keep_damaged:
         raise DataError(f"{damage} To archive what there is: --keep-damaged. Nothing was written.")
     with whole_file(out) as partial, hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):
-        datasets = _image_datasets(raw)
-        count_image = _counter(progress, 2 * sum(dataset.nbytes for dataset in datasets))
+        images = _image_datasets(raw)
+        count_image = _counter(progress, 2 * sum(image.nbytes for image in images))
         try:
             with hdf5.created(partial, layout.LIBVER) as file:
                 copy = _CompressedCopy(codec, count_image, file.require_taken)
@@ -106,7 +106,7 @@ def archive(
                 f"{out} does not give back what was written: {differs} differs. The disk, or the memory, is faulty. "
                 f"Nothing is left of it, and {scan} is untouched."
             )
-        parts = (scan.parent / name for dataset in datasets for name in _drawn_from(dataset))
+        parts = (scan.parent / name for image in images for name in _drawn_from(image))
         sources = tuple(dict.fromkeys((scan, *parts)))
         raw_bytes, compared = sum(path.stat().st_size for path in sources), partial.stat()
     if out.is_symlink() or not _is_compared(out, compared, scan, copy.checksums):
@@ -243,7 +243,7 @@ class _CompressedCopy:
     def group(self, source: h5py.Group, target: h5py.Group) -> None:
         """Copy a group; an object with several names in the raw file keeps them in the copy."""
         self._paths[_place(source)] = target.name
-        hdf5.copy_attributes(source, target)
+        datasets.copy_attributes(source, target)
         for name in source:
             link = source.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
@@ -266,7 +266,7 @@ class _CompressedCopy:
             name, source.shape, source.dtype, chunks=(1, *source.shape[1:]), maxshape=source.maxshape,
             fillvalue=source.fillvalue, **self._codec,
         )  # fmt: skip
-        hdf5.copy_attributes(source, made)
+        datasets.copy_attributes(source, made)
         stored = _stored_checksums(source)
         checksums = self.checksums[source.name] = []
         for row, image in enumerate(_images(source)):
@@ -286,7 +286,7 @@ def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
     """
     names: list[str] = []
     raw.visit_links(names.append)  # an error within a visit would end h5py
-    datasets: dict[_Place, h5py.Dataset] = {}
+    images: dict[_Place, h5py.Dataset] = {}
     for name in ("/", *names):
         link = raw.get(name, getlink=True) if name != "/" else None
         item = raw[name] if link is None or isinstance(link, h5py.HardLink) else None
@@ -296,15 +296,15 @@ def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
                 "Keep the raw file. Nothing was written."
             )
         if item is not None and _is_image_dataset(item):
-            if lost := hdf5.missing_links(item):
+            if lost := datasets.missing_links(item):
                 raise DataError(f"{raw.filename} draws its frames from {lost[0]}, which is not there or differs.")
-            datasets[_place(item)] = item
+            images[_place(item)] = item
         elif others := [link.filename] if isinstance(link, h5py.ExternalLink) else _kept_in(item):
             raise DataError(
                 f"{raw.filename} draws {name} from {others[0]} by a link; an archive would still need that file. "
                 "`beamline ingest` makes one file of both. Nothing was written."
             )
-    return [*datasets.values()]
+    return [*images.values()]
 
 
 def _is_image_dataset(item: h5py.HLObject) -> bool:
@@ -346,7 +346,7 @@ def _images(dataset: h5py.Dataset) -> Iterator[NDArray[Any]]:
     """Each image, in memory that the next one takes."""
     image = np.empty((1, *dataset.shape[1:]), dataset.dtype)
     for row in range(len(dataset)):
-        hdf5.read_frames(dataset, np.array([row]), slice(None), image)
+        datasets.read_frames(dataset, np.array([row]), slice(None), image)
         yield image[0]
 
 

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.readers.nexus import Places, find
 from beamline.storage.rules.finding import Finding
 from beamline.storage.writers import layout
@@ -33,12 +33,12 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
 
 def definition_stated(places: Places) -> Iterator[Finding]:
     """The entry states that it is an NXtomo, whose data are detector counts (NX_INT)."""
-    definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+    definition = datasets.text_at(places.entry, "definition") or datasets.attribute(places.entry, "definition")
     if definition == layout.FLOAT_DEFINITION:
         yield Finding("info", "definition", f"{definition}: float frames in NXtomo's places, on purpose not an NXtomo.")
     elif definition != layout.NXTOMO:
         yield Finding("warning", "definition", f"{places.entry.name}/definition is {definition!r}, expected 'NXtomo'.")
-    if places.data.dtype.kind not in "iu" and hdf5.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION:
+    if places.data.dtype.kind not in "iu" and datasets.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION:
         message = f"Frames are {places.data.dtype}; NXtomo demands integers, as the camera counted."
         yield Finding("error", "integer-frames", message)
 
@@ -46,7 +46,7 @@ def definition_stated(places: Places) -> Iterator[Finding]:
 def lengths(places: Places) -> Iterator[Finding]:
     """There is one image key and one angle for each frame."""
     for name in ("image_key", "image_key_control"):
-        key = hdf5.dataset(places.detector, name)
+        key = datasets.dataset(places.detector, name)
         if key is not None and key.size != places.data.shape[0]:
             yield Finding("error", "key-length", f"{name} has {key.size} entries for {places.data.shape[0]} frames.")
     if places.angle is not None and places.angle.size != places.data.shape[0]:
@@ -56,8 +56,8 @@ def lengths(places: Places) -> Iterator[Finding]:
 def key_codes(places: Places) -> Iterator[Finding]:
     """Image keys are 0 projection, 1 flat, 2 dark, 3 invalid; -1 (alignment) only in image_key_control."""
     for name, legal in (("image_key", {0, 1, 2, 3}), ("image_key_control", {-1, 0, 1, 2, 3})):
-        key = hdf5.dataset(places.detector, name)
-        wrong = set() if key is None else set(np.unique(hdf5.values_of(key)).tolist()) - legal
+        key = datasets.dataset(places.detector, name)
+        wrong = set() if key is None else set(np.unique(datasets.values_of(key)).tolist()) - legal
         if wrong:
             yield Finding("error", "key-codes", f"{name} holds {sorted(wrong)}; legal are {sorted(legal)}.")
 
@@ -65,46 +65,46 @@ def key_codes(places: Places) -> Iterator[Finding]:
 def angle_units(places: Places) -> Iterator[Finding]:
     """Angles have a unit: readers differ in their default."""
     if places.angle is not None:
-        unit = hdf5.attribute(places.angle, "units")
-        if unit.lower() not in hdf5.ANGLE_UNITS:
+        unit = datasets.attribute(places.angle, "units")
+        if unit.lower() not in datasets.ANGLE_UNITS:
             units = f"the units {unit!r}" if unit else "no units attribute"
             yield Finding("error", "angle-units", f"{places.angle.name} has {units}; expected degree or rad.")
 
 
 def links_targeted(places: Places) -> Iterator[Finding]:
     """NXdata links to the three datasets that NXtomo requires, and @target names their paths."""
-    nxdata = hdf5.resolve(places.entry, "data")
+    nxdata = datasets.resolve(places.entry, "data")
     if not isinstance(nxdata, h5py.Group):
         yield Finding("warning", "links", f"{places.entry.name}/data (NXdata) is not there: viewers find no plot.")
         return
     for name, original in (("data", places.data), ("image_key", places.image_key), ("rotation_angle", places.angle)):
         if original is None:
             continue
-        linked = hdf5.dataset(nxdata, name)
-        target = hdf5.attribute(original, "target")
+        linked = datasets.dataset(nxdata, name)
+        target = datasets.attribute(original, "target")
         if linked is None:
             yield Finding("warning", "links", f"{nxdata.name}/{name} is not there.")
         elif linked != original:
             yield Finding("warning", "links", f"{nxdata.name}/{name} is another dataset than {original.name}.")
         elif not target:
             yield Finding("warning", "links", f"{original.name} has no @target: strict readers refuse the link to it.")
-        elif hdf5.dataset(places.entry, target) != original:
+        elif datasets.dataset(places.entry, target) != original:
             yield Finding("warning", "links", f"@target of {original.name} names {target!r}, which is something else.")
 
 
 def axis_order(places: Places) -> Iterator[Finding]:
     """NXdata's axes are rotation_angle, then rows and columns as float positions."""
-    nxdata = hdf5.resolve(places.entry, "data")
+    nxdata = datasets.resolve(places.entry, "data")
     if not isinstance(nxdata, h5py.Group) or "axes" not in nxdata.attrs:
         if isinstance(nxdata, h5py.Group):
             yield Finding("warning", "axes", f"{nxdata.name} has no axes attribute.")
         return
-    axes = [hdf5.text(axis) for axis in np.ravel(nxdata.attrs["axes"])]
+    axes = [datasets.text(axis) for axis in np.ravel(nxdata.attrs["axes"])]
     if len(axes) != 3 or axes[0] != "rotation_angle":
         yield Finding("warning", "axes", f"axes are {axes}; expected rotation_angle, then rows, then columns.")
         return
     for axis, n in zip(axes, places.data.shape, strict=True):
-        item = hdf5.dataset(nxdata, axis)
+        item = datasets.dataset(nxdata, axis)
         if item is None or item.dtype.kind != "f" or item.size != n:
             yield Finding("warning", "axes", f"axis {axis!r} of {nxdata.name} is no float dataset of {n} numbers.")
 
@@ -112,7 +112,7 @@ def axis_order(places: Places) -> Iterator[Finding]:
 def names_stated(places: Places) -> Iterator[Finding]:
     """Sample name and title are present, as validators and people expect."""
     for where in ("sample/name", "title"):
-        if not hdf5.text_at(places.entry, where):
+        if not datasets.text_at(places.entry, where):
             yield Finding("warning", "names", f"{places.entry.name}/{where} is empty or not there.")
 
 
@@ -120,7 +120,7 @@ def iso_times(places: Places) -> Iterator[Finding]:
     """start_time and end_time are ISO 8601 and in order."""
     times = []
     for name in ("start_time", "end_time"):
-        text = hdf5.text_at(places.entry, name)
+        text = datasets.text_at(places.entry, name)
         if not text:
             continue
         try:
@@ -149,7 +149,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     another part of a joined file. Not always at 0, for the first frame may be lost.
     """
     stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
-    key = np.ravel(hdf5.values_of(places.image_key))[: stamps.size]
+    key = np.ravel(datasets.values_of(places.image_key))[: stamps.size]
     if stamps.size < 2 or key.size < stamps.size or triggers.size != stamps.size or (stamps < 0).any():
         return
     steps = np.diff(stamps)
@@ -223,6 +223,6 @@ RULES: tuple[Rule, ...] = (
 
 
 def _column(places: Places, path: str) -> NDArray[Any]:
-    item = hdf5.dataset(places.entry, path)
-    values = np.empty(0) if item is None else np.ravel(hdf5.values_of(item))
+    item = datasets.dataset(places.entry, path)
+    values = np.empty(0) if item is None else np.ravel(datasets.values_of(item))
     return values.astype(np.float64)

@@ -18,8 +18,8 @@ from beamline.core.files import text_in
 from beamline.core.flag import PixelBox
 from beamline.features.xafs.contrast import ContrastRegions, XafsCurve
 from beamline.features.xafs.series import EVERYTHING, FramePart, Radiographs, Series, line_integrals
-from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
+from beamline.storage import datasets, hdf5
+from beamline.storage.datasets import require_real
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
@@ -251,7 +251,7 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
 
 def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
     item = _needed(path, file, "energy")
-    if unit is None and (stated := hdf5.attribute(item, "units").lower()):
+    if unit is None and (stated := datasets.attribute(item, "units").lower()):
         unit = {"kev": "keV", "ev": "eV"}.get(stated)
         if unit is None:
             raise DataError(f"{path}: energies are in {stated!r}, which is neither keV nor eV; give --unit.")
@@ -267,10 +267,10 @@ def _darks(path: Path, file: h5py.File, shape: tuple[int, ...]) -> h5py.Dataset 
 
 def _numbers(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
     """A dataset of numbers; None where no dataset has that name."""
-    item = hdf5.dataset(file, name)
+    item = datasets.dataset(file, name)
     if item is not None:
         require_real(item.dtype, f"{path}: {name}")
-        if missing := hdf5.missing_links(item):
+        if missing := datasets.missing_links(item):
             raise DataError(f"{path}: {name} is in {missing[0]}, which is not there.")
     return item
 

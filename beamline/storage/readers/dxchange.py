@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource, TurnedFrames, dimensions
@@ -45,12 +45,12 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
-            hdf5.refuse_broken(file, where)
-        datasets = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
+            datasets.refuse_broken(file, where)
+        items = ((kind, where, datasets.dataset(file, where)) for kind, where in PLACES)
         order = _order(file["exchange/data"])
         stacks = [
             FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
-            for kind, where, item in datasets
+            for kind, where, item in items
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
@@ -59,7 +59,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             source.angles[-n_views:] = _theta(file, n_views)
         source.take_order(_thetas(file, stacks))
         _set_exposures(source, file)
-        units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
+        units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
         source.not_used = not_copied(file, TEXTS.values()) + stated_in(EXCHANGE, file, source)
@@ -109,10 +109,10 @@ def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> list[NDArray[np.fl
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     """Radians of each of so many frames; None where the file has no such list."""
-    item = hdf5.dataset(file, where)
+    item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
-    angles = hdf5.radians(item, default="degrees")
+    angles = datasets.radians(item, default="degrees")
     return angles if np.isfinite(angles).all() else None
 
 
@@ -124,7 +124,7 @@ def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
         return
     source.exposures[views] = seconds
     source.exposures[~views] = seconds[0] if seconds.size == 1 else np.nan
-    how = hdf5.dataset(file, f"{_FLATS}/different_flat_exposure")
+    how = datasets.dataset(file, f"{_FLATS}/different_flat_exposure")
     of_flats = _seconds(file, f"{_FLATS}/flat_exposure_time", 1)
     if of_flats is not None and how is not None and _words(how).lower().startswith("different"):
         source.exposures[source.image_key == FrameKind.FLAT] = of_flats
@@ -132,23 +132,23 @@ def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
 
 def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     """Positive times, one or so many; None where the file has no such, or in an unknown unit."""
-    item = hdf5.dataset(file, where)
-    values = None if item is None or item.size not in (1, n) else hdf5.in_units(item, EXCHANGE_TIME_UNITS)
+    item = datasets.dataset(file, where)
+    values = None if item is None or item.size not in (1, n) else datasets.in_units(item, EXCHANGE_TIME_UNITS)
     return values if values is not None and (values > 0).all() else None
 
 
 def _words(item: h5py.Dataset) -> str:
     """A text, also where an area detector writes its characters as numbers."""
-    values = np.ravel(hdf5.values_of(item))
+    values = np.ravel(datasets.values_of(item))
     return (
         values.astype(np.uint8).tobytes().decode("ascii", "replace").strip("\0 ")
         if values.dtype.kind in "ui"
-        else (hdf5.text_of(item))
+        else (datasets.text_of(item))
     )
 
 
 def _axes(item: h5py.Dataset) -> list[str]:
-    return [axis for part in np.ravel(item.attrs.get("axes", ())) for axis in hdf5.text(part).split(":")]
+    return [axis for part in np.ravel(item.attrs.get("axes", ())) for axis in datasets.text(part).split(":")]
 
 
 def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
@@ -159,8 +159,8 @@ def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
 def _in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
     if order == _USUAL or item.ndim != 3:
         return item
-    hdf5.require_possible(item)
-    if lost := hdf5.missing_links(item):
+    datasets.require_possible(item)
+    if lost := datasets.missing_links(item):
         raise DataError(f"{item.file.filename} draws its frames from {lost[0]}, which is not there or differs.")
     return TurnedFrames(item, order)
 
@@ -185,28 +185,28 @@ def _measured(
     source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
 ) -> float | None:
     """A positive number. One without a unit counts in the SI's, as the format says, if it then lies in a range."""
-    value, item = _positive(file, where, units), hdf5.dataset(file, where)
-    if value is None or item is None or hdf5.attribute(item, "units") or range[0] <= value <= range[1]:
+    value, item = _positive(file, where, units), datasets.dataset(file, where)
+    if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    number = f"{np.ravel(hdf5.first_of(item))[0]:.6g}"
+    number = f"{np.ravel(datasets.first_of(item))[0]:.6g}"
     source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 
 
 def _positive(file: h5py.File, where: str, units: Mapping[str, float]) -> float | None:
-    value = hdf5.scalar(file, where, units)
+    value = datasets.scalar(file, where, units)
     return value if value is not None and value > 0 else None
 
 
 def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
-    theta = hdf5.dataset(file, "exchange/theta")
+    theta = datasets.dataset(file, "exchange/theta")
     if theta is None:
-        hdf5.refuse_broken(file, "exchange/theta")
+        datasets.refuse_broken(file, "exchange/theta")
         raise DataError(
             f"{file.filename} has no /exchange/theta. Some readers then assume 0 to 180 degrees; we do not: "
             "give them with --angles FILE (degrees, one a line)."
         )
-    angles = hdf5.radians(theta, default="degrees")
+    angles = datasets.radians(theta, default="degrees")
     if angles.size != n_views or n_views not in (1, *theta.shape):
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, "
@@ -221,11 +221,11 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
         if isinstance(value, np.number):
             facts[name] = float(value)
         else:
-            facts[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
+            facts[name] = " ".join(datasets.text(part) for part in np.ravel(value))
     for name, where in TEXTS.items():
-        if hdf5.dataset(file, where) is not None:
-            facts[name] = hdf5.text_at(file, where)
-    facts["theta_units"] = hdf5.attribute(file["exchange"].get("theta", file), "units") or "not given"
+        if datasets.dataset(file, where) is not None:
+            facts[name] = datasets.text_at(file, where)
+    facts["theta_units"] = datasets.attribute(file["exchange"].get("theta", file), "units") or "not given"
     return facts
 
 
@@ -233,7 +233,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
     if not hdf5.is_hdf5(path, opening.follow):
         return False
     with hdf5.open_hdf5(path, opening.follow) as file:
-        return hdf5.dataset(file, "exchange/data") is not None or bool(hdf5.broken_link(file, "exchange/data"))
+        return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 
 FORMAT = ScanFormat(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
+from beamline.storage import datasets
 from beamline.storage.readers.stacks import dimensions
 
 _LISTED = 6  # detectors that an error names
@@ -34,15 +34,15 @@ def find(file: h5py.File) -> list[Places]:
     places = []
     unresolved: list[str] = []
     for name in file:
-        top = hdf5.resolve(file, name)
+        top = datasets.resolve(file, name)
         entries = [top] if isinstance(top, h5py.Group) else []
         entries += [item for item in groups(entries[0]) if "instrument" in item] if entries else []
         for entry in entries:
-            for detector in groups(hdf5.resolve(entry, "instrument")):
-                key = hdf5.dataset(detector, "image_key")
-                data = hdf5.dataset(detector, "data")
+            for detector in groups(datasets.resolve(entry, "instrument")):
+                key = datasets.dataset(detector, "image_key")
+                data = datasets.dataset(detector, "data")
                 for name in ("data", "image_key"):
-                    if broken := hdf5.broken_link(detector, name):
+                    if broken := datasets.broken_link(detector, name):
                         unresolved.append(broken)
                 if key is not None and data is not None and data.ndim == 3:
                     places.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
@@ -55,7 +55,7 @@ def groups(parent: Any) -> list[h5py.Group]:
     """The groups in a group; [] for any other object."""
     if not isinstance(parent, h5py.Group):
         return []
-    items = (hdf5.resolve(parent, name) for name in parent)
+    items = (datasets.resolve(parent, name) for name in parent)
     return [item for item in items if isinstance(item, h5py.Group)]
 
 
@@ -66,16 +66,16 @@ def _link(group: h5py.Group, name: str) -> str:
 
 
 def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset | None, str]:
-    angle = hdf5.dataset(entry, "sample/rotation_angle")
+    angle = datasets.dataset(entry, "sample/rotation_angle")
     if angle is not None:
         return angle, ""
     # Diamond: the NXdata named as the detector says which scanned axis goes with the frames.
-    data = hdf5.resolve(entry, str(detector.name).rsplit("/", 1)[1])
-    name = hdf5.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
+    data = datasets.resolve(entry, str(detector.name).rsplit("/", 1)[1])
+    name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
-        angle = hdf5.dataset(data, name)
+        angle = datasets.dataset(data, name)
         return angle, "" if angle is not None else f"{_link(data, name)} is not there"
-    return None, hdf5.broken_link(entry, "sample/rotation_angle") or f"{entry.name} has no sample/rotation_angle"
+    return None, datasets.broken_link(entry, "sample/rotation_angle") or f"{entry.name} has no sample/rotation_angle"
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
@@ -86,10 +86,10 @@ def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Pla
     if not found:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
     if data is not None:
-        return next(places for places in found if places.data == hdf5.resolve(file, data))
+        return next(places for places in found if places.data == datasets.resolve(file, data))
     if len(found) == 1:
         return found[0]
-    default = hdf5.attribute(file, "default").strip("/")
+    default = datasets.attribute(file, "default").strip("/")
     named = [places for places in found if str(places.entry.name).strip("/") == default]
     plotted = [places for places in named if _is_default(places)]
     for some in (named, plotted):
@@ -104,12 +104,12 @@ def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Pla
 
 def _is_default(places: Places) -> bool:
     """Whether the NXdata that an entry's `default` names shows these frames."""
-    name = hdf5.attribute(places.entry, "default")
-    data = hdf5.resolve(places.entry, name) if name else None
+    name = datasets.attribute(places.entry, "default")
+    data = datasets.resolve(places.entry, name) if name else None
     if not isinstance(data, h5py.Group):
         return False
-    signal = hdf5.attribute(data, "signal") or "data"
-    return bool(hdf5.dataset(data, signal) == places.data)
+    signal = datasets.attribute(data, "signal") or "data"
+    return bool(datasets.dataset(data, signal) == places.data)
 
 
 _MAGNIFIED = 0.01  # a pixel size is not known better
@@ -145,8 +145,8 @@ def read_geometry(places: Places) -> NexusGeometry:
         DataError: distances that cannot be.
     """
     detector, entry = places.detector, places.entry
-    own = [hdf5.scalar(detector, f"{side}_pixel_size", hdf5.LENGTH_UNITS) for side in "xy"]
-    at_sample = [hdf5.scalar(entry, f"sample/{side}_pixel_size", hdf5.LENGTH_UNITS) for side in "xy"]
+    own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
+    at_sample = [datasets.scalar(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
     pixels = [theirs or ours for theirs, ours in zip(at_sample, own, strict=True)]
     cone, remarks = _cone_of(places, own[0], at_sample[0])
     if cone is not None:  # on the detector
@@ -162,7 +162,10 @@ def _cone_of(
     places: Places, own: float | None, at_sample: float | None
 ) -> tuple[tuple[float, float] | None, dict[str, str]]:
     """The cone of `NexusGeometry`, and a remark on a beam that is as good as parallel; widths of a pixel in mm."""
-    upstream, beyond = _source_distance(places.entry), hdf5.scalar(places.detector, "distance", hdf5.LENGTH_UNITS)
+    upstream, beyond = (
+        _source_distance(places.entry),
+        datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS),
+    )
     if upstream is None or beyond is None:
         return None, {}
     sod, sdd = abs(upstream), abs(upstream) + beyond
@@ -188,10 +191,12 @@ def differing(height: float | None, width: float | None) -> float | None:
 def require_order(places: Places) -> None:
     """Raise DataError if the attribute `axes` of the detector's NXdata names an order other than frame, row, column."""
     for name in ("data", str(places.detector.name).rsplit("/", 1)[1]):
-        nxdata = hdf5.resolve(places.entry, name)
+        nxdata = datasets.resolve(places.entry, name)
         if not isinstance(nxdata, h5py.Group) or "axes" not in nxdata.attrs:
             continue
-        axes = [hdf5.text(axis) for part in np.ravel(nxdata.attrs["axes"]) for axis in hdf5.text(part).split(":")]
+        axes = [
+            datasets.text(axis) for part in np.ravel(nxdata.attrs["axes"]) for axis in datasets.text(part).split(":")
+        ]
         if dimensions(axes) not in (None, (0, 1, 2)):
             raise DataError(
                 f"{nxdata.name} in {places.entry.file.filename} says that its axes are {', '.join(axes)}; expected "
@@ -218,10 +223,13 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
         ("incident_energy", "incident_wavelength", _BEAMS),
         ("energy", "wavelength", (_MONOCHROMATOR,)),
     ):
-        for name, units, angstrom in ((energy, hdf5.ENERGY_UNITS, False), (wavelength, hdf5.WAVELENGTH_UNITS, True)):
+        for name, units, angstrom in (
+            (energy, datasets.ENERGY_UNITS, False),
+            (wavelength, datasets.WAVELENGTH_UNITS, True),
+        ):
             for where in groups_:
-                item = hdf5.dataset(entry, f"{where}/{name}")
-                values = None if item is None or item.size != n else hdf5.in_units(item, units)
+                item = datasets.dataset(entry, f"{where}/{name}")
+                values = None if item is None or item.size != n else datasets.in_units(item, units)
                 if values is not None and (known := np.where(values > 0, values, np.nan))[np.isfinite(known)].size:
                     return _HC / known if angstrom else known
     return None
@@ -229,10 +237,10 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
 
 def _source_distance(entry: h5py.Group) -> float | None:
     """mm, negative before the sample, as NXsource has it; some write it without the sign."""
-    instrument = hdf5.resolve(entry, "instrument")
+    instrument = datasets.resolve(entry, "instrument")
     for group in groups(instrument):
-        if hdf5.attribute(group, "NX_class") == "NXsource" or str(group.name).endswith("/source"):
-            distance = hdf5.scalar(group, "distance", hdf5.LENGTH_UNITS)
+        if datasets.attribute(group, "NX_class") == "NXsource" or str(group.name).endswith("/source"):
+            distance = datasets.scalar(group, "distance", datasets.LENGTH_UNITS)
             if distance is not None:
                 return distance
     return None
@@ -247,17 +255,17 @@ def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
     rows, cols = (_flag(detector, name) for name in ("y_flipped", "x_flipped"))
     if rows or cols:
         return (rows, cols), ""
-    turns = hdf5.resolve(detector, "transformations")
+    turns = datasets.resolve(detector, "transformations")
     if not isinstance(turns, h5py.Group):
         return (False, False), ""
-    gravity = hdf5.dataset(turns, "gravity")
+    gravity = datasets.dataset(turns, "gravity")
     vertical = None if gravity is None else _direction(gravity)
     others = []
     for name in turns:
-        item = hdf5.dataset(turns, name)
-        if item is None or hdf5.attribute(item, "transformation_type") != "rotation" or item.size != 1:
+        item = datasets.dataset(turns, name)
+        if item is None or datasets.attribute(item, "transformation_type") != "rotation" or item.size != 1:
             continue
-        angle = float(np.degrees(hdf5.radians(item, default="degrees"))[0]) % 360
+        angle = float(np.degrees(datasets.radians(item, default="degrees"))[0]) % 360
         axis = _direction(item)
         if not np.isfinite(angle) or min(angle, 360 - angle) < 1e-6:
             continue
@@ -273,10 +281,10 @@ def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
 
 
 def _flag(detector: h5py.Group, name: str) -> bool:
-    item = hdf5.dataset(detector, name)
+    item = datasets.dataset(detector, name)
     if item is None or item.size != 1:
         return False
-    return hdf5.text_of(item).strip().lower() in ("1", "1.0", "true", "yes")
+    return datasets.text_of(item).strip().lower() in ("1", "1.0", "true", "yes")
 
 
 def _direction(item: h5py.Dataset) -> int | None:

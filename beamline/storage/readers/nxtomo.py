@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
+from beamline.storage.datasets import require_real
 from beamline.storage.flag_legend import FrameFlags, read_flags
-from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import gaps_in, require_joined
 from beamline.storage.readers.base import (
     WHOLE,
@@ -82,13 +82,13 @@ class NXtomoSource(ScanSource):
             shape = places.data.shape
             self.shape = (int(shape[1]), int(shape[2]))
             self.dtype = places.data.dtype
-            definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
-            self.format = _format(definition, hdf5.text_at(places.entry, "program_name"))
-            stated_quantity = hdf5.text_at(self._file, "/entry/record/quantity")
+            definition = datasets.text_at(places.entry, "definition") or datasets.attribute(places.entry, "definition")
+            self.format = _format(definition, datasets.text_at(places.entry, "program_name"))
+            stated_quantity = datasets.text_at(self._file, "/entry/record/quantity")
             self.quantity = _quantity(stated_quantity, self.dtype)
             self._geometry = None if self._ours else read_geometry(places)
             if self._geometry is None:
-                self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
+                self.pixel_size_mm = datasets.scalar(places.detector, "x_pixel_size", datasets.LENGTH_UNITS)
                 self.cone = self._cone()
             else:
                 self.pixel_size_mm, height = self._geometry.pixel_mm
@@ -97,7 +97,7 @@ class NXtomoSource(ScanSource):
                 self.pixel_mask = self._mask(self._geometry.mirrored)
             self.energy_kev = read_energy(places.entry)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
-            self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
+            self.axis_col = datasets.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
             self.n = 0
             self._damaged: set[int] = set()
             self._altered: set[int] = set()
@@ -108,14 +108,14 @@ class NXtomoSource(ScanSource):
                 self._find_stated(found if data is None else [], self._geometry.turned)
                 self.energies, self.currents = read_energies(places.entry, self.n), self._currents()
             else:
-                self.plan = json_object(hdf5.text_at(self._file, "/entry/record/plan")) or {}
+                self.plan = json_object(datasets.text_at(self._file, "/entry/record/plan")) or {}
                 devices = (self._file.get("/entry/instrument/devices") or {}).values()
                 periods = (float(device["row_period"][()]) for device in devices if "row_period" in device)
                 self.row_period = next(periods, None)
 
     def _cone(self) -> tuple[float, float] | None:
-        sod = hdf5.scalar(self._file, layout.SOURCE_DISTANCE, hdf5.LENGTH_UNITS)
-        beyond = hdf5.scalar(self._places.detector, "distance", hdf5.LENGTH_UNITS)
+        sod = datasets.scalar(self._file, layout.SOURCE_DISTANCE, datasets.LENGTH_UNITS)
+        beyond = datasets.scalar(self._places.detector, "distance", datasets.LENGTH_UNITS)
         if sod is None or beyond is None:
             return None
         if sod <= 0 or beyond < 0:
@@ -127,25 +127,25 @@ class NXtomoSource(ScanSource):
 
     def _mask(self, mirrored: tuple[bool, bool]) -> Mask | None:
         """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
-        item = hdf5.dataset(self._places.detector, "pixel_mask")
+        item = datasets.dataset(self._places.detector, "pixel_mask")
         if item is None or item.shape[-2:] != self.shape or item.dtype.kind not in "uib":
             return None
         if item.size != self.shape[0] * self.shape[1]:
             return None
-        mask = np.asarray(hdf5.values_of(item)).reshape(self.shape) != 0
+        mask = np.asarray(datasets.values_of(item)).reshape(self.shape) != 0
         return mask[:: -1 if mirrored[0] else 1, :: -1 if mirrored[1] else 1]
 
     def _check(self) -> None:
-        finer = hdf5.dataset(self._places.detector, "image_key_control")
+        finer = datasets.dataset(self._places.detector, "image_key_control")
         for item in (self._places.data, self._places.image_key, finer):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
-        hdf5.require_possible(self._places.data)
+        datasets.require_possible(self._places.data)
         if self._ours:
             require_joined(self._file)
         else:
             require_order(self._places)
-        lost = hdf5.missing_links(self._places.data) + hdf5.missing_links(self._places.image_key)
+        lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
         if lost:
             raise DataError(
                 f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
@@ -154,9 +154,9 @@ class NXtomoSource(ScanSource):
     @_guarded
     def refresh(self) -> int:
         places = self._places
-        finer = hdf5.dataset(places.detector, "image_key_control")
+        finer = datasets.dataset(places.detector, "image_key_control")
         if self._ours:
-            finer = hdf5.dataset(places.entry, "frame_log/kind")
+            finer = datasets.dataset(places.entry, "frame_log/kind")
         key = places.image_key if finer is None else finer
         if self._ours:
             committed = self._file[layout.COMMITTED]
@@ -170,8 +170,8 @@ class NXtomoSource(ScanSource):
                         hdf5.look_again(item)
         else:
             n = int(places.data.shape[0])
-        angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
-        keys = np.ravel(hdf5.values_of(key))
+        angles = datasets.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
+        keys = np.ravel(datasets.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
         if min(sizes) < n or (not self._ours and max(sizes) > n):
             raise DataError(
@@ -191,7 +191,7 @@ class NXtomoSource(ScanSource):
 
     @property
     def frame_bytes(self) -> int:
-        return hdf5.bytes_unpacked(self._places.data)
+        return datasets.bytes_unpacked(self._places.data)
 
     @property
     @_guarded
@@ -209,11 +209,11 @@ class NXtomoSource(ScanSource):
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
-            value = hdf5.text_at(entry, where)
+            value = datasets.text_at(entry, where)
             if value:
                 facts[name] = value
         for name, where, units in NUMBERS:
-            number = hdf5.scalar(entry, where, units)
+            number = datasets.scalar(entry, where, units)
             if number is not None:
                 facts[name] = number
         if "exposure_s" not in facts and np.isfinite(self.exposures).any():
@@ -240,10 +240,10 @@ class NXtomoSource(ScanSource):
         return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
     def _currents(self) -> NDArray[np.float64] | None:
-        item = hdf5.dataset(self._places.entry, "control/data")
+        item = datasets.dataset(self._places.entry, "control/data")
         if item is None or item.dtype.kind not in "uif" or item.size < self.n:
             return None
-        values = np.ravel(hdf5.values_of(item))[: self.n].astype(np.float64)
+        values = np.ravel(datasets.values_of(item))[: self.n].astype(np.float64)
         return np.where(values > 0, values, np.nan)
 
     def _find_stated(self, found: list[Places], turned: str) -> None:
@@ -285,8 +285,8 @@ class NXtomoSource(ScanSource):
     @property
     @_guarded
     def part_starts(self) -> NDArray[np.int64]:
-        item = hdf5.dataset(self._file, layout.PART_STARTS) if self._ours else None
-        starts = np.zeros(1, np.int64) if item is None else np.ravel(hdf5.values_of(item))
+        item = datasets.dataset(self._file, layout.PART_STARTS) if self._ours else None
+        starts = np.zeros(1, np.int64) if item is None else np.ravel(datasets.values_of(item))
         if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
             raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
         return starts.astype(np.int64)
@@ -301,7 +301,7 @@ class NXtomoSource(ScanSource):
             for view, row in zip(out, indices, strict=True):
                 view[:] = self._compared(row, self._whole(row))[rows]
             return out
-        hdf5.read_frames(self._places.data, indices, rows, out)
+        datasets.read_frames(self._places.data, indices, rows, out)
         if compared:
             for view, row in zip(out, indices, strict=True):
                 self._compared(row, view)
@@ -313,12 +313,12 @@ class NXtomoSource(ScanSource):
         kept = [self.shape[0] - 1 - row for row in rows] if upside_down else list(rows)
         first, end = (min(kept), max(kept) + 1) if kept else (0, 0)
         block = np.empty((indices.size, end - first, self.shape[1]), self.dtype)
-        hdf5.read_frames(self._places.data, indices, slice(first, end), block)
+        datasets.read_frames(self._places.data, indices, slice(first, end), block)
         return block[:, [row - first for row in kept], :: -1 if left_to_right else 1]
 
     def _whole(self, row: int) -> NDArray[Any]:
         whole = np.empty((1, *self.shape), self.dtype)
-        hdf5.read_frames(self._places.data, np.array([row]), WHOLE, whole)
+        datasets.read_frames(self._places.data, np.array([row]), WHOLE, whole)
         return whole[0]
 
     def _compared(self, row: int, image: NDArray[Any]) -> NDArray[Any]:
@@ -363,20 +363,20 @@ class NXtomoSource(ScanSource):
             )
 
     def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
-        item = hdf5.dataset(self._places.entry, path)
+        item = datasets.dataset(self._places.entry, path)
         if item is None:
             return default
         if self._ours:
             hdf5.look_again(item)
-        values = np.asarray(hdf5.values_of(item))
+        values = np.asarray(datasets.values_of(item))
         return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
         """Seconds of each frame; NaN where the file states none."""
-        item = hdf5.dataset(group, path)
+        item = datasets.dataset(group, path)
         if item is not None and self._ours:
             hdf5.look_again(item)
-        values = hdf5.in_units(item, hdf5.TIME_UNITS)
+        values = datasets.in_units(item, datasets.TIME_UNITS)
         if values is None or 1 != values.size < self.n:
             return np.full(self.n, np.nan)
         return np.full(self.n, values[0]) if values.size == 1 else values[: self.n]
@@ -395,13 +395,13 @@ TEXTS = {
     "instrument": "instrument/name",
 }
 NUMBERS = (
-    ("exposure_s", "record/exposure", hdf5.TIME_UNITS),
-    ("period_s", "record/period", hdf5.TIME_UNITS),
+    ("exposure_s", "record/exposure", datasets.TIME_UNITS),
+    ("period_s", "record/period", datasets.TIME_UNITS),
     ("no_data", "record/no_data", {"": 1.0}),
     ("saturation", "instrument/detector/saturation_value", {"": 1.0}),  # as NXdetector has it
     ("saturation", "record/saturation", {"": 1.0}),
-    ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
-    ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
+    ("distance_mm", "instrument/detector/distance", datasets.LENGTH_UNITS),
+    ("source_distance_mm", "record/source_distance", datasets.LENGTH_UNITS),
 )
 
 

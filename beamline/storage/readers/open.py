@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.changed import AveragedSource, OverlaidSource, angles_of_frames, stated_frames_per_view
@@ -225,7 +225,7 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
     if options.darks_path is None and options.flats_path is None:
         with hdf5.open_hdf5(path) as file:
-            named = hdf5.dataset(file, data)
+            named = datasets.dataset(file, data)
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
             return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
@@ -289,7 +289,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        held, is_volume = datasets_text(file), hdf5.text_at(file, "entry/definition") == "NXtomoproc"
+        held, is_volume = datasets_text(file), datasets.text_at(file, "entry/definition") == "NXtomoproc"
     if is_volume:
         with opened_reconstruction(path) as record:
             made_by = record.method or "another program"

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
-from beamline.storage.hdf5 import bytes_unpacked
+from beamline.storage import datasets, hdf5
+from beamline.storage.datasets import bytes_unpacked
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
@@ -100,13 +100,13 @@ class StacksSource(ScanSource):
     def _check(self) -> None:
         views = self._stacks[-1]
         for stack in self._stacks:
-            hdf5.require_real(stack.frames.dtype, f"{stack.name} in {self.path}")
+            datasets.require_real(stack.frames.dtype, f"{stack.name} in {self.path}")
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
             if isinstance(stack.frames, h5py.Dataset):
-                hdf5.require_possible(stack.frames)
-                lost = hdf5.missing_links(stack.frames)
+                datasets.require_possible(stack.frames)
+                lost = datasets.missing_links(stack.frames)
                 if lost:
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
@@ -120,7 +120,7 @@ class StacksSource(ScanSource):
             wanted = np.flatnonzero((indices >= first) & (indices < last))
             if wanted.size:
                 part = np.empty((wanted.size, *out.shape[1:]), stack.frames.dtype)
-                hdf5.read_frames(stack.frames, indices[wanted] - first, rows, part)
+                datasets.read_frames(stack.frames, indices[wanted] - first, rows, part)
                 out[wanted] = part
         return out
 
@@ -128,7 +128,7 @@ class StacksSource(ScanSource):
     def frame_bytes(self) -> int:
         stored = [stack.frames for stack in self._stacks]
         known = [item.frame_bytes for item in stored if isinstance(item, TurnedFrames)]
-        known += [hdf5.bytes_unpacked(item) for item in stored if isinstance(item, h5py.Dataset)]
+        known += [datasets.bytes_unpacked(item) for item in stored if isinstance(item, h5py.Dataset)]
         return max(known, default=super().frame_bytes)
 
     def close(self) -> None:
@@ -166,27 +166,27 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
-        stated = unit or hdf5.attribute(item, "units")
-        if stated.lower() not in hdf5.ANGLE_UNITS:
+        stated = unit or datasets.attribute(item, "units")
+        if stated.lower() not in datasets.ANGLE_UNITS:
             problem = f"the units {stated!r}" if stated else "no attribute `units`"
             raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
-        return hdf5.radians(item, unit)
+        return datasets.radians(item, unit)
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
     """The dataset at a path. If there is none, the DataError lists the datasets of the file."""
-    item = hdf5.dataset(file, where)
+    item = datasets.dataset(file, where)
     if item is None:
-        hdf5.refuse_broken(file, where)
+        datasets.refuse_broken(file, where)
         raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")
     return item
 
 
 def datasets_text(file: h5py.File) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    datasets = list[h5py.Dataset]()
-    file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
-    datasets.sort(key=lambda item: (-item.ndim, -item.size))
-    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in datasets[:_LISTED]]
-    more = f" and {len(datasets) - _LISTED} more" if len(datasets) > _LISTED else ""
+    arrays = list[h5py.Dataset]()
+    file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
+    arrays.sort(key=lambda item: (-item.ndim, -item.size))
+    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
+    more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."

@@ -16,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import printable
-from beamline.storage import hdf5
+from beamline.storage import datasets
 from beamline.storage.readers.base import NotUsed, ScanSource, Used
 from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 """Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
 
-EXCHANGE_LENGTH_UNITS = {**hdf5.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
+EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
 EXCHANGE_ENERGY_UNITS = {
-    **hdf5.ENERGY_UNITS,
+    **datasets.ENERGY_UNITS,
     "j": 1 / 1.602176634e-16,
     "joule": 1 / 1.602176634e-16,
     "": 1 / 1.602176634e-16,
 }
-EXCHANGE_TIME_UNITS = {**hdf5.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
+EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
 _UNKNOWN = "nothing reads this name"
 _MOST = 40  # fields of unknown names
 _CHANGES = re.compile(r"expos|count_?time|current|energ|wavelength|shift|transl|displac|jitter")
@@ -69,12 +69,12 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
     unused = []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
-        if item is None or item.size == 0 or hdf5.is_foreign(item):
+        if item is None or item.size == 0 or datasets.is_foreign(item):
             continue
-        if item.size * item.dtype.itemsize > hdf5.BRIEF:  # no place, time or number of each frame
+        if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
-        value, unit = np.asarray(hdf5.values_of(item)), hdf5.attribute(item, "units")
+        value, unit = np.asarray(datasets.values_of(item)), datasets.attribute(item, "units")
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
             unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
@@ -92,8 +92,8 @@ def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detect
     unused, used = {field.where for field in source.not_used}, []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
-        if item is not None and item.dtype.kind in "uif" and item.ndim <= 1 and 0 < item.size * 8 <= hdf5.BRIEF:
-            text = _text(np.asarray(hdf5.values_of(item)), hdf5.attribute(item, "units"))
+        if item is not None and item.dtype.kind in "uif" and item.ndim <= 1 and 0 < item.size * 8 <= datasets.BRIEF:
+            text = _text(np.asarray(datasets.values_of(item)), datasets.attribute(item, "units"))
             used.append(Used(field.where, text, field.use))
     return tuple(used)
 
@@ -109,15 +109,15 @@ def _unknown_fields(fields: Sequence[Entry], root: h5py.Group, source: ScanSourc
 
     def visit(name: str, item: Any) -> None:
         told = [key for key in item.attrs if _TOLD.search(key.lower()) and not key.endswith("_indices")]
-        unknown.extend(NotUsed(f"{name}@{key}", hdf5.attribute(item, key), _UNKNOWN, False) for key in told)
+        unknown.extend(NotUsed(f"{name}@{key}", datasets.attribute(item, key), _UNKNOWN, False) for key in told)
         if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or _place(item) in places:
             return
         of_frames = item.ndim == 1 and item.size in (views.size, views.sum()) and item.size > 1
         if of_frames or (item.size == 1 and _TOLD.search(name.rpartition("/")[2].lower())):
-            value = np.asarray(hdf5.values_of(item))
+            value = np.asarray(datasets.values_of(item))
             of_views = value[views] if value.size == views.size else value
             doubt = of_frames and bool(_CHANGES.search(name.lower())) and np.unique(of_views).size > 1
-            unknown.append(NotUsed(name, _text(value, hdf5.attribute(item, "units")), _UNKNOWN, doubt))
+            unknown.append(NotUsed(name, _text(value, datasets.attribute(item, "units")), _UNKNOWN, doubt))
 
     root.visititems(visit)
     return unknown[:_MOST]
@@ -130,24 +130,29 @@ def _place(item: h5py.Dataset) -> tuple[int, int]:
 
 def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
     """The texts stored in another file without images, which are not copied."""
-    items = [(where, hdf5.dataset(root, where)) for where in texts]
+    items = [(where, datasets.dataset(root, where)) for where in texts]
     return tuple(
-        NotUsed(where, f"in the file {hdf5.file_of(item)}", "that holds no images, and its text is not a scan's", True)
+        NotUsed(
+            where,
+            f"in the file {datasets.file_of(item)}",
+            "that holds no images, and its text is not a scan's",
+            True,
+        )
         for where, item in items
-        if item is not None and hdf5.is_foreign(item)
+        if item is not None and datasets.is_foreign(item)
     )
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
     if where.startswith("detector/"):
         where = f"{detector}/{where.removeprefix('detector/')}"
-    return hdf5.dataset(root, where)
+    return datasets.dataset(root, where)
 
 
 def _text(value: NDArray[Any], units: str) -> str:
     if value.size == 1:
         first = value.reshape(-1)[0]
-        text = f"{first:.6g}" if value.dtype.kind == "f" else hdf5.text(first)
+        text = f"{first:.6g}" if value.dtype.kind == "f" else datasets.text(first)
     elif value.dtype.kind in "uif" and value.size and value.ndim == 1:
         text = f"{np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if np.isfinite(value).any() else "nan"
     else:
@@ -161,7 +166,7 @@ def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
 
 def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
-    factor = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
+    factor = datasets.LENGTH_UNITS.get(datasets.attribute(item, "units").lower())
     if value.dtype.kind not in "uif" or value.size != source.image_key.size:
         return False
     places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)
@@ -178,7 +183,11 @@ def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool
 def _off_middle(along: int) -> Matters:
     def matters(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
         """A central ray of a cone more than a twentieth of the detector beside its middle."""
-        if source.cone is None or value.size != 1 or hdf5.attribute(item, "units").lower() not in ("", "pixel", "px"):
+        if (
+            source.cone is None
+            or value.size != 1
+            or datasets.attribute(item, "units").lower() not in ("", "pixel", "px")
+        ):
             return False
         n = source.shape[along]
         return abs(float(value.reshape(-1)[0]) - (n - 1) / 2) > 0.05 * n
@@ -203,31 +212,37 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
     Entry("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
     Entry("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
-    Entry("detector/count_time", "exposure of each frame", units=hdf5.TIME_UNITS),
+    Entry("detector/count_time", "exposure of each frame", units=datasets.TIME_UNITS),
     Entry(
         "detector/x_pixel_size",
         "width of a pixel: at the sample for a parallel beam, on the detector for a cone",
-        units=hdf5.LENGTH_UNITS,
+        units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "detector/y_pixel_size",
         "height of a pixel; slices of a parallel beam are as far apart, others are refused",
-        units=hdf5.LENGTH_UNITS,
+        units=datasets.LENGTH_UNITS,
     ),
-    Entry("sample/x_pixel_size", "width of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS),
     Entry(
-        "sample/y_pixel_size", "height of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS
+        "sample/x_pixel_size",
+        "width of a pixel at the sample; goes before the detector's",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "sample/y_pixel_size",
+        "height of a pixel at the sample; goes before the detector's",
+        units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "detector/distance",
         "from the sample to the detector: phase, and the magnification of a cone",
-        units=hdf5.LENGTH_UNITS,
+        units=datasets.LENGTH_UNITS,
     ),
     Entry(
         "instrument/source/distance",
         "from the source to the sample, of either sign, also of an NXsource of another name: a cone beam, unless it "
         "magnifies by less than 1 % and a ray leaves its parallel by less than half a pixel in the whole field",
-        units=hdf5.LENGTH_UNITS,
+        units=datasets.LENGTH_UNITS,
     ),
     Entry("detector/x_flipped", "frames are mirrored left to right as they are read"),
     Entry("detector/y_flipped", "frames are mirrored upside down as they are read"),
@@ -242,14 +257,18 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("end_time", "shown"),
     Entry("instrument/name", "shown"),
     Entry("control/data", "ring current of each frame, or another monitor of the beam: --ring-current use"),
-    Entry("instrument/beam/incident_energy", "energy", units=hdf5.ENERGY_UNITS),
-    Entry("beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
-    Entry("sample/beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
-    Entry("instrument/beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
-    Entry("beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
-    Entry("sample/beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
-    Entry("instrument/monochromator/energy", "energy, where the beam states none", units=hdf5.ENERGY_UNITS),
-    Entry("instrument/monochromator/wavelength", "energy, where nothing else states it", units=hdf5.WAVELENGTH_UNITS),
+    Entry("instrument/beam/incident_energy", "energy", units=datasets.ENERGY_UNITS),
+    Entry("beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
+    Entry("sample/beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
+    Entry("instrument/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("sample/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("instrument/monochromator/energy", "energy, where the beam states none", units=datasets.ENERGY_UNITS),
+    Entry(
+        "instrument/monochromator/wavelength",
+        "energy, where nothing else states it",
+        units=datasets.WAVELENGTH_UNITS,
+    ),
     Entry(
         "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
     ),

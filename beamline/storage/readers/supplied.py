@@ -19,8 +19,8 @@ from tifffile import natural_sorted
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
 from beamline.plan.plan import from_text
-from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
+from beamline.storage import datasets, hdf5
+from beamline.storage.datasets import require_real
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.nexus import find
@@ -228,11 +228,11 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if dataset:
         return _read(path, dataset_at(file, dataset))
     for places in find(file):
-        keys = np.ravel(hdf5.values_of(places.image_key))
+        keys = np.ravel(datasets.values_of(places.image_key))
         if (keys == kind).any():
             return _of_scan(NXtomoSource(path, own_angles=False, data=str(places.data.name)), kind)
-    exchange = hdf5.dataset(file, _EXCHANGE[kind])
-    if exchange is not None and hdf5.dataset(file, "exchange/data") is not None:
+    exchange = datasets.dataset(file, _EXCHANGE[kind])
+    if exchange is not None and datasets.dataset(file, "exchange/data") is not None:
         return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
@@ -256,20 +256,20 @@ def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
     """Every dataset that may be images, once, also behind links."""
-    return (item for item in hdf5.images_in(file) if min(item.shape[-2:]) > 1)
+    return (item for item in datasets.images_in(file) if min(item.shape[-2:]) > 1)
 
 
 def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) -> NDArray[Any]:
-    if lost := hdf5.missing_links(item):
+    if lost := datasets.missing_links(item):
         raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
     if item.ndim not in (2, 3):
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
     if item.ndim == 2:
         return _stack(item[()], f"{item.name} in {path}")
-    hdf5.require_possible(item)
+    datasets.require_possible(item)
     rows = np.arange(len(item)) if rows is None else rows
     out = np.empty((rows.size, *item.shape[1:]), item.dtype)
-    hdf5.read_frames(item, rows.astype(np.int64), slice(None), out)
+    datasets.read_frames(item, rows.astype(np.int64), slice(None), out)
     return _stack(out, f"{item.name} in {path}")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
@@ -40,7 +40,7 @@ class NXtomoproc:
             return False
         try:
             with hdf5.open_hdf5(path) as file:
-                return hdf5.text_at(file, "entry/definition") == DEFINITION
+                return datasets.text_at(file, "entry/definition") == DEFINITION
         except (DataError, OSError, TypeError):
             return False
 
@@ -83,16 +83,24 @@ class NexusVolume:
                 z, y, x = (low + middle for low, middle in zip(first, half, strict=True))
                 grid = replace(record.volume.grid, centre=(z, y, x))
                 record = replace(record, volume=Volume(values, grid))
-            yield replace(record, kind=VoxelKind.of_unit(hdf5.attribute(values, "units")))
+            yield replace(record, kind=VoxelKind.of_unit(datasets.attribute(values, "units")))
 
 
 def _plotted(file: h5py.File) -> h5py.Dataset | None:
     """The volume [z, y, x] that the file's attributes `default` and `signal` name; None without one."""
-    entry = hdf5.resolve(file, hdf5.attribute(file, "default") or "entry")
-    data = hdf5.resolve(entry, hdf5.attribute(entry, "default") or "data") if isinstance(entry, h5py.Group) else None
-    if not isinstance(data, h5py.Group) or [hdf5.text(name) for name in data.attrs.get("axes", ())] != ["z", "y", "x"]:
+    entry = datasets.resolve(file, datasets.attribute(file, "default") or "entry")
+    data = (
+        datasets.resolve(entry, datasets.attribute(entry, "default") or "data")
+        if isinstance(entry, h5py.Group)
+        else None
+    )
+    if not isinstance(data, h5py.Group) or [datasets.text(name) for name in data.attrs.get("axes", ())] != [
+        "z",
+        "y",
+        "x",
+    ]:
         return None
-    values = hdf5.dataset(data, hdf5.attribute(data, "signal"))
+    values = datasets.dataset(data, datasets.attribute(data, "signal"))
     return values if values is not None and values.ndim == 3 and values.dtype.kind in "uif" else None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
@@ -34,7 +34,7 @@ def add_exchange_view(file: h5py.File) -> None:
             continue
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)
         filled = 0
-        for first, last in hdf5.runs(rows):
+        for first, last in datasets.runs(rows):
             virtual[filled : filled + last - first] = h5py.VirtualSource(source)[first:last]
             filled += last - first
         dataset = group.create_virtual_dataset(name, virtual)
@@ -98,26 +98,26 @@ def ending_in(file: h5py.File) -> ScanEnding:
     """The ending stated by a scan file of this program."""
     for path in (layout.STATUS, layout.MISSING):
         hdf5.look_again(file[path])
-    status = hdf5.text_of(file[layout.STATUS]) or RUNNING
-    return ScanEnding(status, tuple(file[layout.MISSING][()].tolist()), hdf5.text_at(file, layout.REASON))
+    status = datasets.text_of(file[layout.STATUS]) or RUNNING
+    return ScanEnding(status, tuple(file[layout.MISSING][()].tolist()), datasets.text_at(file, layout.REASON))
 
 
-def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
+def state_ending(fields: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
     """Write the ending into a file created by `layout.create`, or into its open datasets, by path.
 
     Files of older versions have no place for the reason.
     """
     missing = np.asarray(ending.missing, np.int64)
-    datasets[layout.MISSING].resize(missing.size, 0)
-    datasets[layout.MISSING][...] = missing
-    state_words(datasets, ending)
+    fields[layout.MISSING].resize(missing.size, 0)
+    fields[layout.MISSING][...] = missing
+    state_words(fields, ending)
 
 
-def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
+def state_words(fields: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
     """Write only status and reason, which needs no further space on the disk."""
-    if layout.REASON in datasets:
-        datasets[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()
-    datasets[layout.STATUS][()] = ending.status.encode()
+    if layout.REASON in fields:
+        fields[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()
+    fields[layout.STATUS][()] = ending.status.encode()
 
 
 def complete(file: hdf5.NewFile, ending: ScanEnding) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, refuse_existing, replaceable, whole_file
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
@@ -253,7 +253,7 @@ def is_partial(path: Path) -> bool:
         return False
     try:
         with hdf5.open_hdf5(path) as file:
-            return isinstance(hdf5.resolve(file, _SLABS), h5py.Group)
+            return isinstance(datasets.resolve(file, _SLABS), h5py.Group)
     except (DataError, OSError):
         return False
 

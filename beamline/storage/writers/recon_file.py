@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.shipped import version
 from beamline.core.voxel_kind import VoxelKind
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.recon_record import ReconRecord as ReconRecord
 from beamline.storage.recon_record import Value
 from beamline.storage.structure import require_harmless
@@ -198,7 +198,7 @@ def volumes_in_time(file: h5py.File) -> int:
 
 def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
-    z, y, x = (np.asarray(hdf5.values_of(data[name])) for name in ("z", "y", "x"))
+    z, y, x = (np.asarray(datasets.values_of(data[name])) for name in ("z", "y", "x"))
     # An axis of one voxel says nothing about the voxel size, the longer one says it best; slices may be higher.
     height = _pitch(z)
     size = _pitch(max(y, x, key=len)) or height or 1.0
@@ -218,8 +218,8 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
         sample=str(_own_value(entry["sample/name"])),
         time=datetime.fromisoformat(str(value_of(process["date"]))).timestamp(),
         parameters=parameters,
-        metrics={name: float(hdf5.values_of(node)) for name, node in process["metrics"].items()},
-        history={name: np.asarray(hdf5.values_of(node)) for name, node in process["history"].items()},
+        metrics={name: float(datasets.values_of(node)) for name, node in process["metrics"].items()},
+        history={name: np.asarray(datasets.values_of(node)) for name, node in process["history"].items()},
         model={name: value_of(node, _MODEL) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
@@ -234,12 +234,12 @@ def _pitch(axis: NDArray[np.floating]) -> float | None:
 
 
 def _own_value(node: h5py.Dataset) -> Value:
-    return "" if hdf5.is_foreign(node) else value_of(node)
+    return "" if datasets.is_foreign(node) else value_of(node)
 
 
-def value_of(node: h5py.Dataset, most: float = hdf5.BRIEF) -> Value:
+def value_of(node: h5py.Dataset, most: float = datasets.BRIEF) -> Value:
     """Value of a dataset of at most so many bytes, as text or number if it is one."""
-    value = hdf5.values_of(node, most)
+    value = datasets.values_of(node, most)
     if isinstance(value, bytes):
         return value.decode()
     return value.item() if isinstance(value, np.generic) else value

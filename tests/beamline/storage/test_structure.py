@@ -14,7 +14,7 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5, structure
+from beamline.storage import datasets, structure
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
@@ -130,5 +130,5 @@ def test_a_list_larger_than_any_scan_has(tmp_path: Path) -> None:
         for n in range(200):
             item.id.write_direct_chunk((n, 0, 0), packed)
         with pytest.raises(DataError, match=r"holds 0\.839 GB"):
-            hdf5.values_of(item)
-        assert hdf5.first_of(item) == 0
+            datasets.values_of(item)
+        assert datasets.first_of(item) == 0

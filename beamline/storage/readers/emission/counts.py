@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.readers.base import WHOLE, EmissionCounts, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from drivers.base.frame import FrameKind
@@ -32,16 +32,18 @@ class EmissionSource(StacksSource):
         )  # fmt: skip
         self._counts = views
         self.dtype, self.quantity = np.dtype(np.float32), "line_integrals"
-        self._sets = {name: dataset for name in SETS if (dataset := hdf5.dataset(file, f"{GROUP}/{name}")) is not None}
+        self._sets = {
+            name: dataset for name in SETS if (dataset := datasets.dataset(file, f"{GROUP}/{name}")) is not None
+        }
         for name, dataset in self._sets.items():
-            hdf5.require_real(dataset.dtype, f"{dataset.name} in {path}")
+            datasets.require_real(dataset.dtype, f"{dataset.name} in {path}")
             if dataset.shape != views.shape:
                 raise DataError(f"{path}: {name} has shape {dataset.shape}, the counts {views.shape} [view, row, col].")
-        angles = hdf5.radians(dataset_at(file, f"{GROUP}/angles"))
+        angles = datasets.radians(dataset_at(file, f"{GROUP}/angles"))
         if angles.shape != self.angles.shape:
             raise DataError(f"{path}: {angles.size} angles for {self.angles.size} views; expected one for each.")
         self.angles = angles
-        self.pixel_size_mm = hdf5.scalar(file, f"{GROUP}/pixel_size", {"mm": 1.0})
+        self.pixel_size_mm = datasets.scalar(file, f"{GROUP}/pixel_size", {"mm": 1.0})
         self.axis_col, self.emission = (self.shape[1] - 1) / 2, self._counted
 
     @property
@@ -53,7 +55,7 @@ class EmissionSource(StacksSource):
         sets = dict.fromkeys(SETS, np.zeros_like(counts)) | {"normalisation": np.ones_like(counts)}
         for name, item in self._sets.items():
             sets[name] = np.empty_like(counts)
-            hdf5.read_frames(item, frames, rows, sets[name])
+            datasets.read_frames(item, frames, rows, sets[name])
         survival = sets["normalisation"] * np.exp(-sets["attenuation"])
         return EmissionCounts(counts, survival, sets["randoms"] + sets["scatter"])
 
@@ -68,7 +70,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
     if not path.is_file() or not hdf5.is_hdf5(path, opening.follow):
         return False
     with hdf5.open_hdf5(path, opening.follow) as file:
-        return hdf5.dataset(file, f"{GROUP}/counts") is not None
+        return datasets.dataset(file, f"{GROUP}/counts") is not None
 
 
 def _open(path: Path, opening: Opening) -> EmissionSource:

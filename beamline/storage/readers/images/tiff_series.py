@@ -25,7 +25,8 @@ from beamline.core.errors import DataError
 from beamline.core.files import TEXT, decoded
 from beamline.core.text import size, spans
 from beamline.storage import hdf5
-from beamline.storage.hdf5 import UnreadableError, require_real
+from beamline.storage.datasets import require_real
+from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
 from beamline.storage.readers.side_files import offered

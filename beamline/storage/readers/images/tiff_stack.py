@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.hdf5 import UnreadableError, require_real
+from beamline.storage.datasets import require_real
+from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
-from beamline.storage import hdf5
+from beamline.storage import datasets
 from beamline.storage.readers.changed import OverlaidSource
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -313,7 +313,7 @@ def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
         h5py.File(tmp_path / "f.h5") as file,
         pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"),
     ):
-        hdf5.require_possible(file["exchange/data"])
+        datasets.require_possible(file["exchange/data"])
     with pytest.raises(DataError, match=r"claims 6e\+09 GB"):
         open_scan(tmp_path / "f.h5")
 

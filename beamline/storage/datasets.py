@@ -1,0 +1,337 @@
+"""Text, units, links and frames, in any order, of an open HDF5 file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.text import printable
+from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
+
+DEGREE = np.pi / 180
+ANGLE_UNITS = {
+    "deg": DEGREE,
+    "degree": DEGREE,
+    "degrees": DEGREE,
+    "°": DEGREE,
+    "rad": 1.0,
+    "radian": 1.0,
+    "radians": 1.0,
+}
+LENGTH_UNITS = {  # mm
+    "m": 1e3, "metre": 1e3, "meter": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3,
+    "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "micrometre": 1e-3, "nm": 1e-6,
+}  # fmt: skip
+ENERGY_UNITS = {"ev": 1e-3, "kev": 1.0}  # keV
+WAVELENGTH_UNITS = {"angstrom": 1.0, "angstroms": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "pm": 0.01, "m": 1e10}  # Å
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
+
+
+_FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
+_DEEPEST = 12  # groups within another that are looked into
+_PIECE = 2**31  # bytes of a chunk of frames
+BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
+
+
+def text(value: Any) -> str:
+    """A string from HDF5's representations: str, bytes, or an array of one of these; without control characters."""
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1)[0] if value.size else ""
+    return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
+
+
+def attribute(item: h5py.HLObject, name: str) -> str:
+    """An attribute as text; "" if it is missing."""
+    return text(item.attrs[name]) if name in item.attrs else ""
+
+
+def text_at(group: h5py.Group, path: str) -> str:
+    """A dataset as text; "" if it is missing, or as `text_of`."""
+    item = dataset(group, path)
+    return "" if item is None else text_of(item)
+
+
+def text_of(item: h5py.Dataset) -> str:
+    """The first value of a dataset as text; "" if it `is_foreign`."""
+    return "" if is_foreign(item) else text(first_of(item))
+
+
+def is_foreign(item: h5py.Dataset) -> bool:
+    """Whether a text is behind a link to a file without images: no scan needs it, and a reader would print its
+    content."""
+    if item.dtype.kind in "uifb":
+        return False
+    if item.is_virtual:
+        return file_of(item) != item.file.filename
+    number = h5py.h5o.get_info(item.file.id).fileno
+    if number not in _HOLD_IMAGES:
+        if len(_HOLD_IMAGES) > 1000:
+            _HOLD_IMAGES.clear()
+        _HOLD_IMAGES[number] = any(True for _ in images_in(item.file))
+    return not _HOLD_IMAGES[number]
+
+
+def file_of(item: h5py.Dataset) -> str:
+    """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
+    source."""
+    sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
+    return next((name for name in sources if name != "."), str(item.file.filename))
+
+
+_HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's number of it
+
+
+def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
+    """Each dataset that may hold images, once, also behind links."""
+    seen, groups = set(), [(file["/"], 0)]
+    while groups:
+        group, depth = groups.pop()
+        for name in group:
+            item = resolve(group, name)
+            if item is None or (known := h5py.h5o.get_info(item.id)) is None:
+                continue
+            place = (known.fileno, known.addr)
+            if place in seen:
+                continue
+            seen.add(place)
+            if isinstance(item, h5py.Group) and depth < _DEEPEST:
+                groups.append((item, depth + 1))
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3, 4):
+                yield item
+
+
+def first_of(item: h5py.Dataset) -> Any:
+    """The first value of a dataset, which may have many; of an empty dataset nothing."""
+    _require_brief(item, item.dtype.itemsize)
+    return item[()] if item.size <= 1 else item[(0,) * item.ndim]
+
+
+def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
+    """All values of a dataset of at most so many bytes, by default those of a number, a text or a list of a scan.
+
+    Raises:
+        DataError: it holds more.
+    """
+    _require_brief(item, (item.size or 0) * item.dtype.itemsize, most)
+    return item[()]
+
+
+def piece_of(item: h5py.Dataset) -> int:
+    """Bytes that HDF5 decompresses at once: a chunk; of a dataset without chunks, a value."""
+    return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
+
+
+def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
+    """Bytes that HDF5 decompresses for one frame of a dataset of three dimensions; `frames` is the number of the frame
+    dimension.
+    """
+    across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
+    pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
+    return math.prod(pieces) * math.prod(across) * int(item.dtype.itemsize)
+
+
+def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> None:
+    """DataError where so many bytes, or the piece of the file that HDF5 unpacks for them, are too many."""
+    if (n := max(n_bytes, piece_of(item))) > most:
+        raise DataError(
+            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
+            f"{most / 1e9:.3g} GB at most. Nothing was read."
+        )
+
+
+def resolve(group: h5py.Group, path: str) -> Any | None:
+    """The object at a path; None if there is none, as after a link to a missing file, or in a circle of links."""
+    try:
+        return group[path]
+    except (KeyError, OSError, RuntimeError):
+        return None
+
+
+def broken_link(group: h5py.Group, path: str) -> str:
+    """A sentence if a path ends at a broken link, with the link's target; "" if not."""
+    here: Any = group
+    for name in path.strip("/").split("/"):
+        if not isinstance(here, h5py.Group):
+            return ""
+        link, there = here.get(name, getlink=True), resolve(here, name)
+        if there is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+            file = f"{link.filename}::" if isinstance(link, h5py.ExternalLink) else ""
+            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which is not there"
+        here = there
+    return ""
+
+
+def refuse_broken(group: h5py.Group, path: str) -> None:
+    """Raise DataError if a path ends at a broken link."""
+    if broken := broken_link(group, path):
+        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
+
+
+def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
+    """The dataset at a path; None if it is missing or has a null dataspace.
+
+    Raises:
+        DataError: a list longer than any scan.
+    """
+    item = resolve(group, path)
+    if not isinstance(item, h5py.Dataset) or item.shape is None:
+        return None
+    if item.ndim == 1 and item.size > _FRAMES:
+        raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
+    return item
+
+
+def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
+    """A number in the unit of this program; None if it is absent, not finite, or its unit is unknown or missing."""
+    item = dataset(group, path)
+    factor = None if item is None else units.get(attribute(item, "units").lower())
+    if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
+        return None
+    value = float(np.ravel(first_of(item))[0]) * factor
+    return value if np.isfinite(value) else None
+
+
+def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
+    """Numbers in the unit of this program, as a list; None if there is no dataset of real numbers, or its unit is
+    unknown.
+    """
+    factor = None if item is None else units.get(attribute(item, "units").lower())
+    if item is None or factor is None or item.dtype.kind not in "uif":
+        return None
+    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
+
+
+def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians; a column becomes a list.
+
+    Args:
+        unit: whatever the attribute `units` says; None: that, or `default` if it is missing.
+    """
+    unit = unit or attribute(item, "units") or default
+    factor = ANGLE_UNITS.get(unit.lower())
+    if factor is None:
+        raise DataError(
+            f"{item.name} in {item.file.filename} has {f'the units {unit!r}' if unit else 'no units attribute'}; "
+            "expected degrees or radians. Set the attribute, or give --angles FILE (degrees, one a line)."
+        )
+    require_real(item.dtype, f"{item.name} in {item.file.filename}")
+    if lost := missing_links(item):
+        raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
+    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
+
+
+def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
+    """Copy all attributes of an object, with their types and shapes; the target must have none of these names."""
+    for name in source.attrs:
+        given = source.attrs.get_id(name)
+        made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
+        if given.get_space().get_simple_extent_type() != h5py.h5s.NULL:
+            values = np.empty(given.shape, given.dtype)
+            given.read(values)
+            made.write(values)
+
+
+def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
+    """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
+
+    For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
+    Virtual sources are followed through `within` files at most.
+    """
+    if not item.is_virtual:
+        return []
+    folder, lost = Path(item.file.filename).parent, set()
+    for source in item.virtual_sources():
+        if source.file_name == ".":
+            drawn = dataset(item.file, source.dset_name)
+            whole = not source.src_space.shape
+            if drawn is None or not (_fills(drawn, source) if whole else drawn.shape[1:] == source.src_space.shape[1:]):
+                lost.add(source.dset_name)
+        elif not _is_there(folder / source.file_name, source, within):
+            lost.add(str(folder / source.file_name))
+    return sorted(lost)
+
+
+def _is_there(path: Path, source: Any, within: int) -> bool:
+    """Whether another file has the frames, of their shape, that a source of a virtual dataset names."""
+    if within == 0:
+        return False
+    try:
+        with open_hdf5(path) as file:
+            drawn = dataset(file, source.dset_name)
+            return drawn is not None and _holds(drawn, source) and not missing_links(drawn, within - 1)
+    except (DataError, OSError):
+        return False
+
+
+def _holds(drawn: h5py.Dataset, source: Any) -> bool:
+    space = source.src_space
+    if not space.shape:
+        return _fills(drawn, source)
+    return drawn.shape[1:] == space.shape[1:] and space.get_select_bounds()[1][0] < drawn.shape[0]
+
+
+def _fills(drawn: h5py.Dataset, source: Any) -> bool:
+    """Whether all of a dataset has the shape of its place: some frames, or a stripe or tile of each."""
+    place = source.vspace
+    extent = place.shape
+    if place.get_select_type() == h5py.h5s.SEL_HYPERSLABS and place.is_regular_hyperslab():
+        _, _, counts, blocks = place.get_regular_hyperslab()
+        extent = tuple(n * block for n, block in zip(counts, blocks, strict=True))
+    return [n for n in drawn.shape if n != 1] == [n for n in extent if n != 1]
+
+
+def require_possible(item: h5py.Dataset) -> None:
+    """Raise DataError for frames [frame, row, col] without pixels, or too large for any memory."""
+    if 0 in item.shape[1:]:
+        raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
+    if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
+        raise DataError(
+            f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
+            f"frames of {_PIXELS} pixels."
+        )
+    if (piece := piece_of(item)) > _PIECE:
+        raise DataError(
+            f"{item.name} in {item.file.filename} is stored in pieces of {piece / 1e9:.3g} GB, which are unpacked "
+            f"for any frame; expected {_PIECE / 1e9:.3g} GB at most. Copy it with a frame a chunk."
+        )
+
+
+def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
+    """Fill out [frame, row, col] with frames in the requested order; consecutive ones are read at once.
+
+    Raises:
+        DataError: the file does not give them: damaged or cut chunks, or a compression that is not installed.
+    """
+    start = 0
+    for first, end in runs(indices):
+        try:
+            out[start : start + end - first] = item[first:end, rows]
+        except OSError as error:
+            which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
+            raise UnreadableError(
+                f"{which} of {item.name} in {item.file.filename} cannot be read ({reason(error)})."
+            ) from error
+        start += end - first
+
+
+def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
+    """Half-open runs [a, b) of consecutive numbers, in order: 3 4 5 9 -> (3, 6), (9, 10)."""
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
+
+
+_SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}
+
+
+def require_real(dtype: np.dtype[Any], what: str) -> None:
+    """Raise DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
+    if dtype.kind not in "uif":
+        raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")
