@@ -68,7 +68,7 @@ _FEATURES = {folder for feature in table() for folder in folders(feature)}
 
 @cache
 def _is_of_a_feature(path: Path) -> bool:
-    return not _FEATURES.isdisjoint(path.parents)
+    return not _FEATURES.isdisjoint((path, *path.parents))
 
 
 # Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of

@@ -20,7 +20,7 @@ from beamline.core.events import Event, VolumeDone
 from beamline.core.files import SCAN, parts_of
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
-from beamline.energies.scans import EnergyScans, read_spectra
+from beamline.energies import EnergyScans, read_spectra
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest

@@ -26,7 +26,7 @@ from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
-from beamline.simulate.labels import volumes_beside
+from beamline.simulate import volumes_beside
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter

@@ -43,7 +43,7 @@ from beamline.scan.resume import ResumableRun, other_devices
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
-from beamline.simulate.labels import LabelLog, labels_path, write_labels
+from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.machine import free_memory
-from beamline.gaussians.model import Model, read_model
+from beamline.gaussians import Model, read_model
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.recon_record import ReconRecord
@@ -23,7 +23,7 @@ from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.base.volume import Grid, Volume
-from recon.features.surfaces.marching import BySlices, Mesh, half_way, on_level, surface
+from recon.features.surfaces import BySlices, Mesh, half_way, on_level, surface
 from recon.splatting.splat import project, voxelize
 
 _SLICES = 16  # made at a time

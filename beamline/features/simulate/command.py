@@ -89,7 +89,7 @@ def simulate(request: SimulateRequest) -> None:
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
     """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
-    from beamline.simulate.labels import labels_path
+    from beamline.simulate import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
     seen: dict[str, str] = {}

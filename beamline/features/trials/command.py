@@ -150,7 +150,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
-    from beamline.energies.scans import EnergyScans, read_spectra
+    from beamline.energies import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
     from beamline.features.trials.runner import ComparedScan
     from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff

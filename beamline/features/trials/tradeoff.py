@@ -15,7 +15,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.machine import machine
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
-from beamline.energies.scans import EnergyScans, prepare_energies, views_of
+from beamline.energies import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.plans import (

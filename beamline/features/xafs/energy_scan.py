@@ -15,7 +15,7 @@ from beamline.core.errors import ConfigError
 from beamline.features.xafs.contrast import ContrastRegions
 from beamline.features.xafs.series import Series, line_integrals
 from beamline.scenes.scene_file import open_scene
-from beamline.simulate.labels import volumes_beside
+from beamline.simulate import volumes_beside
 from simulators.frame.mapping import SceneError
 from simulators.frame.sensor import largest_count
 from simulators.light.beam import Beam

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.base.units import HC
-from recon.features.phase.paganin import Paganin, length_of
+from recon.features.phase import Paganin, length_of
 from simulators.effects.scattering.phase_fringes import PhaseFringes
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom

@@ -8,8 +8,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.measure import regionprops
 
-from recon.features.particles.particles import bodies_outside, cleaned, measured, parted, volume_deviation
-from recon.post.enhance import clusters, enhanced, inscribed_box
+from recon.features.particles import bodies_outside, cleaned, measured, parted, volume_deviation
+from recon.post import clusters, enhanced, inscribed_box
 from tests.recon.post.phantom import BALLS, CIRCLE, SHAPE, can, inside
 
 

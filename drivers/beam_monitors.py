@@ -45,7 +45,7 @@ _USUAL = ElectrometerQuery()
 
 
 class SerialSource:
-    """Implements `drivers.beam_monitors.reading.TextSource` over a serial line.
+    """Implements `drivers.beam_monitors.TextSource` over a serial line.
 
     Args:
         url: pyserial URL.
@@ -99,7 +99,7 @@ _PIECE = 1 << 14
 
 
 class PageSource:
-    """Implements `drivers.beam_monitors.reading.TextSource` over http, https or file.
+    """Implements `drivers.beam_monitors.TextSource` over http, https or file.
 
     No proxy is used: the page is in the facility's own network.
 

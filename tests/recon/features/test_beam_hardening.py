@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.features.beam_hardening.curve import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.features.beam_hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
 from simulators.effects.beam.energies import BeamHardening
 from tests.simulators import shots
 

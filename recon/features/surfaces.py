@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.volume import Grid
-from recon.post.enhance import clusters
+from recon.post import clusters
 from recon.splatting.gaussians import Gaussians
 
 

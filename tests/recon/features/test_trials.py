@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.features.trials.fsc import ShellCorrelation, fourier_shell_correlation, soft_cylinder
+from recon.features.trials import ShellCorrelation, fourier_shell_correlation, soft_cylinder
 
 SHAPES = [(32, 32, 32), (12, 40, 40), (31, 20, 37), (1, 48, 48), (40, 9, 9)]
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from simulators.effects.catalogue import CATALOGUE, Domain
-from simulators.scenes.cost.explain import explain
+from simulators.scenes.cost import explain
 from simulators.scenes.scene import load_scene
 from tests.clock import SteppedClock
 from tests.simulators.shots import PHANTOM, shot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simulators.frame.shot import Detector
-from simulators.scenes.emission.counts import AIR, TEFLON, WATER, NemaPhantom, Rod, Scanner, events
+from simulators.scenes.emission import AIR, TEFLON, WATER, NemaPhantom, Rod, Scanner, events
 
 DETECTOR = Detector.centred((4, 64), 1.0)
 ANGLES = np.linspace(0, np.pi, 12, endpoint=False)
