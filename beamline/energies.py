@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
-from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections

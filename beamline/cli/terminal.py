@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from beamline.cli.options import json_events
+from beamline.core.durations import seconds_left
 from beamline.core.events import (
     Counted,
     Done,
@@ -34,7 +35,6 @@ from beamline.core.events import (
     TrialReached,
     VolumeDone,
 )
-from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess
 from beamline.core.sinks import Warnings, sentence
 from beamline.core.stop import terminated_like_interrupted

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.phases import Phases
 from beamline.core.sinks import Note, Warn
 from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.corrections.preparation import Preparation

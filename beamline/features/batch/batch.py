@@ -13,11 +13,11 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file
 from beamline.core.machine import Need
-from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.core.text import count, size
 from beamline.storage.writer_lock import WriterLock, held

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.text import count, csv_text
 from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
 from beamline.storage import hdf5

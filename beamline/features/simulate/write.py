@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import FrameStored, Sink
 from beamline.core.files import refuse_existing
-from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM

@@ -12,8 +12,8 @@ from typing import Any
 import psutil
 
 from beamline.cli.terminal import answering
+from beamline.core.durations import MachineSpeed
 from beamline.core.machine import Need, free_memory
-from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.core.text import count, size
 from beamline.features.trials.launch import TrialData

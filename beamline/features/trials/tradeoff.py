@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 
+from beamline.core.durations import MachineSpeed
 from beamline.core.errors import ConfigError
 from beamline.core.events import Sink, TradeoffStarted
 from beamline.core.files import refuse_existing
 from beamline.core.machine import machine
-from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.energies import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.front import TRADEOFF

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
-from beamline.core.shipped import version
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.installed import version
 from beamline.storage.readers.tiff import VOLUME
-from beamline.storage.recon_record import ReconRecord
+from beamline.storage.recon_record import ReconRecord, VoxelKind
 from recon.base.volume import Grid, Volume
 
 

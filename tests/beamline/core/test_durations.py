@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.core.machine_speed import DAYS, MachineSpeed, seconds_left
+from beamline.core.durations import DAYS, MachineSpeed, seconds_left
 from recon.base.work import Rate
 
 KEY: dict[str, Any] = {"processor": "a", "threads": 2}

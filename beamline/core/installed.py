@@ -1,12 +1,32 @@
-"""Clashes of names: whether Python finds our packages, and which other distributions bring one of the same name.
-
-This runs before all else is imported, and imports the standard library alone.
-"""
+"""What is installed: the version, the configurations and scenes of the package, and other distributions that bring a
+package of our name."""
 
 from __future__ import annotations
 
 import os
 import sys
+from importlib import metadata
+from pathlib import Path
+
+
+def config_folder() -> Path:
+    """The folder of the configurations that come with the package: installed, or beside the packages of a checkout."""
+    installed = Path(__file__).parents[1] / "configs"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """The scenes that come with the package, by name."""
+    return {path.stem: path for path in sorted((config_folder() / "scenes").glob("*.yaml"))}
+
+
+def version() -> str:
+    """The installed distribution's version; "uninstalled" when run from a bare checkout."""
+    try:
+        return metadata.version("splatline")
+    except metadata.PackageNotFoundError:
+        return "uninstalled"
+
 
 OWN_PACKAGES = ("drivers", "recon", "simulators")
 _MARK = b"splatline"  # in the first line of each one's __init__.py

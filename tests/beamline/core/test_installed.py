@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from beamline.core import own_packages
+from beamline.core import installed
 from beamline.features.doctor.check import Grade
 from beamline.features.doctor.examine import packages
 
@@ -23,7 +23,7 @@ def run(script: Path, first: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_here_all_are_ours() -> None:
-    assert own_packages.package_problem(str(ROOT)) == ""
+    assert installed.package_problem(str(ROOT)) == ""
 
 
 def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
@@ -44,7 +44,7 @@ def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
 def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A site-packages with our packages and the distribution `motors`, which has brought a package `drivers`."""
     site = tmp_path / "site-packages"
-    for name in own_packages.OWN_PACKAGES:
+    for name in installed.OWN_PACKAGES:
         (site / name).mkdir(parents=True)
         text = '"""Motors."""\n' if name == "drivers" else '"""Of splatline."""\n'
         (site / name / "__init__.py").write_text(text, encoding="utf-8")
@@ -60,9 +60,9 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_distribution_that_has_overwritten_a_package(environment: Path) -> None:
-    told = own_packages.package_problem(str(environment))
+    told = installed.package_problem(str(environment))
     assert told.startswith(f"{environment / 'drivers/__init__.py'} is not splatline's: it belongs to motors. Install")
-    assert own_packages.clashing_distributions() == {"motors": ("drivers",)}
+    assert installed.clashing_distributions() == {"motors": ("drivers",)}
 
 
 def test_a_package_that_is_not_there(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,7 +70,7 @@ def test_a_package_that_is_not_there(environment: Path, monkeypatch: pytest.Monk
     (environment / "drivers/__init__.py").unlink()
     (environment / "drivers").rmdir()
     monkeypatch.setattr(sys, "meta_path", [])
-    assert "finds no package 'drivers'. Install it again" in own_packages.package_problem(str(environment))
+    assert "finds no package 'drivers'. Install it again" in installed.package_problem(str(environment))
 
 
 def test_the_doctor_names_who_else_has_our_names() -> None:

@@ -1,11 +1,14 @@
-"""MachineSpeed: what operations take on this machine, measured once and kept on disk; and the time that is left.
+"""Durations: what operations take on this machine, measured once and kept on disk; the time that is left; and the
+phases of a long work.
 
-It is measured in processor time, which is the same on a busy machine; a time that follows is that of an idle one.
+Operations are measured in processor time, which is the same on a busy machine; a time that follows is that of an idle
+one.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import platform
 import time
 from collections.abc import Callable, Mapping
@@ -15,8 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import DataError
+from beamline.core.events import PhaseReached, Sink
 from beamline.core.files import write_whole
 from beamline.core.machine import processor, state_folder, usable_cores
+from drivers.base.clock import Clock, SystemClock
 from recon.base.work import Rate
 
 DAYS = 30.0  # after which figures are measured anew: updates and other programs change what a machine does
@@ -96,3 +101,50 @@ def seconds_left(done: float, total: float, spent: float) -> float | None:
         spent: s for what is done.
     """
     return max(total - done, 0.0) * spent / done if done > 0 and spent > 0 else None
+
+
+_SAY_EVERY = 0.2  # s between events on the progress of a phase
+
+
+class Phases:
+    """Consecutive phases without gaps, so that their seconds add up to the time since the start.
+
+    Args:
+        sink: gets an event `progress` of the stage "phase" as each begins, and some on its progress.
+        clock: for their times.
+
+    Attributes:
+        seconds: of each phase that has ended; the sum for a repeated phase.
+    """
+
+    def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
+        self._sink, self._clock = sink, clock or SystemClock()
+        self._name, self._counted, self._begun, self._said = "", "", self._clock.now(), -math.inf
+        self.seconds: dict[str, float] = {}
+
+    def enter(self, name: str, counted: str = "views") -> None:
+        """End the last phase and begin this one; its progress counts up to `counted`."""
+        self.end()
+        self._name, self._counted, self._said = name, counted, -math.inf
+        self._say(0, 0, None, None)
+
+    def progress(self, n: int, total: int) -> None:
+        """Report that n of `total` are done; n = 0 is not reported."""
+        now = self._clock.now()
+        if not n:
+            return
+        if now - self._said >= _SAY_EVERY or n == total:
+            self._said = now
+            spent = max(now - self._begun, 1e-9)
+            self._say(n, total, n / spent, seconds_left(n, total, spent))
+
+    def end(self) -> None:
+        """End the last phase now."""
+        now = self._clock.now()
+        if self._name:
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begun
+            self._begun = now
+        self._name = ""
+
+    def _say(self, n: int, of: int, per_s: float | None, eta_s: float | None) -> None:
+        self._sink(PhaseReached("phase", self._counted, self._name, n, of, per_s, eta_s, time=self._clock.now()))
