@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.recon_record import Value, VoxelKind
+from beamline.storage.recon_record import Value
 from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
@@ -23,7 +24,7 @@ from beamline.reconstruct.outcome import ReportContext, label_of, partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
-from beamline.storage.recon_record import ReconRecord, Value, VoxelKind, VoxelsInFile, recorded_ending
+from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock

@@ -1,47 +1,20 @@
-"""ReconRecord: the record of a volume with the kind of its voxels, the same in its file, in the event `done` and in
-scripts."""
+"""ReconRecord: the record of a volume, the same in its file, in the event `done` and in scripts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.voxel_kind import VoxelKind
 from recon.assess.time_model import NextDecibel
 from recon.base.method import Ending
 from recon.base.volume import Grid, Volume, VolumeSeries
-
-
-class VoxelKind(Enum):
-    """The physical quantity of the voxels."""
-
-    ATTENUATION = "attenuation"
-    """Linear attenuation coefficient, of views in transmission."""
-    ACTIVITY = "activity"
-    """Counts per length of a line of response, of a sample that emits."""
-    SHARE = "volume fraction"
-    """Share of the voxel that a material fills, without a unit."""
-
-    def unit(self, length: str) -> str:
-        """Unit of a voxel, with lengths in `length`, "mm" or "px"; empty for shares."""
-        return {self.ATTENUATION: f"1/{length}", self.ACTIVITY: f"counts/{length}", self.SHARE: ""}[self]
-
-    def label(self, length: str) -> str:
-        """Label of an axis or a colour bar: the quantity and its unit."""
-        unit = self.unit(length)
-        return f"{self.value} ({unit})" if unit else self.value
-
-    @classmethod
-    def of_unit(cls, unit: str) -> VoxelKind:
-        """The kind of voxels with this unit; attenuation if no kind has the unit that a file states."""
-        return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
-
 
 Value = str | int | float | bool | NDArray[Any]
 _MOVE = ("x", "y", "z", "turn", "image", "magnification")  # of a sample between two scans

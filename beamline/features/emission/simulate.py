@@ -18,10 +18,10 @@ from beamline.core.files import refuse_existing, remove, whole_file
 from beamline.core.machine import free_memory
 from beamline.core.sinks import fan_out
 from beamline.core.text import size
+from beamline.core.voxel_kind import VoxelKind
 from beamline.scenes.request import Output, SimulateRequest
 from beamline.scenes.scene_file import Truth, grid_of, open_other, write_truth
 from beamline.storage import hdf5
-from beamline.storage.recon_record import VoxelKind
 from drivers.base.clock import SystemClock
 from simulators.scenes.emission import EmissionScene, Events, events, load_emission
 

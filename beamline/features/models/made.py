@@ -18,8 +18,7 @@ from beamline.storage import hdf5
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import ScanEnding, complete
-from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
+from beamline.storage.writers.rows import PER_FLUSH, Record, Rows, ScanEnding, complete
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.base.volume import Grid, Volume

@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import size
+from beamline.core.voxel_kind import VoxelKind
 from beamline.energies import Spectra
 from beamline.reconstruct.memory import SHARE
 from beamline.report.figures import downwards, dpi_for, new_figure, planes, png
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recon_record import ReconRecord, VoxelKind
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from recon.base.volume import Grid, Volume
 

@@ -12,9 +12,10 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.tiff import VOLUME
-from beamline.storage.recon_record import ReconRecord, VoxelKind
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.volume_file import axes_of
 from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of

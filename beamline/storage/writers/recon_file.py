@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.installed import version
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import datasets, hdf5
 from beamline.storage.recon_record import ReconRecord as ReconRecord
-from beamline.storage.recon_record import Value, VoxelKind
+from beamline.storage.recon_record import Value
 from beamline.storage.structure import require_harmless
 from beamline.storage.writer_lock import opened_whole
 from recon.base.volume import Grid, Volume, VolumeSeries

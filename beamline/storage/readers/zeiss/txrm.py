@@ -19,7 +19,7 @@ from beamline.core.text import count
 from beamline.storage import hdf5
 from beamline.storage.readers.base import Opening, ScanFormat
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")

@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 import recon
 from beamline.cli.main import main
 from beamline.core.errors import DataError
+from beamline.core.voxel_kind import VoxelKind
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, split
@@ -24,7 +25,6 @@ from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.recon_record import VoxelKind
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared

@@ -17,9 +17,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
+from beamline.core.voxel_kind import VoxelKind
 from beamline.features.xafs import command as xafs
 from beamline.features.xafs.series import Series, run_series
-from beamline.storage.recon_record import VoxelKind
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
