@@ -20,8 +20,7 @@ from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules import angle_order
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding, angle_order
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings

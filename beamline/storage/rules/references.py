@@ -32,8 +32,8 @@ from beamline.monitor.references import (
     judge,
 )
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules import Finding
 from beamline.storage.rules.exposures import levelled, usual_exposure, views_differ
-from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 
