@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.plausible import RANGES, doubt
+from beamline.core.quantities import RANGES, doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, cut_sentence, passing_sentence, warn_of_inconsistency

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.recon_record import Value

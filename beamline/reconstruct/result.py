@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from recon.base.geometry import Geometry
 from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume

@@ -18,7 +18,7 @@ from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
-from beamline.core.plausible import doubt, doubt_span
+from beamline.core.quantities import doubt, doubt_span
 from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices

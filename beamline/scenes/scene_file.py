@@ -17,7 +17,7 @@ from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in, whole_file
 from beamline.core.installed import shipped_scenes
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.simulate import volumes_beside
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from recon.assess.time_model import NextDecibel
 from recon.base.method import Ending
 from recon.base.volume import Grid, Volume, VolumeSeries

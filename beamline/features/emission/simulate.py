@@ -16,9 +16,9 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, remove, whole_file
 from beamline.core.machine import free_memory
+from beamline.core.quantities import VoxelKind
 from beamline.core.sinks import fan_out
 from beamline.core.text import size
-from beamline.core.voxel_kind import VoxelKind
 from beamline.scenes.request import Output, SimulateRequest
 from beamline.scenes.scene_file import Truth, grid_of, open_other, write_truth
 from beamline.storage import hdf5

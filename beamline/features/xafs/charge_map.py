@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
+from beamline.core.quantities import VoxelKind
 from beamline.core.text import size
-from beamline.core.voxel_kind import VoxelKind
 from beamline.energies import Spectra
 from beamline.reconstruct.memory import SHARE
 from beamline.report.figures import downwards, dpi_for, new_figure, planes, png

@@ -126,9 +126,10 @@ class TiltAndLens:
 
     def done(self, sentence: str) -> StepDone:
         """What the step did; also recorded if nothing was requested."""
-        lens = {} if self.distortion is None else asdict(self.distortion)
         parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": sentence} if sentence else {})}
-        return StepDone(sentence, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
+        for name, value in ({} if self.distortion is None else asdict(self.distortion)).items():
+            parameters[f"distortion_{name}"] = value if isinstance(value, float) else str(value)
+        return StepDone(sentence, parameters)
 
     def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
         """The resampling of the views; None if they are used as recorded.
@@ -146,10 +147,6 @@ class TiltAndLens:
         if lens is not None and source.cols is not None:
             lens = replace(lens, col=lens.col - source.cols[0])
         return Resampling(source.shape, math.radians(self.tilt_deg), lens, selection.binning)
-
-
-def _plain(value: Any) -> float | str:
-    return value if isinstance(value, float) else str(value)
 
 
 def with_tilt(

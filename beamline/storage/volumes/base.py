@@ -17,7 +17,7 @@ from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
 from beamline.core.installed import version
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from recon.base.volume import Grid, Volume

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord

@@ -265,9 +265,8 @@ class _Fit:
         self.optimiser.step()
         self.step += 1
         residual = math.sqrt(squares * pixels.size / max(float((weights * values**2).sum()), 1e-30))
-        mix = 1.0 if self.step == 1 else 0.05
-        self.loss = squares if self.step == 1 else self.loss + mix * (squares - self.loss)
-        self.residual = residual if self.step == 1 else self.residual + mix * (residual - self.residual)
+        self.loss = squares if self.step == 1 else self.loss + 0.05 * (squares - self.loss)
+        self.residual = residual if self.step == 1 else self.residual + 0.05 * (residual - self.residual)
 
     def _integrals(self, points: F32, lengths: F32) -> Tensor:
         return self.network(self._tensor(points)).mean(1) * self._tensor(lengths)

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 import recon
 from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, split

@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.core.voxel_kind import VoxelKind
+from beamline.core.quantities import VoxelKind
 from beamline.features.xafs import command as xafs
 from beamline.features.xafs.series import Series, run_series
 from beamline.storage.volumes.files import opened_volume, write_volume

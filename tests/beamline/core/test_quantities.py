@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.config import load as config
-from beamline.core.plausible import doubt, doubt_span
+from beamline.core.quantities import doubt, doubt_span
 from beamline.projections import prepare
 from beamline.projections.selection import Selection
 from tests.beamline.array_source import ArraySource
