@@ -173,13 +173,15 @@ def _run(
         for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
             answer.warn(sentence)
         where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
-        title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
-        write_whole(path.with_suffix(".csv"), table_of(slices, scores))
+        title = f"{Path(first.source.path).name}{where}, {slices[0].views.geometry.n_views} views"
+        table = _rows(slices, scores, ("residual_held_out", "verdict", "seconds"), (".6g", "", ".3g"))
+        write_whole(path.with_suffix(".csv"), csv_text(table))
         write_whole(path, sweep_sheet(slices, scores, options, title))
         best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
         means = None if scores is None else scores.shares.tolist()
         facts = {"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means}
-        answer.done(facts, _lines(slices, scores), f"sheet     {path}", f"table     {facts['table']}")
+        lines = _rows(slices, scores, (METRICS["residual_held_out"].label, "", "s"), (".5g", "-", ".2g"))
+        answer.done(facts, aligned(lines, ">"), f"sheet     {path}", f"table     {facts['table']}")
     return slices, scores
 
 
@@ -213,29 +215,27 @@ def _remarks(
     return remarks
 
 
-def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    """The table as CSV: values, residual of held-out views, whether the slice is the best or equivalent to it, and
-    seconds.
-    """
-    rows = [[*slices[0].values, "residual_held_out", "verdict", "seconds"]]
-    for n, each in enumerate(slices):
-        residual = "" if scores is None else f"{scores.shares[n]:.6g}"
-        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
-    return csv_text(rows)
-
-
 def _verdict(scores: Scores | None, n: int) -> str:
     if scores is None or not scores.alike[n]:
         return ""
     return "best" if n == scores.best else "alike"
 
 
-def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    rows = [[*slices[0].values, METRICS["residual_held_out"].label, "", "s"]]
-    for n, each in enumerate(slices):
-        residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
-        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
-    return aligned(rows, ">")
+def _rows(
+    slices: Sequence[SweptSlice], scores: Scores | None, heading: tuple[str, str, str], digits: tuple[str, str, str]
+) -> list[list[str]]:
+    """A heading, then of each slice: values, residual of views held out, whether it is the best or not significantly
+    different from it, and seconds.
+
+    Args:
+        digits: of the residual, what stands for an unknown one, digits of the seconds.
+    """
+    residual, unknown, seconds = digits
+    known = [unknown] * len(slices) if scores is None else [f"{share:{residual}}" for share in scores.shares]
+    return [[*slices[0].values, *heading]] + [
+        [*each.values.values(), known[n], _verdict(scores, n), f"{each.seconds:{seconds}}"]
+        for n, each in enumerate(slices)
+    ]
 
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:

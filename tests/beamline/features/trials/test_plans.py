@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from beamline.features.trials.plans import Depth, trials_of
+from beamline.features.trials.tradeoff import Depth, trials_of
 from recon import methods
 
 
@@ -12,7 +12,7 @@ from recon import methods
 @pytest.mark.parametrize("depth", ["quick", "full"])
 def test_every_trial_is_settings_that_the_method_has(name: str, depth: Depth) -> None:
     method = methods.by_name(name)
-    base, *others = trials_of(name, 5000, depth)
-    assert base.varies == "method" and base.binning == 1
+    base, *others = trials_of(name, 60, 5000, depth)
+    assert base.group == "method" and base.binning == 1
     for tried in (base, *others):
-        assert isinstance(methods.build(method, tried.settings), method)
+        assert isinstance(tried.build(), method)

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ from beamline.core.events import Event
 from beamline.features.trials import runner, tradeoff
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.layout import text
-from beamline.features.trials.runner import ComparedScan
-from beamline.features.trials.table import TIME
-from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff
+from beamline.features.trials.runner import ComparedScan, run_comparison
+from beamline.features.trials.table import TIME, TrialTable
+from beamline.features.trials.tradeoff import TradeoffOptions, planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
@@ -43,8 +44,13 @@ def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
         write_exchange(tmp_path / "scan.h5", SCAN)
     scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
     of_scan = {field.name: changes.pop(field.name) for field in fields(ComparedScan) if field.name in changes}
-    options = TradeoffOptions(replace(scan, **of_scan), ("r2", "fbp"), command="beamline tradeoff scan.h5")
-    return replace(options, **changes)
+    return TradeoffOptions(
+        replace(scan, methods=("r2", "fbp"), command="beamline tradeoff scan.h5", **of_scan), **changes
+    )
+
+
+def run_tradeoff(options: TradeoffOptions, *how: Any, **more: Any) -> TrialTable:
+    return run_comparison(partial(planned_tradeoff, options), options.scan, *how, **more)
 
 
 def _made_up(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
