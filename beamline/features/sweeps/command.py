@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING
 
 import click
@@ -147,7 +148,8 @@ def _options(context: click.Context) -> ReconOptions:
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
-    return replace(options_of(context, BASELINE), target=OutputPaths(Path("slice.h5"), None, written=False))
+    target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
+    return replace(options_of(context, BASELINE), target=target)
 
 
 def _run(
@@ -157,23 +159,21 @@ def _run(
     from beamline.features.sweeps.sweep import scores_of, sliced, sweep_sheet, sweep_slices
 
     slices: list[SweptSlice] = []
-    first = trials[0][1]
     with answering(as_json) as answer:
-        sink, clock = answer.sink, answer.clock
-        with sliced([each for _, each in trials]) as cut:
-            planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
-            try:
-                for each in sweep_slices(planned, sink, clock, answer.counting("slices")):
-                    slices.append(each)
-            except KeyboardInterrupt:
-                if not slices:
-                    raise
-            rows = cut[0].selection.rows
-        scores = scores_of(slices, direct=first.method.traits.direct)
-        for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
+        cut = sliced([each for _, each in trials])
+        planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
+        try:
+            for each in sweep_slices(planned, answer.sink, answer.clock, answer.counting("slices")):
+                slices.append(each)
+        except KeyboardInterrupt:
+            if not slices:
+                raise
+        rows, direct = cut[0].selection.rows, cut[0].method.traits.direct
+        scores = scores_of(slices, direct=direct)
+        for sentence in _remarks(slices, scores, options, direct=direct):
             answer.warn(sentence)
         where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
-        title = f"{Path(first.source.path).name}{where}, {slices[0].views.geometry.n_views} views"
+        title = f"{Path(cut[0].source.path).name}{where}, {slices[0].views.geometry.n_views} views"
         table = _rows(slices, scores, ("residual_held_out", "verdict", "seconds"), (".6g", "", ".3g"))
         write_whole(path.with_suffix(".csv"), csv_text(table))
         write_whole(path, sweep_sheet(slices, scores, options, title))
@@ -249,8 +249,7 @@ def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
 
     with answering(as_json) as answer:
         speed = MachineSpeed()
-        with sliced([each for _, each in trials]) as cut:
-            needs = [estimate(each, speed, busy()) for each in cut]
+        needs = [estimate(each, speed, busy()) for each in sliced([each for _, each in trials])]
         together = Need.in_turn(needs)
         total = None if any(each.seconds is None for each in needs) else together.seconds
         time, first = "not known" if total is None else f"about {duration_text(total)} at most", needs[0]

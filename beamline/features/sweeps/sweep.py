@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +18,7 @@ from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
-from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import WIDTH, new_figure, png, show_grey
 from beamline.report.metrics import METRICS
 from beamline.storage.readers.base import ScanSource
@@ -109,9 +106,8 @@ class Scores:
         return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
 
 
-@contextmanager
-def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
-    """The same reconstruction options for a few rows around the middle, with no output.
+def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
+    """The same reconstruction options for a few rows around the middle.
 
     A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
     are given, all of them are made.
@@ -119,15 +115,11 @@ def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
-    with tempfile.TemporaryDirectory(prefix="beamline-") as folder:
-        target = OutputPaths(Path(folder) / "slice.h5", None, written=False)
-        cut = []
-        for trial in trials:
-            with trial.source.open() as source:
-                selection = _middle(source, trial.selection, halo)
-            cut.append(replace(trial, target=target, selection=selection))
-        yield cut
+    halo, cut = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials), []
+    for trial in trials:
+        with trial.source.open() as source:
+            cut.append(replace(trial, selection=_middle(source, trial.selection, halo)))
+    return cut
 
 
 def _middle(source: ScanSource, selection: Selection, halo: int) -> Selection:
