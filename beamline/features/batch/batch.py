@@ -5,17 +5,19 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
+
+from pydantic import TypeAdapter
 
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
-from beamline.core.files import RECON, named_on_failure, remove, whole_file
+from beamline.core.files import RECON, named_on_failure, remove, whole_file, write_whole
 from beamline.core.machine import Need
 from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import count, size
+from beamline.core.text import count, csv_text, one_line, size
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
@@ -51,6 +53,9 @@ class BatchRow:
     @property
     def has_volume(self) -> bool:
         return self.state in ("done", "poor")
+
+
+_ROWS = TypeAdapter(list[BatchRow])
 
 
 @dataclass(frozen=True)
@@ -279,23 +284,11 @@ def _read(folder: Path) -> list[BatchRow]:
     path = folder / TABLE
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [_row(record) for record in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise DataError(f"{path} is no table of a batch ({error}). Nothing was touched.") from error
-
-
-def _row(record: Mapping[str, str]) -> BatchRow:
-    results: Mapping[str, RowState] = {result: result for result in get_args(RowState)}
-    numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
-    return BatchRow(
-        record["name"], record["scan"], results[record["state"]], method=record["method"], message=record["message"],
-        **numbers,
-    )  # fmt: skip
+            return _ROWS.validate_python([{k: v for k, v in row.items() if v} for row in csv.DictReader(file)])
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
-    path = folder / TABLE
-    with whole_file(path, replace=True) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, [column.name for column in fields(BatchRow)])
-        table.writeheader()
-        table.writerows(asdict(row) for row in rows)
+    names = [column.name for column in fields(BatchRow)]
+    write_whole(folder / TABLE, csv_text([names, *(vars(row).values() for row in rows)]), replace=True)

@@ -116,7 +116,7 @@ class _Instrument:
             return _Taken(plan, prepared, seconds, instrument.truth(grid).data)
 
 
-def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, list[ViewChoice]]:
+def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, Sequence[ViewChoice]]:
     """Scans by all plans as one set of views, with views held out that no plan took, and the views of each plan.
 
     Args:

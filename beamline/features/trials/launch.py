@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
+from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
@@ -147,14 +148,8 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
         )
     counted = whole.weights
     least = None if counted is None else np.stack([counted[group].min(axis=0) for group in groups])
-    means = np.stack([_mean(np.asarray(whole.data[group])) for group in groups])
+    means = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
     return replace(middle, projections=replace(middle.projections, data=means, weights=least), geometry=geometry)
-
-
-def _mean(views: F32) -> F32:
-    """The line integrals [row, col] of the mean transmission of some views [view, row, col]."""
-    least = views.min(axis=0)  # taken out before the exponential, which would be 0 behind much matter
-    return np.asarray(least - np.log(np.exp(least - views).mean(axis=0)), np.float32)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:

@@ -192,16 +192,10 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
     """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
     if volume.grid == grid:
         return volume
-    index = [
-        (there - here[0]) / edge
-        for there, here, edge in zip(grid.coordinates(), volume.grid.coordinates(), volume.grid.spacing, strict=True)
-    ]
-    out = np.empty(grid.shape, np.float32)
-    plane = np.meshgrid(index[1], index[2], indexing="ij")
-    for k, height in enumerate(index[0]):
-        where = np.stack((np.full_like(plane[0], height), *plane))
-        ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
-    return Volume(out, grid)
+    edges = volume.grid.spacing
+    scale, offset = np.divide(grid.spacing, edges), np.subtract(grid.first, volume.grid.first) / edges
+    data = ndimage.affine_transform(volume.data, scale, offset, grid.shape, np.float32, order=1, mode="nearest")
+    return Volume(data, grid)
 
 
 def main(job: Path) -> int:
