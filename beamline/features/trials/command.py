@@ -42,7 +42,6 @@ from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 if TYPE_CHECKING:
     from beamline.features.trials.layout import Plan, TableLayout
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.tradeoff import Depth
     from beamline.projections.scan_statistics import LightAsked
 
 
@@ -151,7 +150,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     from beamline.energies.scans import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.tradeoff import TradeoffOptions, planned_tradeoff
+    from beamline.features.trials.tradeoff import planned_tradeoff
     from beamline.scan.energies import scans_of
 
     context, files = click.get_current_context(), request.files
@@ -170,9 +169,14 @@ def tradeoff(request: TradeoffRequest) -> None:
             source, selection, folder, request.methods or (), request.truth, _light(request), request.seconds,
             request.max_seconds, request.seed, repeating(context, files, folder),
         )  # fmt: skip
-        depth: Depth = "quick" if request.quick else "full"
-        options = TradeoffOptions(scan, depth, request.volumes or 0, scans, names_in(request.states))
-    plan = partial(planned_tradeoff, options)
+        plan = partial(
+            planned_tradeoff,
+            scan,
+            depth="quick" if request.quick else "full",
+            volumes=request.volumes or 0,
+            scans=scans,
+            states=names_in(request.states),
+        )
     _compare(scan, TRADEOFF, plan, dry=request.dry, as_json=request.as_json, begun=begun)
 
 

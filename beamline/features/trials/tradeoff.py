@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -51,36 +51,30 @@ _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
-@dataclass(frozen=True)
-class TradeoffOptions:
-    """The scan and the trials to compare.
+def planned_tradeoff(
+    scan: ComparedScan,
+    warn: Warn,
+    depth: Depth = "quick",
+    volumes: int = 0,
+    scans: EnergyScans | None = None,
+    states: Sequence[str] = (),
+) -> Planned:
+    """Read and correct the views, hold some out, and plan the trials.
 
-    Attributes:
+    Args:
         volumes: that views show in time, to compare a fit of all of them; 0: none.
         scans: all scans at several energies, the one compared first, and their cross sections; None: it has one.
         states: names of two materials that are two states of the same one; empty: no such pair.
-    """
-
-    scan: ComparedScan
-    depth: Depth = "quick"
-    volumes: int = 0
-    scans: EnergyScans | None = None
-    states: Sequence[str] = ()
-
-
-def planned_tradeoff(options: TradeoffOptions, warn: Warn) -> Planned:
-    """Read and correct the views, hold some out, and plan the trials.
 
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    scan = options.scan
-    if options.scans is not None:
-        data, table, trials = _of_energies(scan, options.scans, options.states, warn)
-    elif options.volumes:
-        data, table, trials = _in_time(scan, options.volumes, warn)
+    if scans is not None:
+        data, table, trials = _of_energies(scan, scans, states, warn)
+    elif volumes:
+        data, table, trials = _in_time(scan, volumes, warn)
     else:
-        data, table, trials = _of_one_volume(scan, options.depth, warn)
+        data, table, trials = _of_one_volume(scan, depth, warn)
     if scan.max_seconds is not None:
         trials = telling_first(trials)
     by = "psnr" if data.truth is not None else "residual_held_out"

@@ -18,7 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan, run_comparison
-from beamline.features.trials.tradeoff import TradeoffOptions, planned_tradeoff, split
+from beamline.features.trials.tradeoff import planned_tradeoff, split
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.features.trials.worker import run
@@ -252,5 +252,5 @@ def test_a_trade_off_without_names_tries_the_methods_of_counts(pet: Path, tmp_pa
     plain, emitting = names_compared(), names_compared(emission=True)
     assert set(emitting) - set(plain) == {"mlem", "osem"} and set(plain) < set(emitting)
     scan = ComparedScan(SourceOptions(pet), Selection(), tmp_path / "t", max_seconds=1e-9)
-    table = run_comparison(partial(planned_tradeoff, TradeoffOptions(scan)), scan, lambda _: None, SystemClock())
+    table = run_comparison(partial(planned_tradeoff, scan), scan, lambda _: None, SystemClock())
     assert {outcome.trial.method for outcome in table.outcomes} == set(emitting)

@@ -20,7 +20,7 @@ from beamline.features.trials import runner
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.table import TrialTable
-from beamline.features.trials.tradeoff import TradeoffOptions, planned_tradeoff
+from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
@@ -37,7 +37,7 @@ def asked(path: Path, axis_col: float) -> ComparedScan:
 
 
 def planned(scan: ComparedScan, warn: Callable[[str], None], **several: Any) -> tuple[TrialData, TrialTable]:
-    planned = planned_tradeoff(TradeoffOptions(scan, **several), warn)
+    planned = planned_tradeoff(scan, warn, **several)
     return planned.data, planned.table
 
 
