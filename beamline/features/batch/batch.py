@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file, write_whole
 from beamline.core.machine import Need
-from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.text import count, csv_text, one_line, size
 from beamline.storage.writer_lock import WriterLock, held

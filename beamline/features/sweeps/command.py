@@ -240,8 +240,8 @@ def _rows(
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     """Print the time and memory of the sweep."""
+    from beamline.core.durations import MachineSpeed
     from beamline.core.machine import Need, busy
-    from beamline.core.machine_speed import MachineSpeed
     from beamline.core.text import count, size
     from beamline.features.sweeps.sweep import sliced
     from beamline.reconstruct.estimate import estimate

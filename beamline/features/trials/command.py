@@ -147,7 +147,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
-    from beamline.energies.scans import EnergyScans, read_spectra
+    from beamline.energies import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
     from beamline.features.trials.runner import ComparedScan
     from beamline.features.trials.tradeoff import planned_tradeoff
@@ -188,7 +188,7 @@ def _compare(
     scan: ComparedScan, layout: TableLayout, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None
 ) -> None:
     """Run a comparison and print its table, or print what it will take."""
-    from beamline.core.machine_speed import MachineSpeed
+    from beamline.core.durations import MachineSpeed
     from beamline.features.trials.forecast import dry_run
     from beamline.features.trials.layout import text
     from beamline.features.trials.runner import run_comparison

@@ -12,8 +12,8 @@ from typing import Any
 
 from beamline.core.events import Event, TrialDone
 from beamline.core.files import write_whole
+from beamline.core.installed import version
 from beamline.core.machine import machine_line
-from beamline.core.shipped import version
 from beamline.core.sinks import Warn
 from beamline.core.text import csv_text
 from beamline.features.trials.launch import TrialData

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from beamline.core.durations import MachineSpeed
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
 from beamline.core.files import refuse_existing
 from beamline.core.machine import machine
-from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.forecast import Expected, Timed, expected_seconds, trials_left
 from beamline.features.trials.launch import DATA, TrialData, compile_kernels, run_trial, write_array

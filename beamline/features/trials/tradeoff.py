@@ -12,12 +12,12 @@ from typing import Literal
 
 import numpy as np
 
+from beamline.core.durations import MachineSpeed
 from beamline.core.errors import ConfigError
 from beamline.core.events import TradeoffStarted
 from beamline.core.files import refuse_existing
-from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
-from beamline.energies.scans import EnergyScans, prepare_energies, views_of
+from beamline.energies import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.forecast import Expected, expected_seconds
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.launch import TrialData

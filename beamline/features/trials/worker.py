@@ -39,7 +39,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
+from recon.features.trials import fourier_shell_correlation, soft_cylinder
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution

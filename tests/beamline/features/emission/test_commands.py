@@ -29,7 +29,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared
-from simulators.scenes.emission.counts import events, load_emission
+from simulators.scenes.emission import events, load_emission
 
 SCENE = "emission: {radius: 24}\nscanner: {trues: 2.0e+5}\nlines: {views: 24, shape: [3, 32], pitch: 2.0}\n"
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
-from beamline.energies.scans import EnergyScans, read_spectra
+from beamline.energies import EnergyScans, read_spectra
 from beamline.features.trials import runner
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
