@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,26 +118,18 @@ def fourier_shell_correlation(
     width = 1 / float(max(n * edge for n, edge in zip(shape, edges, strict=True)))
     nyquist = float(min(0.5 / edge for n, edge in zip(shape, edges, strict=True) if n > 1))
     shells = max(1, int(np.floor(nyquist / width + 1e-9)))
-    sums = _sums_of_shells(_spectrum(first, mask), _spectrum(second, mask), shape, edges, width, shells)
-    power = np.sqrt(sums.first * sums.second)
-    correlation = np.divide(sums.cross, power, out=np.full(shells + 1, np.nan), where=power > 0)
-    used = sums.voxels > 0
+    spectra = _spectrum(first, mask), _spectrum(second, mask)
+    cross, one, other, voxels = _sums_of_shells(*spectra, shape, edges, width, shells)
+    power = np.sqrt(one * other)
+    correlation = np.divide(cross, power, out=np.full(shells + 1, np.nan), where=power > 0)
+    used = voxels > 0
     used[0] = False  # the mean was subtracted
     return ShellCorrelation(
         frequency=np.float64(width) * np.arange(shells + 1, dtype=np.float64)[used],
         correlation=np.clip(correlation[used], -1, 1),
-        independent=np.maximum(1.0, sums.voxels[used] * _independent_share(mask)),
+        independent=np.maximum(1.0, voxels[used] * _independent_share(mask)),
         nyquist=nyquist,
     )
-
-
-class _Sums(NamedTuple):
-    """Over each shell [shell]: of F₁ F₂*, |F₁|², |F₂|², and of ones."""
-
-    cross: F64
-    first: F64
-    second: F64
-    voxels: F64
 
 
 def _sums_of_shells(
@@ -148,8 +139,9 @@ def _sums_of_shells(
     edges: F64,
     width: float,
     shells: int,
-) -> _Sums:
-    """Sums of the spectra of two real volumes of this shape, over shells of this width (1/mm)."""
+) -> F64:
+    """Sums [4, shell] of F₁ F₂*, |F₁|², |F₂|² and ones, of two real volumes of this shape, over shells of this width
+    (1/mm)."""
     kz, ky = (np.fft.fftfreq(n, edge) for n, edge in zip(shape[:2], edges[:2], strict=True))
     kx = np.fft.rfftfreq(shape[2], edges[2])
     twice = np.full(kx.size, 2.0)  # only half of a real volume's transform is stored; the other half is its conjugate
@@ -158,18 +150,13 @@ def _sums_of_shells(
         twice[-1] = 1
     in_plane = ky[:, None] ** 2 + kx[None, :] ** 2
     weight = np.broadcast_to(twice, in_plane.shape).ravel()
-    sums = _Sums(*(np.zeros(shells + 1) for _ in range(4)))
+    sums = np.zeros((4, shells + 1))
     for k, height in enumerate(kz):
         shell = np.rint(np.sqrt(in_plane + height**2) / width).astype(np.int64).ravel()
         inside = np.flatnonzero(shell <= shells)
         index, w = shell[inside], weight[inside]
         x, y = a[k].ravel()[inside], b[k].ravel()[inside]
-        for total, values in (
-            (sums.cross, (x * y.conj()).real),
-            (sums.first, np.abs(x) ** 2),
-            (sums.second, np.abs(y) ** 2),
-            (sums.voxels, np.ones(w.size)),
-        ):
+        for total, values in zip(sums, ((x * y.conj()).real, np.abs(x) ** 2, np.abs(y) ** 2, 1.0), strict=True):
             total += np.bincount(index, w * values, shells + 1)
     return sums
 
