@@ -195,7 +195,7 @@ class PnpDct(VoxelMethod):
     label: ClassVar[str] = "PnP-DCT"
     traits: ClassVar[Traits] = Traits(halo=16, own_length=True, error_bars=(2.3, 0.25))
 
-    iterations: Count = 25
+    iterations: Count = 35
     patch_threshold: NonNegative | None = None
     allow_negative: bool = False
 
