@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 import recon
 from beamline import api
-from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
 from beamline.energies.scans import read_spectra
@@ -31,6 +29,7 @@ from recon.base.method import Progress
 from recon.base.ray_width import RayWidth
 from recon.features.joint import spectral
 from simulators.samples.materials.materials import known
+from tests.beamline.cli.small_scan import beamline
 
 pytest.importorskip("xraylib")
 TRIED = spectral.weights_by_views
@@ -53,10 +52,6 @@ effects: [photon_noise]
 """
 
 
-def run(*words: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("series")
@@ -64,7 +59,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     made = []
     for seed, energy in enumerate(ENERGIES):
         made.append(folder / f"scan{seed}.h5")
-        done = run(
+        done = beamline(
             "simulate", folder / "scene.yaml", "--set", f"beam.energy_kev={energy}", "--seed", str(seed), "-o", made[-1]
         )
         assert done.exit_code == 0, done.output
@@ -94,7 +89,7 @@ def made(scans: list[Path]) -> Path:
     """The folder of the volumes of all scans: out_charged.h5 and out_fresh.h5."""
     folder = scans[0].with_name("made")
     folder.mkdir()
-    done = run("materials", *scans, "--spectra", spectra(folder), "-o", folder / "out.h5", "--axis", "31.5")
+    done = beamline("materials", *scans, "--spectra", spectra(folder), "-o", folder / "out.h5", "--axis", "31.5")
     assert done.exit_code == 0, done.output
     return folder
 
@@ -118,7 +113,7 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], made: Pa
         assert share[other][name] < 0.15
     page = (made / "out.html").read_text(encoding="utf-8")
     assert "Slices of each material" in page and "2 materials, fresh, charged, of 6 × 64 × 64 voxels" in page
-    again = run("materials", *scans, "--spectra", spectra(made), "-o", made / "out.h5")
+    again = beamline("materials", *scans, "--spectra", spectra(made), "-o", made / "out.h5")
     assert "never overwritten" in again.output
 
 
@@ -149,7 +144,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(scans: list[Path], ma
 
 def test_states_of_one_material_keep_their_sum(scans: list[Path], made: Path, tmp_path: Path) -> None:
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--states", "fresh, charged"
-    done = run("materials", *scans, *words)
+    done = beamline("materials", *scans, *words)
     assert done.exit_code == 0, done.output
     found = {}
     for name, folder, states in (("plain", made, None), ("smooth", tmp_path, "fresh,charged")):
@@ -165,7 +160,7 @@ def test_states_of_one_material_keep_their_sum(scans: list[Path], made: Path, tm
         np.abs(share["smooth"] - np.round(share["smooth"])).mean()
         < 0.5 * np.abs(share["plain"] - np.round(share["plain"])).mean()
     )
-    refused = run(
+    refused = beamline(
         "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "no.h5", "--states", "fresh,other"
     )
     assert refused.exit_code == 2 and "expected two of the materials fresh, charged" in refused.output
@@ -184,7 +179,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
         ([*scans, "--spectra", tmp_path / "absent.csv"], "no table of spectra"),
     ):
         for dry in ([], ["--dry-run"]):
-            done = run("materials", *words, "-o", tmp_path / "out.h5", "--axis", "31.5", *dry)
+            done = beamline("materials", *words, "-o", tmp_path / "out.h5", "--axis", "31.5", *dry)
             assert done.exit_code != 0
             assert said in done.output
     assert not list(tmp_path.glob("out*"))
@@ -204,7 +199,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
 )
 def test_a_hostile_table_is_refused(scans: list[Path], tmp_path: Path, table: str, said: str) -> None:
     (tmp_path / "table.csv").write_text(table, newline="")
-    done = run(
+    done = beamline(
         "materials", *scans[:2], "--spectra", tmp_path / "table.csv", "-o", tmp_path / "out.h5", "--axis", "31.5"
     )
     assert done.exit_code in (2, 5), done.output
@@ -225,14 +220,14 @@ def test_a_scan_of_larger_pixels_is_interpolated_to_those_of_the_first(
     other = tmp_path / "larger.h5"
     words = "--set", f"beam.energy_kev={ENERGIES[2]}", "--seed", "2", "-o", other
     pixels = f"detector.pixel_size_um={2.2 * larger}"
-    assert run("simulate", scans[0].with_name("scene.yaml"), *words, "--set", pixels).exit_code == 0
+    assert beamline("simulate", scans[0].with_name("scene.yaml"), *words, "--set", pixels).exit_code == 0
     words = "--spectra", spectra(tmp_path), "--axis", "31.5"
-    done = run("materials", *scans[:2], other, scans[3], *words, "-o", tmp_path / "out.h5")
+    done = beamline("materials", *scans[:2], other, scans[3], *words, "-o", tmp_path / "out.h5")
     assert done.exit_code == code, done.output
     if code:
         assert "The scans do not fit together" in done.output and not list(tmp_path.glob("out*"))
         return
-    assert run("materials", *scans, *words, "-o", tmp_path / "equal.h5").exit_code == 0
+    assert beamline("materials", *scans, *words, "-o", tmp_path / "equal.h5").exit_code == 0
     volumes = []
     for name in ("out", "equal"):
         with opened_volume(tmp_path / f"{name}_charged.h5") as record:
@@ -250,7 +245,7 @@ def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "out.tif", "out"])
 def test_an_output_of_another_format_is_refused(scans: list[Path], tmp_path: Path, name: str) -> None:
-    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / name if name else "")
+    done = beamline("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / name if name else "")
     assert done.exit_code == 2
     assert "ends in .h5" in done.output
     assert not list(tmp_path.glob("out*"))
@@ -262,7 +257,7 @@ def test_too_little_memory_is_said_before_a_scan_is_corrected(
     monkeypatch.setattr("beamline.energies.scans.prepare_projections", None)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--memory", "1M"
     for more in ((), ("--dry-run",)):
-        done = run("materials", *scans, *words, *more)
+        done = beamline("materials", *scans, *words, *more)
         assert done.exit_code == 2
         assert "Volumes of materials are not made in slabs: give --rows with 2 rows or fewer" in done.output
     assert not list(tmp_path.glob("out*"))
@@ -287,7 +282,7 @@ def test_ctrl_c_while_weights_are_tried_ends_with_the_volumes_so_far(
         return heard
 
     monkeypatch.setattr("beamline.reconstruct.job.progress_events", interrupted)
-    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+    done = beamline("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
     assert done.exit_code == 4, done.output
     assert shown == [1, 2, 3]
     for material in GRAINS:
@@ -308,14 +303,14 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
 
     monkeypatch.setattr("beamline.energies.scans.prepare_projections", prepared)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--rows", "0:1"
-    done = run("materials", *scans[:2], *words)
+    done = beamline("materials", *scans[:2], *words)
     assert done.exit_code == code, done.output
     assert ("Give an --exposure-arc that holds for all" in " ".join(done.output.split())) == (code == 2)
 
 
 def test_a_source_within_the_field_is_refused(scans: list[Path], tmp_path: Path) -> None:
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--cone", "0.01:0.02"
-    done = run("materials", *scans[:2], *words)
+    done = beamline("materials", *scans[:2], *words)
     assert done.exit_code == 5, done.output
     assert "the box reaches" in done.output
     assert not list(tmp_path.glob("out*"))
@@ -334,9 +329,9 @@ def test_a_sample_that_moved_between_the_scans_is_registered(tmp_path: Path) -> 
         (tmp_path / "scene.yaml").write_text(text)
         made.append(tmp_path / f"scan{seed}.h5")
         words = "--set", f"beam.energy_kev={energy}", "--seed", str(seed), "-o", made[-1]
-        assert run("simulate", tmp_path / "scene.yaml", *words).exit_code == 0
+        assert beamline("simulate", tmp_path / "scene.yaml", *words).exit_code == 0
     words = "--spectra", spectra(tmp_path), "--axis", "31.5", "--register"
-    done = run("materials", *made, *words, "-o", tmp_path / "out.h5")
+    done = beamline("materials", *made, *words, "-o", tmp_path / "out.h5")
     assert done.exit_code == 0, done.output
     with opened_volume(tmp_path / "out_charged.h5") as record:
         found = np.asarray(record.parameters["displacements"])[:, :3] / PITCH

@@ -21,7 +21,6 @@ from beamline.features.trials import runner, tradeoff
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.layout import text
 from beamline.features.trials.runner import ComparedScan
-from beamline.features.trials.table import TIME
 from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.scan_statistics import LightAsked
@@ -112,15 +111,6 @@ def test_each_trial_has_the_photons_of_its_views(tmp_path: Path, made_up: object
     assert "in 30 views" in table.scan["light"] and table.dose.axis == "photons a pixel in the open beam"
     for row, outcome in zip(_rows(tmp_path / "out"), table.outcomes, strict=True):
         assert float(row["photons"]) == pytest.approx(photons * outcome.trial.views)
-
-
-def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path: Path, made_up: object) -> None:
-    table = run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
-    said = text(table, TRADEOFF)
-    best = {table.compared[i].trial.label for i in table.front(TIME)}
-    marked = {line[2:].split("  ")[0] for line in said.splitlines() if line.startswith("* ")}
-    assert marked == best
-    assert " ".join(said.split()).count("s a dB") == len(best) - 1
 
 
 def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> None:
@@ -224,20 +214,6 @@ def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_
         assert "0.00 s" not in words and " µs" in words and ">0.00<" not in words
     fbp = next(o for o in table.compared if o.trial.method == "fbp")
     assert f"{fbp.seconds:.2e}".replace("e-0", "e-") in said  # 5.40e-05 s: three digits where two decimals say 0.00
-
-
-def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any) -> None:
-    time = iter(range(0, 10_000, 5))
-    limits: list[float] = []
-
-    def timed(trial: Trial, work: Path, seed: int, left: float, keep: Path | None) -> Outcome:
-        limits.append(left)
-        return _made_up(trial)
-
-    made_up(timed)
-    table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: float(next(time)))
-    assert 0 < table.n_done < len(table.outcomes)
-    assert all(0 < left <= 60 for left in limits) and limits == sorted(limits, reverse=True)
 
 
 def test_a_limit_of_time_bounds_reading_compiling_and_the_page(
