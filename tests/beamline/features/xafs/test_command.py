@@ -186,7 +186,7 @@ def said(result: Result) -> Any:
 def test_edges_of_a_scene_move_up_with_the_charge(tmp_path: Path, real_pictures: None) -> None:
     """By 2 eV for nickel from fresh to charged, as the scene has it; the picture and the table have all states."""
     done = _beamline(
-        "edge_scan", "--from", 8.32, "--to", 8.38, "--step", 0.0005, "--states", "0,0.5,1", "--json",
+        "edge_scan", "--from", 8.32, "--to", 8.38, "--step", 0.001, "--states", "0,0.5,1", "--json",
         "-o", tmp_path / "states.png",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
@@ -228,37 +228,46 @@ def fraction(path: Path, values: np.ndarray, grid: Grid, **other: Any) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["h5", "tif", "ome.zarr"])
-def test_a_map_of_volume_fractions(tmp_path: Path, kind: str, real_pictures: None) -> None:
-    grid = Grid((20, 12, 10), 0.01)
-    charge = np.linspace(0, 1, 20)[:, None, None] * np.ones(grid.shape)
-    filled = np.zeros(grid.shape)
-    filled[:, 2:9, 3:8] = 0.9
-    filled[:, 2, :] = 0.4  # less than half
-    fresh = fraction(tmp_path / "fresh.h5", (1 - charge) * filled, grid)
-    charged = fraction(tmp_path / "charged.h5", charge * filled, grid)
-    out, drawn = tmp_path / f"map.{kind}", tmp_path / "map.png"
-    done = _beamline(fresh, charged, "--volume", out, "-o", drawn)
+GRID = Grid((20, 12, 10), 0.01)
+CHARGE = np.linspace(0, 1, 20)[:, None, None] * np.ones(GRID.shape)
+FILLED = np.zeros(GRID.shape)
+FILLED[:, 2:9, 3:8] = 0.9
+FILLED[:, 2, :] = 0.4  # less than half
+
+
+def mapped(folder: Path, name: str, *words: object) -> tuple[str, np.ndarray[Any, Any]]:
+    """What the command says of the volumes fresh and charged, and their map."""
+    fresh = fraction(folder / "fresh.h5", (1 - CHARGE) * FILLED, GRID)
+    charged = fraction(folder / "charged.h5", CHARGE * FILLED, GRID)
+    done = _beamline(fresh, charged, "--volume", folder / name, "-o", folder / "map.png", *words)
     assert done.exit_code == 0, done.output
-    assert "charged in the sum of fresh, charged" in done.stdout and drawn.stat().st_size > 10_000
-    with opened_volume(out) as record:
-        found = np.asarray(record.volume.data[:])
+    with opened_volume(folder / name) as record:
         assert record.volume.grid.voxel_size == pytest.approx(0.01)
-    assert (np.isfinite(found) == (filled >= 0.5)).all()
-    assert found[filled >= 0.5] == pytest.approx(charge[filled >= 0.5], abs=1e-6)
-    more = _beamline(fresh, charged, "--volume", tmp_path / "more.h5", "--least", 0.3, "-o", tmp_path / "2.png")
-    assert more.exit_code == 0
-    with opened_volume(tmp_path / "more.h5") as record:
-        assert (np.isfinite(np.asarray(record.volume.data[:])) == (filled >= 0.3)).all()
+        return done.stdout, np.asarray(record.volume.data[:])
+
+
+@pytest.mark.parametrize("kind", ["h5", "tif", "ome.zarr"])
+def test_a_map_of_volume_fractions(tmp_path: Path, kind: str) -> None:
+    said, found = mapped(tmp_path, f"map.{kind}")
+    assert "charged in the sum of fresh, charged" in said
+    assert (np.isfinite(found) == (FILLED >= 0.5)).all()
+    assert found[FILLED >= 0.5] == pytest.approx(CHARGE[FILLED >= 0.5], abs=1e-6)
+
+
+def test_a_map_of_voxels_that_are_less_full_is_drawn(tmp_path: Path, real_pictures: None) -> None:
+    _, found = mapped(tmp_path, "map.h5", "--least", 0.3)
+    assert (np.isfinite(found) == (FILLED >= 0.3)).all()
+    assert (tmp_path / "map.png").stat().st_size > 10_000
 
 
 def test_a_map_of_volumes_of_several_energies(tmp_path: Path) -> None:
-    """Filtered back-projections of two grains at four energies: one is charged, the other is not."""
+    """Filtered back-projections of two grains at three energies: one is charged, the other is not."""
     (tmp_path / "scene.yaml").write_text(SCENE)
     volumes = []
-    for seed, energy in enumerate(ENERGIES):
+    energies = (ENERGIES[0], ENERGIES[1], ENERGIES[3])
+    for seed, energy in enumerate(energies):
         scan, volume = tmp_path / f"scan{seed}.h5", tmp_path / f"fbp{seed}.h5"
-        words = "--set", f"beam.energy_kev={energy}", "--set", "scan.views=90", "--seed", seed
+        words = "--set", f"beam.energy_kev={energy}", "--set", "scan.views=60", "--seed", seed
         assert beamline("simulate", tmp_path / "scene.yaml", *words, "-o", scan).exit_code == 0
         words = "-m", "fbp", "--axis", "31.5", "--no-report"
         done = beamline("recon", scan, *words, "-o", volume)
@@ -269,9 +278,9 @@ def test_a_map_of_volumes_of_several_energies(tmp_path: Path) -> None:
         "--json",
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert said(done)["energies_kev"] == pytest.approx(ENERGIES) and said(done)["of"] == "charged"
+    assert said(done)["energies_kev"] == pytest.approx(energies) and said(done)["of"] == "charged"
     with opened_volume(tmp_path / "map.h5") as record:
-        middle = np.asarray(record.volume.data[:])[3]
+        middle = np.asarray(record.volume.data[:])[2]
     y, x = (np.mgrid[:64, :64] - 31.5) * PITCH
     for name, at in GRAINS.items():
         inside = middle[np.hypot(x - at[0], y - at[1]) < 0.006]
