@@ -162,11 +162,12 @@ def test_scratches_take_the_light_of_lines() -> None:
         rng = fixed_rng("flat_structure", seed)
         row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
         length = -math.log1p(-chance) * 80
-        reach = length / 2 + 10
+        reach = length / 2 + 18
         if not (reach < row < 2304 - reach and reach < col < 4096 - reach):
             continue
         inside += 1
-        loss = 1 - scratch.transmission(_roi(0, 0, 2304, 4096))
+        row0, col0, size = 4 * (int(row - reach) // 4), 4 * (int(col - reach) // 4), 4 * (int(2 * reach) // 4)
+        loss = 1 - scratch.transmission(_roi(row0, col0, size, size))
         assert loss.sum() == pytest.approx(deep * (length * math.sqrt(2 * math.pi) * 2 + 8 * math.pi), rel=2e-3)
         j, i = np.nonzero(loss > 0.5 * loss.max())
         if length > 40:  # its direction is its angle: rows along its sine, columns along its cosine

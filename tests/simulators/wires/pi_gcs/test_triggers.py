@@ -166,18 +166,6 @@ def test_a_motion_error_ends_the_pulses() -> None:
     assert wire.degrees() == [2, 3, 4]
 
 
-def test_a_stop_at_the_instant_of_a_pulse_neither_loses_nor_repeats_one() -> None:
-    for k in range(8):
-        wire = Wire()
-        wire.window("1", "10", "20.5")
-        wire.tell("MOV 1 40")
-        for _ in range(k):
-            wire.clock.sleep(wire.line.next_after(wire.clock.now()).time - wire.clock.now())  # type: ignore[union-attr]
-        wire.run("STP" if k % 2 else "HLT 1")
-        wire.run("MOV 1 40")
-        assert wire.degrees() == list(range(10, 21))
-
-
 @settings(max_examples=60)
 @given(
     start=st.integers(1, 3000), step=st.integers(1, 700), n=st.integers(1, 40), sign=st.sampled_from([-1, 1]),
