@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.shipped import shipped_scenes
+from beamline.core.installed import shipped_scenes
 from beamline.features.simulate import command as module
 from beamline.features.simulate import write
 from beamline.features.simulate.write import scan_of, write_scan
