@@ -22,7 +22,6 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
-from recon.base.geometry import Geometry
 from tests.bench import quality_cases
 from tests.bench.league_peers import LEAGUE
-from tests.bench.quality_cases import Case, cone, diamond, seen_by_simulator, slab, strip_integrals
+from tests.bench.quality_cases import Case, cone, diamond, rows_of, seen_by_simulator, slab, strip_integrals
 from tests.bench.test_patch_prior import TEXTURED
 
 F32 = NDArray[np.float32]
@@ -80,25 +78,6 @@ def smaller(case: Case, rows: int = 4) -> Case:
         return case
     first = (geometry.detector_shape[0] - rows) // 2
     return rows_of(case, range(first, first + rows))
-
-
-def rows_of(case: Case, rows: Sequence[int]) -> Case:
-    """A case of these rows of a parallel beam, as if they were neighbours."""
-    chosen, shape = list(rows), (len(rows), case.geometry.detector_shape[1])
-    unseen = case.unseen
-
-    def cut(geometry: Geometry) -> Geometry:
-        return replace(geometry, detector_shape=shape, axis_row=(len(rows) - 1) / 2)
-
-    return replace(
-        case,
-        projections=np.ascontiguousarray(case.projections[:, chosen]),
-        geometry=cut(case.geometry),
-        grid=replace(case.grid, shape=(len(rows), *case.grid.shape[1:])),
-        truth=case.truth[chosen],
-        weights=None if case.weights is None else np.ascontiguousarray(case.weights[:, chosen]),
-        unseen=unseen and (unseen[0][:, chosen], cut(unseen[1]), unseen[2][:, chosen]),
-    )
 
 
 def judged(case: Case, volume: F32) -> float:

@@ -9,8 +9,8 @@ method is given data of its own making.
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -49,6 +49,25 @@ class Case:
     peak: float
     weights: F32 | None = None
     unseen: tuple[F32, Geometry, NDArray[np.bool_]] | None = None
+
+
+def rows_of(case: Case, rows: Sequence[int]) -> Case:
+    """A case of these rows of a parallel beam, as if they were neighbours."""
+    chosen, shape = list(rows), (len(rows), case.geometry.detector_shape[1])
+    unseen = case.unseen
+
+    def cut(geometry: Geometry) -> Geometry:
+        return replace(geometry, detector_shape=shape, axis_row=(len(rows) - 1) / 2)
+
+    return replace(
+        case,
+        projections=np.ascontiguousarray(case.projections[:, chosen]),
+        geometry=cut(case.geometry),
+        grid=replace(case.grid, shape=(len(rows), *case.grid.shape[1:])),
+        truth=case.truth[chosen],
+        weights=None if case.weights is None else np.ascontiguousarray(case.weights[:, chosen]),
+        unseen=unseen and (unseen[0][:, chosen], cut(unseen[1]), unseen[2][:, chosen]),
+    )
 
 
 def seen_by_simulator(fine: F32, geometry: Geometry, voxel: float | None = None) -> F32:

@@ -1,4 +1,4 @@
-"""A small sample with a known answer: spheres in a cylinder, exact chords, photon noise."""
+"""A small sample of spheres."""
 
 from __future__ import annotations
 

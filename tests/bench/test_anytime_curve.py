@@ -28,7 +28,6 @@ from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import Projector
-from recon.warm_up import warm_up
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
@@ -160,36 +159,3 @@ def slab(rows: int, side: int, count: int, views: int) -> tuple[F32, Geometry]:
     geometry = Geometry.parallel(golden(views), (rows, side))
     data = project(model, geometry).numpy()
     return (data + rng.normal(0, 0.005 * data.max(), data.shape)).astype(np.float32), geometry
-
-
-@pytest.mark.bench
-@pytest.mark.timeout(1800)
-def test_the_volume_is_there_soon_after_the_last_view() -> None:
-    """180 views a second apart, 16 rows of 256: until the last round leaves no more than a fit to all views does."""
-    warm_up()
-    rows, side, views = 16, 256, 180
-    data, geometry = slab(rows, side, 3000, views)
-    scratch = recon.reconstruct(data, geometry, recon.R2(finish=0), control=recon.RunControl(now=two_cores))
-    assert scratch.gaussians is not None
-
-    def left(gaussians: Gaussians) -> float:
-        return float(np.linalg.norm(project(gaussians, geometry).numpy() - data) / np.linalg.norm(data))
-
-    goal = left(scratch.gaussians)
-    # A second of two cores for 256 rows; rows are alike, so that this slab has its share of them.
-    share = rows / 256
-    model = StreamingFit(geometry, now=two_cores)
-    for view in range(views):
-        model.add_views(data[view : view + 1], geometry.angles[view : view + 1])
-        model.advance(share)
-    waited, found = 0.0, [left(model.gaussians)] if model.gaussians is not None else []
-    while found[-1] > goal and waited < 60 * share:
-        begin = two_cores()
-        model.advance(2 * share)
-        waited += two_cores() - begin
-        assert model.gaussians is not None
-        found.append(left(model.gaussians))
-    print(
-        f"\nleft by a fit of all views {goal:.4f} in {scratch.seconds:.1f} s; stream {found[0]:.4f} -> {found[-1]:.4f}"
-    )
-    print(f"as good after {waited:.1f} s of the slab, {waited / share:.0f} s of 256 rows")

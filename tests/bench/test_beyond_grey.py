@@ -22,11 +22,10 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.features.surfaces import Mesh, half_way, on_level, surface
-from simulators.samples.materials.materials import known
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene
 from tests.bench.quality_cases import OBJECTS, padded, seen_by_simulator
-from tests.bench.test_materials import grains
+from tests.bench.test_materials import counted, cross_sections, grains
 from tests.bench.test_series import FOAM, of_sub_scans, scanned
 from tests.conftest import SHARED_DATA
 
@@ -96,13 +95,10 @@ def test_energies(kind: str) -> None:
     truth = np.stack([coarse(part) for part in parts])
     energy = np.arange(120) % len(ENERGIES)
     geometry = Geometry.parallel(np.arange(120) * np.pi / 120, truth.shape[1:3], pixel_pitch=PITCH)
-    oxide = known("NMC811")
-    assert oxide is not None
-    sections = np.stack([replace(oxide, state_of_charge=charge).attenuation(ENERGIES) for charge in (0.0, 1.0)], 1)
+    sections = cross_sections(ENERGIES)[:, :2]
     lines = [seen_by_simulator(part, geometry, PITCH / 2) for part in parts]
     depth = sum(line * sections[energy, m][:, None, None] for m, line in enumerate(lines))
-    counts = np.random.default_rng(2).poisson(5000 * np.exp(-depth)).clip(1)
-    views = recon.EnergyViews((-np.log(counts / 5000)).astype(np.float32), geometry, energy, sections)
+    views = recon.EnergyViews(counted(depth, 5000), geometry, energy, sections)
 
     def apart() -> F32:
         own = [np.flatnonzero(energy == e) for e in range(len(ENERGIES))]

@@ -8,12 +8,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-import recon
 from recon.base.geometry import Geometry
-from recon.base.method import Method
 from recon.base.volume import Grid
 from recon.voxels.fbp import Filter, fbp_block, fbp_memory, is_gridded, plan_fbp
-from recon.warm_up import warm_up
 
 
 @pytest.mark.bench
@@ -40,27 +37,3 @@ def test_fbp(views: int, cols: int, filter: Filter) -> None:
         f"(best {min(busy):.4f}), {peak / 1e9:.2f} GB, {fbp_memory(views, cols) / 1e9:.2f} expected"
     )
     assert peak < 1.2 * fbp_memory(views, cols)
-
-
-@pytest.mark.bench
-@pytest.mark.parametrize("method", [recon.OsSirtTv(iterations=2, tv_weight=0.01), recon.Sirt(iterations=2)])
-@pytest.mark.parametrize("cols", [256, 512, 1024, 2048])
-def test_iterations(method: Method, cols: int) -> None:
-    """Two iterations of sixteen rows: CPU seconds of an iteration a slice, and memory against the plan."""
-    views, rows = 90, 16
-    geometry = Geometry.parallel(np.arange(views) * np.pi / views, (rows, cols))
-    grid = Grid.matching(geometry)
-    data = np.random.default_rng(0).random((views, rows, cols), dtype=np.float32)
-    warm_up(method, geometry)
-    tracemalloc.start()
-    begin = time.process_time()
-    recon.reconstruct(data, geometry, method)
-    busy, peak = time.process_time() - begin, tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    planned = method.memory(geometry, grid, False)
-    print(
-        f"\n{method.name}, {views} views, {cols} columns: {busy / rows / 2:.3f} CPU s a slice and iteration, "
-        f"{busy / 2 / (views * grid.shape[1] ** 2 * rows) * 1e9:.2f} ns a voxel and view, "
-        f"{peak / 1e9:.2f} GB, {planned / 1e9:.2f} planned"
-    )
-    assert peak < planned

@@ -1,4 +1,4 @@
-"""How fast the GPU kernels and a step are; run on a CUDA machine with  pytest -m "gpu and bench" -s tests/bench."""
+"""How fast a step on the GPU is; run on a CUDA machine with  pytest -m "gpu and bench" -s tests/bench."""
 
 from __future__ import annotations
 
@@ -39,27 +39,6 @@ def _median_ms(call: Callable[[], object], repeats: int = 51) -> tuple[float, fl
     return float(middle), float(high - low)
 
 
-def _device_ms(call: Callable[[], object], repeats: int = 50) -> float:
-    """Mean ms on the device with launches queued ahead, so that what the host needs for each is hidden if shorter."""
-    for _ in range(3):
-        call()
-    begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    torch.cuda.synchronize()
-    begin.record()
-    for _ in range(repeats):
-        call()
-    end.record()
-    torch.cuda.synchronize()
-    return float(begin.elapsed_time(end)) / repeats
-
-
-def _bytes_a_second() -> float:
-    """What a plain copy reaches on this device, reading and writing."""
-    source = torch.empty(2**26, device="cuda")
-    target = torch.empty_like(source)
-    return 2 * 4 * 2**26 / (1e-3 * _device_ms(lambda: target.copy_(source)))
-
-
 def _model(n: int, extent: float, seed: int = 0) -> Gaussians:
     """n Gaussians in a cube, boxes of 9 to 15 pixels, ordered in space as a fit orders them."""
     rng = np.random.default_rng(seed)
@@ -73,65 +52,6 @@ def _model(n: int, extent: float, seed: int = 0) -> Gaussians:
 def _raw(g: Gaussians, backend: Backend) -> list[torch.Tensor]:
     arrays = g.arrays()
     return [backend.array(arrays[name]) for name in ("means", "log_scales", "quaternions", "raw_densities")]
-
-
-@pytest.mark.parametrize(("n", "side"), [(20_000, 512), (50_000, 256), (200_000, 512)])
-def test_kernels(n: int, side: int) -> None:
-    from recon.kernels.gpu.images import render  # this module must load where triton is missing
-
-    # FaCT-GS has 0.31 ms forward and 0.44 ms backward for 20k on 512 x 512 (other footprints, device not stated).
-    rate = _bytes_a_second()
-    backend, unit = backend_for("cuda"), 1.0
-    raw = _raw(_model(n, 0.86 * side), backend)
-    view, grid = Geometry.parallel([0.7], (side, side)), Grid((32, 32, 32))
-    run = backend.begin(*raw, unit)
-    seen, placed = run.view(view, 0, 1e-3, 3.5, RayModel()), run.box(grid, 1e-3, 3.5)
-    rng = np.random.default_rng(1)
-    shapes = ((side, side), (side, side), (32, 32, 32))
-    slope, target, box = (backend.array(rng.normal(size=shape)) for shape in shapes)
-    loss = backend.projection_loss((side, side), 0.25)
-    maps = loss.target_maps(target)
-    spans = seen.footprints.table[:, 6:8].clamp(min=0).double() * 2
-    pairs = float(spans.prod(1).sum())
-    moments = [[torch.zeros_like(p) for p in raw] for _ in range(2)]
-    floats = 11 * n
-    # Least traffic in bytes: what must be read and written once, were everything else free.
-    calls: list[tuple[str, Callable[[], object], float]] = [
-        ("activate", lambda: backend.begin(*raw, unit), 4 * (11 + 16 + 16) * n),
-        ("footprints and render", lambda: run.view(view, 0, 1e-3, 3.5, RayModel()), 4 * (40 * n + side * side)),
-        ("of that, render", lambda: render(seen.footprints, (side, side)), 4 * (12 * n + side * side)),
-        ("moments and backward", lambda: seen.backward(slope), 4 * (74 * n + side * side)),
-        ("L1 and SSIM", lambda: loss(slope, target, maps), 4 * 5 * side * side),
-        ("box: place, fill", lambda: run.box(grid, 1e-3, 3.5), 4 * (16 + 22) * n),
-        ("box: total variation", lambda: backend.total_variation(box, 0.1), 4 * 2 * 32**3),
-        ("box: backward", lambda: placed.backward(box), 4 * 6 * n),
-        ("gradients", lambda: run.gradients(), 4 * (15 + 5) * n),
-        ("misfit", lambda: backend.misfit(slope, target, None), 4 * 2 * side * side),
-        ("adam", lambda: backend.adam(raw, raw, *moments, (0.0,) * 4, 10, (None,) * 4), 4 * 7 * floats),
-    ]
-    print(f"\n{torch.cuda.get_device_name()}, copy {rate / 1e9:.0f} GB/s; {n} Gaussians on {side}², {pairs:.3g} pairs")
-    for name, call, traffic in calls:
-        wall, spread = _median_ms(call)
-        device = _device_ms(call)
-        print(
-            f"{name:22s} {wall:7.3f} ms alone (quartiles {spread:.3f}), {device:7.3f} ms queued, "
-            f"bandwidth floor {1e3 * traffic / rate:.4f} ms"
-        )
-        assert device > 0
-
-
-def test_a_whole_volume() -> None:
-    # Published: 1.5 ms forward and 5.6 ms backward for 20k Gaussians in 256³ (FaCT-GS, device not stated).
-    backend = backend_for("cuda")
-    run = backend.begin(*_raw(_model(20_000, 220), backend), 1.0)
-    grid = Grid((256, 256, 256))
-    placed = run.box(grid, 1e-3, 3.5)
-    slope = backend.array(np.random.default_rng(1).normal(size=grid.shape))
-    print(f"\n{torch.cuda.get_device_name()}; 20000 Gaussians in 256³")
-    for name, call in (("place, fill", lambda: run.box(grid, 1e-3, 3.5)), ("backward", lambda: placed.backward(slope))):
-        wall, spread = _median_ms(call)
-        print(f"{name:22s} {wall:7.3f} ms (quartiles {spread:.3f})")
-        assert wall > 0
 
 
 @pytest.mark.parametrize(("n", "side"), [(50_000, 256), (50_000, 512)])

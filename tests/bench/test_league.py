@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from tests.bench.league import SLICES, Score, judged, play, rows_of, table
-from tests.bench.quality_cases import Case, strip_integrals
+from tests.bench.league import SLICES, Score, judged, play, table
+from tests.bench.quality_cases import Case, rows_of, strip_integrals
 
 SIDE = 33
 ANGLES = np.linspace(0, np.pi, 12, endpoint=False)

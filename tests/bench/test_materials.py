@@ -6,13 +6,15 @@ pytest -m bench -s tests/bench/test_materials.py    (needs xraylib; a minute)
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import recon
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.voxels.displacement import Displacement, displaced
 from simulators.samples.materials.materials import known
@@ -48,24 +50,38 @@ def grains() -> F32:
     return np.stack([grain * (1 - charge), grain * charge, liquid]).astype(np.float32)
 
 
+def cross_sections(energies: Sequence[float]) -> F64:
+    """1/mm of the three materials, [energy, material]."""
+    oxide, liquid = known("NMC811"), known("electrolyte")
+    assert oxide is not None and liquid is not None
+    materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
+    return np.stack([material.attenuation(energies) for material in materials], 1)
+
+
+def counted(depth: F64, photons: float) -> F32:
+    """Line integrals with the noise of so many photons."""
+    counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
+    return (-np.log(counts / photons)).astype(np.float32)
+
+
+def charge_of(fine: F32) -> tuple[NDArray[np.bool_], F32]:
+    """Voxels of the oxides, and their charge, [z, y, x] of single pixels."""
+    truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
+    oxides = truth[:2].sum(0)
+    return oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
+
+
 @pytest.mark.parametrize(("energies", "each", "photons"), CASES)
 def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
     fine, n = grains(), len(energies) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(energies)
     geometry = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH)
-    oxide, liquid = known("NMC811"), known("electrolyte")
-    assert oxide is not None
-    assert liquid is not None
-    materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
-    sections = np.stack([material.attenuation(energies) for material in materials], 1)
+    sections = cross_sections(energies)
     lines = [seen_by_simulator(volume, geometry, PITCH / 2) for volume in fine]
     depth = sum(line * sections[energy, m][:, None, None] for m, line in enumerate(lines))
-    counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
-    views = recon.EnergyViews((-np.log(counts / photons)).astype(np.float32), geometry, energy, sections)
+    views = recon.EnergyViews(counted(depth, photons), geometry, energy, sections)
 
-    truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
-    oxides = truth[:2].sum(0)
-    matter, charge = oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
+    matter, charge = charge_of(fine)
 
     def error(densities: F32) -> float:
         found = np.clip(densities[1] / np.maximum(densities[:2].sum(0), 0.05), 0, 1)
@@ -113,27 +129,21 @@ def test_shifts(monkeypatch: pytest.MonkeyPatch, optics: float) -> None:
     n = len(SIX) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SIX)
     geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
-    oxide, liquid = known("NMC811"), known("electrolyte")
-    assert oxide is not None and liquid is not None
-    materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
-    sections = np.stack([material.attenuation(SIX) for material in materials], 1)
+    sections = cross_sections(SIX)
     for e, (x, y, z) in enumerate(half):
         own, factor = np.flatnonzero(energy == e), magnified[e]
         axis_col = geometry.axis_col + images[e] * factor
         seen = replace(geometry.select(own), pixel_pitch=PITCH / factor, axis_col=axis_col)
         for volume, mu in zip(fine, sections[e], strict=True):
             depth[own] += mu * seen_by_simulator(np.roll(volume, (z, y, x), (0, 1, 2)), seen, PITCH / 2)
-    counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
-    views = recon.EnergyViews((-np.log(counts / photons)).astype(np.float32), geometry, energy, sections)
+    views = recon.EnergyViews(counted(depth, photons), geometry, energy, sections)
     began = time.process_time()
     corrected, moves = recon.register_energies(views)
     took = time.process_time() - began
     apart = np.array([(move.x, move.y, move.z) for move in moves]) / PITCH - half / 2
     by_optics = [np.array([move.image for move in moves]) / PITCH - images]
     by_optics.append(np.array([move.magnification for move in moves]) - magnified)
-    truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
-    oxides = truth[:2].sum(0)
-    matter, charge = oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
+    matter, charge = charge_of(fine)
     matter[:2] = matter[-2:] = False
 
     def error(seen: recon.EnergyViews) -> float:

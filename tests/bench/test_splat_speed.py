@@ -8,13 +8,9 @@ multiply-adds alone would take: RENDER_OPERATIONS or MOMENTS_OPERATIONS a pair o
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,15 +21,13 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu import lanes
-from recon.kernels.cpu.activation import OPTIONS, activation_backward
-from recon.kernels.cpu.adam import adam_all
-from recon.kernels.cpu.engine import Active, Gradients, grid_layout, render_view, view_table
+from recon.kernels.cpu.activation import OPTIONS
+from recon.kernels.cpu.engine import Active, Gradients, grid_layout, view_table
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
-from recon.kernels.cpu.losses import CpuProjectionLoss, total_variation
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.splatting.splat import project
 from recon.warm_up import warm_up
 from tests.recon.helpers import run_steps
@@ -160,48 +154,18 @@ def test_a_whole_step_and_its_parts() -> None:
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], unit)
     cut = settings.truncation
     table = view_table(active, views, 2, cut.faint, cut.sigmas)
-    image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
-    slope, into, centres = np.empty_like(image), Gradients.zeros(n), np.empty((n, 2), np.float32)
-    seen = render_view(active, views, 2, cut.faint, cut.sigmas, settings.rays, image=image)
-    loss = CpuProjectionLoss((SIDE, SIDE), 0.25)
-    loss(image, problem.images[2], problem.target_maps[2], slope)
-    box = Grid((32, 32, 32))
-    layout = grid_layout(active, box, 1e-7, cut.sigmas)
-    density = np.ascontiguousarray(layout.fill())
-    tv = np.empty_like(density)
-    total_variation(density, tv, 0.1)
-    gradients, d_raw, d_q = (
-        [np.zeros_like(p[k]) for k in NAMES],
-        np.empty_like(p["raw"]),
-        np.empty((n, 4), np.float32),
-    )
-    arrays = [[a.copy() for a in gradients] for _ in range(3)]
-    found = np.empty((n, 6), np.float32)
-    parts: dict[str, Timing] = {}
-    for name, call in (
-        ("activate", lambda: Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], unit)),
-        ("footprints", lambda: view_table(active, views, 2, cut.faint, cut.sigmas)),
-        ("render", lambda: render(table, image, layers)),
-        ("loss (L1, SSIM)", lambda: loss(image, problem.images[2], problem.target_maps[2], slope)),
-        ("moments", lambda: moments(table, slope, found)),
-        ("moments, footprints back", lambda: seen.backward(slope, into, centres)),
-        ("TV box: find", lambda: grid_layout(active, box, 1e-7, cut.sigmas)),
-        ("TV box: fill", layout.fill),
-        ("TV box: loss", lambda: total_variation(density, tv, 0.1)),
-        ("TV box: back", lambda: layout.backward(tv, into.means, into.log_scales, into.rotations, into.densities)),
-        ("activation back", lambda: activation_backward(
-            p["quaternions"], p["raw"], unit, into.rotations, into.densities, d_q, d_raw)),
-        ("Adam", lambda: adam_all(arrays[0], gradients, arrays[1], arrays[2], (0.1,) * 4, 9)),
-    ):  # fmt: skip
-        parts[name] = _times(call)
+    image, layers, found = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE), np.empty((n, 6), np.float32)
+    parts = {
+        "footprints": _times(lambda: view_table(active, views, 2, cut.faint, cut.sigmas)),
+        "render": _times(lambda: render(table, image, layers)),
+        "moments": _times(lambda: moments(table, image, found)),
+    }
     print(f"\na step at {N} Gaussians on {SIDE}²")
     for name, timing in parts.items():
         _line("  " + name, timing)
     pair = parts["render"][0] + parts["moments"][0]
-    once = sum(t[0] for name, t in parts.items() if name != "moments")
-    _line("whole step", step, f"{step[0] / pair:.2f} x render + moments; its parts {once:.2f} ms")
-    grid = Grid((SIDE, SIDE, SIDE))
-    layout = grid_layout(active, grid, 1e-7, cut.sigmas)
+    _line("whole step", step, f"{step[0] / pair:.2f} x render + moments")
+    layout = grid_layout(active, Grid((SIDE, SIDE, SIDE)), 1e-7, cut.sigmas)
     _line(f"voxelise {SIDE}³", _times(layout.fill, 3))
     assert step[0] > pair
 
@@ -247,18 +211,3 @@ def test_time_is_linear_in_pairs() -> None:
     slope, start = np.polyfit(pairs / 1e6, both, 1, w=1 / both)
     print(f"slope {slope:.4f} ms a million pairs, start {start:.3f} ms")
     assert slope > 0
-
-
-@pytest.mark.bench
-def test_first_use_compiles_outside_of_fits(tmp_path: Path) -> None:
-    code = (
-        "import time; from recon.warm_up import warm_up; t = time.perf_counter(); warm_up();"
-        "print(f'{time.perf_counter() - t:.1f}')"
-    )
-    seconds = []
-    for _ in range(2):
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-        seconds.append(float(done.stdout))
-    print(f"\nwarm_up: {seconds[0]} s where nothing is compiled yet, {seconds[1]} s afterwards")
-    assert seconds[1] < seconds[0]

@@ -30,32 +30,15 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.settings import DensityPolicy, FitSettings
 from tests.bench import quality_cases
-from tests.bench.quality_cases import SLABS, Case
+from tests.bench.quality_cases import SLABS, Case, rows_of
 from tests.bench.test_patch_prior import PHOTONS, TEXTURED, TUNED, VIEWS
 
 VALIDATION = "bone", "cement", "12 bone", "12 cement", "180 bone", "180 cement"
 
 
-def _rows(case: Case, first: int) -> Case:
-    """Eight rows of a parallel beam."""
-    rows, views = slice(first, first + 8), case.geometry
-
-    def cut(angles: np.ndarray) -> Geometry:
-        shape = 8, views.detector_shape[1]
-        return Geometry.parallel(angles, shape, pixel_pitch=views.pixel_pitch, axis_col=views.axis_col)
-
-    unseen = case.unseen
-    if unseen is not None:
-        data, other, rays = unseen
-        unseen = np.ascontiguousarray(data[:, rows]), cut(other.angles), rays[:, rows]
-    geometry, data = cut(views.angles), np.ascontiguousarray(case.projections[:, rows])
-    grid = Grid.matching(geometry)
-    return replace(case, projections=data, geometry=geometry, grid=grid, truth=case.truth[rows], unseen=unseen)
-
-
 def _slab(folder: Path, name: str, views: int = VIEWS) -> Case:
     first = 8 if name in TEXTURED else 16  # bone and cement have 24 rows, the others 40
-    return _rows(quality_cases.slab(folder, name, views, PHOTONS), first)
+    return rows_of(quality_cases.slab(folder, name, views, PHOTONS), range(first, first + 8))
 
 
 def _region(folder: Path) -> Case:
@@ -77,7 +60,7 @@ def _wild(folder: Path, share: float, value: float) -> Case:
 
 ROWS: dict[str, Callable[[Path], Case]] = {
     **{name: lambda folder, name=name: _slab(folder, name) for name in ("shell", "teapot", "foam", "bone", "cement")},
-    "walnut": lambda folder: _rows(TUNED["walnut"](folder, "walnut"), 12),
+    "walnut": lambda folder: rows_of(TUNED["walnut"](folder, "walnut"), range(12, 20)),
     "teapot, cone": lambda folder: quality_cases.cone(folder, "teapot", VIEWS, 64),
     "shell, cone": lambda folder: quality_cases.cone(folder, "shell", VIEWS, 64),
     "region": _region,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from simulators.frame.shot import Detector, Pose
-from simulators.samples.bodies.packing import rotation
 from simulators.samples.bodies.solids import (
     Box,
     Cylinder,
@@ -46,7 +44,6 @@ SOLIDS: dict[str, Solid] = {
     "corners": Polyhedron(CORNERS, 1.4, CENTRE, QUATERNION),
     "gem": Polyhedron(GEM, 1.4, CENTRE, QUATERNION),
 }
-TURNABLE = [name for name in SOLIDS if name != "cylinder"]
 
 
 def level(solid: Solid, points: Reals) -> Reals:
@@ -153,11 +150,3 @@ def rays(pose: Pose, detector: Detector) -> tuple[Reals, Reals]:
         starts.append((np.broadcast_to(source, pixel.shape) - shift) @ to_sample.T)
         directions.append((pixel - source) @ to_sample.T)
     return np.array(starts), np.array(directions)
-
-
-def turned(solid: Solid, matrix: Reals) -> Solid:
-    """The solid after a rotation about the origin; not for cylinders."""
-    assert not isinstance(solid, Cylinder)
-    x, y, z, w = Rotation.from_matrix(matrix @ rotation(solid.quaternion)).as_quat()
-    centre = tuple((matrix @ np.array(solid.centre)).tolist())
-    return replace(solid, centre=centre, quaternion=(w, x, y, z))

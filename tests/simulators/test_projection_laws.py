@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from recon.base.volume import Grid
-from simulators.frame.shot import Detector, Pose
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Polyhedron, Solid
 from simulators.samples.builders.battery import battery
-from tests.simulators.bodies import SOLIDS, rays, volume
+from tests.simulators.bodies import SOLIDS, volume
 
 ANGLES = st.floats(-7.0, 7.0)
 FINE = Detector((1440, 1920), 6.25e-4, axis_col=959.3, axis_row=639.6)
@@ -62,36 +60,6 @@ def test_orders_0_and_1_of_helgason_and_ludwig(name: str, angle: float) -> None:
     assert (view.sum(axis=1) @ detector.v()) / mass == pytest.approx(z, abs=1e-5)
 
 
-def _moments(phantom: Phantom, angle: float, detector: Detector) -> list[float]:
-    profile = phantom.line_integrals(angle, detector).sum(axis=0) * detector.pitch**2
-    return [float((profile * detector.u() ** n).sum()) for n in range(3)]
-
-
-@settings(max_examples=10, deadline=None)
-@given(angle=ANGLES)
-def test_the_moments_of_a_battery(angle: float) -> None:
-    """The n-th moment in u is a homogeneous polynomial of degree n in cos θ and sin θ."""
-    solids = battery(np.random.default_rng(3), (0.9, 0.9), n_particles=40)
-    phantom, detector = Phantom.of(solids), Detector((300, 307), 0.003, axis_col=151.3, axis_row=149.7)
-    c, s = math.cos(angle), math.sin(angle)
-    zeroth, first, second = _moments(phantom, angle, detector)
-    masses = np.array([solid.attenuation * volume(solid) for solid in solids])
-    centre = masses @ np.array([solid.centre for solid in solids])
-    assert zeroth == pytest.approx(masses.sum(), rel=2e-3)
-    assert first == pytest.approx(centre[0] * c + centre[1] * s, abs=2e-4 * masses.sum())
-    at_0, at_45, at_90 = (_moments(phantom, a, detector)[2] for a in (0.0, math.pi / 4, math.pi / 2))
-    cross = 2 * at_45 - at_0 - at_90
-    assert second == pytest.approx(at_0 * c * c + cross * c * s + at_90 * s * s, rel=2e-3)
-
-
-@pytest.mark.parametrize("tilt", [(0.3, -0.2), (-0.8, 0.5)])
-def test_mass_does_not_change_with_the_tilt(tilt: tuple[float, float]) -> None:
-    solids = list(SOLIDS.values())
-    pose = Pose.turned(0.9, FINE.shape[0]).tilted_by(tilt)
-    mass = Phantom.of(solids).line_integrals(pose, FINE).sum() * FINE.pitch**2
-    assert mass == pytest.approx(sum(solid.attenuation * volume(solid) for solid in solids), rel=1e-5)
-
-
 def test_line_sums_of_the_truth_are_the_projection() -> None:
     """The voxel truth and the analytic projection meet in a third thing: plain sums over an axis of the truth."""
     phantom = Phantom.of(battery(np.random.default_rng(1), (0.9, 0.9), n_particles=30))
@@ -110,32 +78,6 @@ def test_line_sums_of_the_truth_are_the_projection() -> None:
         error = view - expected * grid.voxel_size
         assert np.abs(error).max() < 0.05 * view.max(), angle
         assert np.sqrt(np.mean(error**2)) < 0.004 * view.max(), angle
-
-
-def _along_rays(f: Callable[[NDArray[np.float64]], NDArray[np.float64]], pose: Pose, detector: Detector, n: int):
-    """Line integrals of f by the midpoint rule, within 1 mm of the rays' points on the plane of the axis."""
-    start, ray = rays(pose, detector)
-    start = start + ray  # on that plane, from 1 mm before it or from the source
-    t = ((np.arange(n) + 0.5) / n * 2 - 1)[:, None]
-    unit = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-    return f(start[..., None, :] + t * unit[..., None, :]).sum(-1) * 2 / n
-
-
-@pytest.mark.parametrize("sod", [math.inf, 2.0])
-def test_interpolated_truth_along_oblique_rays(sod: float) -> None:
-    phantom = Phantom.of([SOLIDS["ellipsoid"], SOLIDS["box"], SOLIDS["plate"]])
-    grid = Grid((64, 64, 64), 0.9 / 64)
-    truth = phantom.attenuation(grid)
-
-    def sample(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        index = points[..., ::-1] / grid.voxel_size + (np.array(grid.shape) - 1) / 2
-        return map_coordinates(truth, np.moveaxis(index, -1, 0), order=1)
-
-    detector = Detector((20, 24), 0.03, 11.5, 9.5, sod)
-    for pose in (Pose.turned(0.6, 20), Pose.turned(2.2, 20).tilted_by((0.2, 0.1))):
-        view = phantom.line_integrals(pose, detector)
-        error = view - _along_rays(sample, pose, detector, n=400)
-        assert np.sqrt(np.mean(error**2)) < 0.015 * view.max()
 
 
 def test_boxes_meet_without_a_seam() -> None:

@@ -13,8 +13,8 @@ from tests.beamline.scans import TwoCylinders
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 
 
-def beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, list(arguments))
+def beamline(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
 def left(folder: Path) -> set[str]:

@@ -86,15 +86,6 @@ def test_time_at_inverts_position(move: TrapezoidMove, fraction: float) -> None:
     assert move.position(move.time_at(position)) == pytest.approx(position, rel=1e-7, abs=1e-4)
 
 
-@given(MOVES, st.lists(FRACTIONS, min_size=2, max_size=8))
-def test_farther_positions_are_passed_later(move: TrapezoidMove, fractions: list[float]) -> None:
-    low, high = sorted((move.start, move.target))
-    where = sorted((min(max(low + f * (high - low), low), high) for f in fractions), reverse=move.direction < 0)
-    times = [move.time_at(position) for position in where]
-    assert times == sorted(times)
-    assert all(move.begin <= time <= move.end + 1e-9 for time in times)
-
-
 @given(MOVES, FRACTIONS, ACCELERATIONS)
 def test_a_braked_move_shares_the_past_and_stops_after_v_squared_over_2a(
     move: TrapezoidMove, at: float, acceleration: float

@@ -39,13 +39,6 @@ def test_cancel_takes_exactly_the_later_pulses(times: list[float], stop: float) 
     assert [pulse.time for pulse in drain(line)] == sorted(time for time in times if time <= stop)
 
 
-def test_next_after_is_strictly_later() -> None:
-    line = TriggerLine(VirtualClock())
-    line.schedule([Pulse(1.0, 0.5)])
-    assert line.next_after(0.999) == Pulse(1.0, 0.5)
-    assert line.next_after(1.0) is None
-
-
 def test_a_pulse_without_a_finite_time_is_refused_and_nothing_is_scheduled() -> None:
     line = TriggerLine(VirtualClock())
     with pytest.raises(ValueError, match="no pulse was scheduled"):

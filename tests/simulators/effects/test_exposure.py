@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simulators.effects import sensor
-from simulators.effects.exposure import BeamProfile, MotionBlur, PixelArea
+from simulators.effects.exposure import BeamProfile, MotionBlur
 from simulators.frame.shot import Detector
 from simulators.scenes.expose import expose
 from tests.simulators import shots
@@ -107,12 +107,6 @@ def test_the_open_beam_stays_as_it_is() -> None:
     np.testing.assert_array_equal(
         shots.frame(shots.scene("pixel_area"), sample=False), shots.frame(shots.scene(), sample=False)
     )
-
-
-def test_rays_are_evenly_spread_about_the_middle() -> None:
-    offsets = np.array(PixelArea(4).offsets)
-    np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=1e-15)
-    assert sorted(set(offsets[:, 0])) == [-0.375, -0.125, 0.125, 0.375] and len(offsets) == 16
 
 
 def test_beam_profile_is_a_gaussian_with_stripes_that_drift() -> None:

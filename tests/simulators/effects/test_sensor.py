@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy import stats
 
 from simulators.effects import sensor
 from simulators.effects.sensor import (
@@ -18,7 +17,6 @@ from simulators.effects.sensor import (
     DarkCurrent,
     Offset,
     PhotonNoise,
-    QuantumEfficiency,
     ReadNoise,
     Saturation,
     digitise,
@@ -45,18 +43,6 @@ def test_a_share_of_the_light_is_detected(effect: dict[str, float], share: float
     assert (flat == round(4000 * share / CONVERSION)).all()
 
 
-def test_thinned_light_is_poisson() -> None:
-    """Counts of a thinned flat against the law of the thinned mean, by chi²; wrong once in a million seeds."""
-    thin = QuantumEfficiency(0.7).apply(np.full((200, 250), 5.0), shots.shot())
-    counts = np.random.default_rng(3).binomial(np.random.default_rng(4).poisson(5.0, thin.shape), 0.7)  # one by one
-    direct = np.random.default_rng(5).poisson(thin)
-    law = stats.poisson(3.5)
-    expected = np.append(law.pmf(np.arange(11)), law.sf(10)) * thin.size
-    for seen in (counts, direct):
-        found = np.bincount(np.minimum(seen, 11).reshape(-1), minlength=12)
-        assert ((found - expected) ** 2 / expected).sum() < stats.chi2.isf(1e-6, 11)
-
-
 @pytest.mark.parametrize("mean", [0.2, 4000.0])
 def test_photon_noise_is_poisson(mean: float) -> None:
     shot = shots.sized(300, 400)
@@ -71,12 +57,6 @@ def test_photon_noise_is_poisson(mean: float) -> None:
     np.testing.assert_array_equal(photons, again)
     chance.uncorrelated(photons, later)
     chance.uncorrelated(photons, seed)
-
-
-def test_it_ends_the_photons() -> None:
-    assert PhotonNoise.final
-    counts = shots.frame(shots.scene("photon_noise"), sample=False) * shots.shot().conversion
-    chance.mean_is(counts, 4000.0, 4000.0)
 
 
 def test_what_is_no_expectation_is_refused() -> None:
@@ -130,11 +110,6 @@ def test_the_knee_bends_smoothly_towards_the_full_well(knee: float, well: float)
     assert out.max() <= well
 
 
-def test_it_does_not_touch_the_light_that_fits() -> None:
-    charge = np.linspace(0, 6999, 500)
-    np.testing.assert_array_equal(_response(Saturation(), charge), charge)
-
-
 @pytest.mark.parametrize(("readout", "rms"), [("standard", 0.43), ("ultra_quiet", 0.27), ("photon_number", 0.27)])
 @pytest.mark.parametrize("binning", [1, 4])
 def test_read_noise_is_normal_with_the_readout_s_rms(readout: str, rms: float, binning: int) -> None:
@@ -147,18 +122,6 @@ def test_read_noise_is_normal_with_the_readout_s_rms(readout: str, rms: float, b
 def test_the_second_model_reads_ultra_quiet_with_more_noise() -> None:
     noise = ReadNoise().apply(np.zeros((300, 400)), shots.sized(300, 400, readout="ultra_quiet", model="C15550-22UP"))
     chance.variance_is(noise, 0.3**2)
-
-
-def test_read_noise_and_offset_make_the_dark() -> None:
-    dark = shots.frame(shots.scene("read_noise", "offset"), beam=False).astype(float)
-    variance = (0.43 / 0.107) ** 2 + 1 / 12  # of rounding (Janesick 2007)
-    chance.mean_is(dark, 200.0, variance)
-    chance.variance_is(dark, variance)
-
-
-def test_each_frame_has_its_own() -> None:
-    one, other = (ReadNoise().apply(np.zeros((60, 80)), shots.shot(frame=k)) for k in (1, 2))
-    chance.uncorrelated(one, other)
 
 
 def test_the_rms_may_be_another_camera_s() -> None:
@@ -241,12 +204,6 @@ def test_the_bow_is_zero_at_both_ends_and_largest_in_the_middle() -> None:
     x = counts / 65535
     assert np.abs(bow - 0.04 * 65535 * x * (1 - x)).max() <= 0.5 + 1e-9
     assert (np.diff(_codes(Adc(nonlinearity=-0.25), counts)) >= 0).all()
-
-
-def test_it_ends_the_counts() -> None:
-    frame = shots.frame(shots.scene("photon_noise", "read_noise", "offset", {"kind": "adc", "bits": 12}))
-    assert not (frame % 16).any()
-    assert frame.max() > 30_000
 
 
 @pytest.mark.parametrize("adc", [{"bits": 12}, {"bits": 8}, {"nonlinearity": 0.01}])

@@ -140,22 +140,3 @@ def test_what_is_no_expectation_is_refused_and_nothing_is_written(bad: float) ->
     with pytest.raises(CannotExposeError, match=r"in 0 ... 1e\+09"):
         poisson(image, np.random.default_rng(0))
     np.testing.assert_array_equal(image, before)
-
-
-@pytest.mark.bench
-def test_a_frame_of_2048_takes_a_quarter_of_numpy_s_time() -> None:
-    import time
-
-    mean, rng = np.full((2048, 2048), 5000.0), np.random.default_rng(0)
-
-    def best(make) -> float:  # type: ignore[no-untyped-def]
-        seconds = []
-        for _ in range(5):
-            image = mean.copy()
-            begin = time.perf_counter()
-            make(image)
-            seconds.append(time.perf_counter() - begin)
-        return min(seconds)
-
-    best(lambda image: poisson(image, rng))
-    assert best(lambda image: poisson(image, rng)) < best(rng.poisson) / 4

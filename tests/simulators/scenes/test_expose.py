@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from typing import Any
 
 import numba
@@ -44,23 +42,6 @@ def test_a_frame_without_effects_is_beer_lambert_rounded_and_clipped() -> None:
             light = 4e5 * shot.exposure * shot.binning**2 * np.exp(-sample.line_integrals(0.3, shot.detector))
             counts = expose(_scene(sample), shot)
         np.testing.assert_array_equal(counts, np.rint(np.minimum(light / shot.conversion, 65535)))
-
-
-def test_the_steps_that_were_taken_are_told() -> None:
-    steps: list[str] = []
-
-    def on_step(step: str) -> AbstractContextManager[None]:
-        steps.append(step)
-        return nullcontext()
-
-    expose(_scene(ALL), shots.shot(), on_step)
-    assert steps == ["line_integrals", "beer_lambert", "digitise", "digitise"]
-
-
-def test_darks_and_flats_are_not_the_sample_s() -> None:
-    scene = _scene(ALL)
-    assert not expose(scene, replace(shots.shot(), beam=False)).any()
-    assert len(np.unique(expose(scene, replace(shots.shot(), sample=False)))) == 1
 
 
 @pytest.mark.parametrize("threads", [2, 3, 7])

@@ -53,20 +53,9 @@ def test_a_scene_pays_only_for_what_it_names() -> None:
     assert [step for step in steps if step in CATALOGUE] == ["beam_profile", "ring_current"]
 
 
-def test_the_same_seed_makes_the_same_frame_again() -> None:
-    scene = load_scene(yaml.safe_load((SCENES / "battery.yaml").read_text(encoding="utf-8")))
-    frames = [shots.frame(scene, shots.shot(frame=k)) for k in (3, 4, 3)]
-    np.testing.assert_array_equal(frames[0], frames[2])
-    assert (frames[0] != frames[1]).mean() > 0.9
-
-
 def test_binned_pixels_collect_the_light_of_all_they_sum() -> None:
     flat = shots.frame(shots.scene(flux=4e4), shots.shot(binning=2), sample=False)
     assert (flat == round(1600 / CONVERSION)).all()
-
-
-def test_too_much_light_saturates() -> None:
-    assert (shots.frame(shots.scene("offset", flux=1e6), sample=False) == 65535).all()
 
 
 @pytest.mark.parametrize("name", ["battery", "plain"])
@@ -103,26 +92,13 @@ def _with(**changes: Any) -> dict[str, Any]:
             "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects",
         ),
         (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
-        (_with(beam={"photons_per_s": -1}), "scene.beam.photons_per_s must be greater than or equal to 0, got -1"),
-        (_with(beam={"photons_per_s": "many"}), "scene.beam.photons_per_s must be a finite number, got 'many'"),
         (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd, energy_kev"),
-        (_with(axis_offset_px=True), "scene.axis_offset_px must be a number, got True"),
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
-        (_with(phantom={"kind": "battery"}), "scene.phantom (battery): key 'field_of_view' is missing"),
-        (
-            _with(phantom={"kind": "battery", "field_of_view": [1, 1], "n_particles": 1.5}),
-            "n_particles must be a whole number, got 1.5",
-        ),
-        (
-            _with(phantom={"kind": "battery", "field_of_view": [1]}),
-            "field_of_view[1] is missing, got [1]",
-        ),
         (
             _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
             "scene.phantom (battery): only",
         ),
         (_with(phantom={"kind": "solids"}), "scene.phantom (solids): key 'solids' is missing"),
-        (_with(phantom={"kind": "solids", "solids": {"a": 1}}), "scene.phantom (solids).solids must be a list"),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "cone"}]}),
             "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, ellipsoid, box",
@@ -133,18 +109,15 @@ def _with(**changes: Any) -> dict[str, Any]:
         ),
         (_with(effects="offset"), "scene.effects must be a list, got 'offset'"),
         (_with(effects=["fog"]), "scene.effects[0]: kind 'fog' is unknown; legal: motion_blur, rolling_shutter, "),
-        (_with(effects=[7]), "scene.effects[0]: kind 7 is unknown"),
         (
             _with(effects=["photon_noise", {"kind": "zingers", "rat": 1}]),
             "scene.effects[1] (zingers): key 'rat' is unknown; legal: rate, charge",
         ),
-        (_with(effects=["zingers"]), "scene.effects[0] (zingers): key 'rate' is missing"),
         (
             _with(effects=["offset", "photon_noise"]),
             "effect 'photon_noise' acts on photons and cannot follow 'offset', which acts on counts; "
             "the order is motion, optical depth, photons, electrons, counts",
         ),
-        (_with(effects=["read_noise", "rolling_shutter"]), "'rolling_shutter' acts on motion and cannot follow"),
         (_with(effects=["offset", "offset"]), "effect 'offset' is named twice"),
         (
             _with(effects=["photon_noise", {"kind": "ring_current", "lifetime": 9}]),

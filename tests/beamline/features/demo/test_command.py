@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from beamline.cli.main import main
 from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.stop import StopRequest
 from beamline.features.demo.command import run_demo
-from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
-from recon.base.volume import Grid, Volume
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.writers.recon_file import read_reconstruction
+from tests.beamline.cli.small_scan import beamline
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -101,8 +101,6 @@ def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPa
     from beamline.instrument.connect import connect
 
     def without_truth(config: Config) -> object:
-        from dataclasses import replace
-
         return replace(connect(config), simulated=None)
 
     monkeypatch.setattr("beamline.instrument.connect.connect", without_truth)
@@ -118,13 +116,8 @@ def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest
     def fake(config: Config, runs: Path | None, sinks: list, stop: StopRequest, command: str) -> None:
         asked.append((config, runs))
         assert threading.current_thread() is threading.main_thread()
-        record = ReconRecord(
-            volume=Volume(np.zeros((2, 3, 4), np.float32), Grid((2, 3, 4))),
-            length_unit="mm",
-            raw_file="scan.h5",
-            title="t",
-            sample="s",
-            time=0.0,
+        record = replace(
+            bare_record(here, np.zeros((2, 3, 4), np.float32)),
             parameters={"method": "r2", "axis_col": 17.0, "n_views": 9},
             metrics={"psnr": 30.0},
             compared={"psnr": 25.0},
@@ -137,13 +130,13 @@ def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest
             sink(done)
 
     monkeypatch.setattr("beamline.features.demo.command.run_demo", fake)
-    result = CliRunner().invoke(main, ["demo", "-o", "elsewhere", "--seconds", "7"])
+    result = beamline("demo", "-o", "elsewhere", "--seconds", 7)
     assert result.exit_code == 0, result.output
     assert asked[0][0].recon.seconds == 7.0
     assert asked[0][0].sample.name == "demo-battery"
     assert asked[0][1] == Path("elsewhere")
     assert "folder    runs/x" in result.stdout
     assert "30.00 dB      25.00 dB" in result.stdout
-    result = CliRunner().invoke(main, ["demo", "--json"])
+    result = beamline("demo", "--json")
     assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
     assert len(result.stdout.splitlines()) == 1

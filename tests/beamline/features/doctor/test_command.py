@@ -10,11 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
-from beamline.cli.main import main
 from beamline.config import load as config
 from beamline.features.doctor import examine as disk
+from tests.beamline.cli.small_scan import beamline
 
 FOLDER = config.config_folder()
 INSTRUMENT, DEMO = str(FOLDER / "instrument.yaml"), str(FOLDER / "demo.yaml")
@@ -29,7 +29,7 @@ def briefly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def run(*arguments: str) -> Result:
-    return CliRunner().invoke(main, ["doctor", *arguments])
+    return beamline("doctor", *arguments)
 
 
 def events(result: Result) -> list[dict[str, object]]:

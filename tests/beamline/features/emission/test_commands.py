@@ -10,10 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 import recon
-from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.quantities import VoxelKind
 from beamline.features.trials.launch import TrialData
@@ -30,12 +28,9 @@ from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared
 from simulators.scenes.emission import events, load_emission
+from tests.beamline.cli.small_scan import beamline
 
 SCENE = "emission: {radius: 24}\nscanner: {trues: 2.0e+5}\nlines: {views: 24, shape: [3, 32], pitch: 2.0}\n"
-
-
-def _beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, list(arguments))
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +38,9 @@ def pet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of counts; its truth lies beside it."""
     folder = tmp_path_factory.mktemp("pet")
     (folder / "pet.yaml").write_text(SCENE, encoding="utf-8")
-    made = _beamline("simulate", str(folder / "pet.yaml"), "-o", str(folder / "pet.h5"), "--truth",
-                     str(folder / "truth.h5"), "--seed", "5")  # fmt: skip
+    made = beamline(
+        "simulate", folder / "pet.yaml", "-o", folder / "pet.h5", "--truth", folder / "truth.h5", "--seed", 5
+    )
     assert made.exit_code == 0, made.output
     return folder / "pet.h5"
 
@@ -68,7 +64,7 @@ def test_the_file_has_what_the_scene_made(pet: Path) -> None:
 
 def test_recon_reads_it_and_gives_what_the_function_gives(pet: Path, tmp_path: Path) -> None:
     out, truth = tmp_path / "osem.h5", str(pet.with_name("truth.h5"))
-    done = _beamline("recon", str(pet), "-m", "osem", "--iterations", "3", "--truth", truth, "-o", str(out))
+    done = beamline("recon", str(pet), "-m", "osem", "--iterations", "3", "--truth", truth, "-o", str(out))
     assert done.exit_code == 0, done.output
     assert "Contrast recovery of hot regions" in done.output and "Noise of the body" in done.output
     with open_scan(pet) as source:
@@ -83,14 +79,14 @@ def test_recon_reads_it_and_gives_what_the_function_gives(pet: Path, tmp_path: P
         assert file["entry/data/data"].attrs["long_name"] == "activity (counts/mm)"
     with opened_volume(out) as record, h5py.File(truth) as file:
         assert record.kind is VoxelKind.ACTIVITY and file["entry/data/data"].attrs["units"] == record.unit
-    assert _beamline("export", str(out), "-o", str(tmp_path / "o.tif")).exit_code == 0
+    assert beamline("export", str(out), "-o", str(tmp_path / "o.tif")).exit_code == 0
     with opened_volume(tmp_path / "o.tif") as record:
         assert record.kind is VoxelKind.ACTIVITY
 
 
 def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> None:
     out = tmp_path / "cgls.h5"
-    assert _beamline("recon", str(pet), "-m", "cgls", "--iterations", "4", "-o", str(out)).exit_code == 0
+    assert beamline("recon", str(pet), "-m", "cgls", "--iterations", "4", "-o", str(out)).exit_code == 0
     with h5py.File(pet) as file, h5py.File(out) as made:
         sets = {name: item[()] for name, item in file["emission"].items()}
         survival = sets["normalisation"] * np.exp(-sets["attenuation"])
@@ -106,7 +102,7 @@ def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> Non
      (("--cols", "2:30"), "go with --cols"), (("--follow",), "--follow")],
 )  # fmt: skip
 def test_what_counts_do_not_take_is_refused(pet: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    refused = _beamline("recon", str(pet), "-m", "r2", *arguments, "-o", str(tmp_path / "out.h5"))
+    refused = beamline("recon", str(pet), "-m", "r2", *arguments, "-o", str(tmp_path / "out.h5"))
     assert refused.exit_code in (2, 5) and said in refused.output, refused.output
     assert not list(tmp_path.iterdir())
 
@@ -116,16 +112,16 @@ def test_sets_of_another_shape_and_a_wrong_scene_are_refused(pet: Path, tmp_path
         right.copy("emission", file)
         del file["emission/randoms"]
         file["emission/randoms"] = np.zeros((3, 32))
-    refused = _beamline("recon", str(tmp_path / "wrong.h5"))
+    refused = beamline("recon", str(tmp_path / "wrong.h5"))
     assert refused.exit_code == 5 and "randoms has shape (3, 32), the counts (24, 3, 32)" in refused.output
     for override, said in (
         ("emission.radius=-1", "emission.radius"),
         ("emission.radius=12", "leaves the body"),
         ("lines.pixels=3", "key 'pixels' is unknown"),
     ):
-        refused = _beamline("simulate", str(pet.with_suffix(".yaml")), "-o", str(tmp_path / "x.h5"), "--set", override)
+        refused = beamline("simulate", str(pet.with_suffix(".yaml")), "-o", str(tmp_path / "x.h5"), "--set", override)
         assert refused.exit_code == 2 and said in refused.output, refused.output
-    refused = _beamline("simulate", str(pet.with_suffix(".yaml")), "--explain")
+    refused = beamline("simulate", str(pet.with_suffix(".yaml")), "--explain")
     assert refused.exit_code == 2 and "takes no --explain" in refused.output
 
 
@@ -177,11 +173,11 @@ def test_views_added_are_the_counts_of_both(pet: Path) -> None:
 def test_a_trade_off_reconstructs_counts(pet: Path, tmp_path: Path) -> None:
     """By the commands, beside the truth: osem of the trade-off is osem of `recon`."""
     truth = str(pet.with_name("truth.h5"))
-    made = _beamline("tradeoff", str(pet), "--methods", "osem", "--truth", truth, "-o", str(tmp_path / "t"))
+    made = beamline("tradeoff", str(pet), "--methods", "osem", "--truth", truth, "-o", str(tmp_path / "t"))
     assert made.exit_code == 0, made.output
     trials = json.loads((tmp_path / "t/tradeoff.json").read_text(encoding="utf-8"))["trials"]
     base = next(one for one in trials if one["trial"]["method"] == "osem" and one["trial"]["group"] == "method")
-    alone = _beamline("recon", str(pet), "-m", "osem", "--truth", truth, "-o", str(tmp_path / "o.h5"), "--json")
+    alone = beamline("recon", str(pet), "-m", "osem", "--truth", truth, "-o", str(tmp_path / "o.h5"), "--json")
     figures = json.loads(alone.output.splitlines()[-1])
     for name in ("psnr", "spillover", "recovery", "variation"):
         assert base["metrics"][name] == pytest.approx(figures[name], rel=1e-3)
@@ -205,7 +201,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
 
 def test_a_set_that_changed_on_the_disk_is_refused_by_name(pet: Path, tmp_path: Path) -> None:
     """Every set of the file has a checksum of each view; `validate --deep` compares it, too."""
-    said = _beamline("validate", str(pet), "--deep")
+    said = beamline("validate", str(pet), "--deep")
     assert said.exit_code == 0 and "no checksums" not in said.output
     for name in ("counts", "attenuation", "normalisation", "randoms", "scatter"):
         damaged = tmp_path / f"{name}.h5"
@@ -217,9 +213,9 @@ def test_a_set_that_changed_on_the_disk_is_refused_by_name(pet: Path, tmp_path: 
             byte = raw.read(1)[0]
             raw.seek(-1, 1)
             raw.write(bytes([byte ^ 1]))
-        refused = _beamline("recon", str(damaged), "-m", "fbp", "-o", str(tmp_path / "out.h5"))
+        refused = beamline("recon", str(damaged), "-m", "fbp", "-o", str(tmp_path / "out.h5"))
         assert refused.exit_code == 5 and "cannot be read" in refused.output, (name, refused.output)
-        assert _beamline("validate", str(damaged), "--deep").exit_code == 5
+        assert beamline("validate", str(damaged), "--deep").exit_code == 5
         assert f"{name}.h5" in refused.output and not (tmp_path / "out.h5").exists()
 
 
@@ -237,7 +233,7 @@ def test_error_bars_of_an_emission_are_those_of_its_counts(pet: Path, tmp_path: 
             fewer[f"emission/{name}"] = values.astype(np.float32)
     for path in (pet, tmp_path / "fewer.h5"):
         out = tmp_path / f"{path.stem}_{method}.h5"
-        done = _beamline("recon", str(path), "-m", method, "--uncertainty", "-o", str(out))
+        done = beamline("recon", str(path), "-m", method, "--uncertainty", "-o", str(out))
         assert done.exit_code == 0, done.output
         with h5py.File(out) as made:
             bars, volume = made["entry/data/data_errors"][()], made["entry/data/data"][()]

@@ -16,7 +16,8 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.features.epics.ioc import SHOWN, RunServer
-from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.beamline.features.run_folder import FAILED, STARTED, write_run
+from tests.beamline.scans import TwoCylinders, frames_of
 
 thread = pytest.importorskip("p4p.client.thread")
 WITHIN = 60.0  # s
@@ -58,36 +59,19 @@ def test_without_a_run_it_is_idle_and_beats(tmp_path: Path) -> None:
 
 
 def test_a_finished_run_and_the_next_one(tmp_path: Path) -> None:
-    def run(name: str, sample: str, began: float) -> None:
-        (tmp_path / name).mkdir()
-        write_flagged(tmp_path / name / "scan.h5", frames_of(TwoCylinders()), {})
-        started = (
-            f'{{"event": "run_started", "time": {began}, "folder": "{name}", "path": "{name}/scan.h5", '
-            f'"sample": "{sample}", "n_frames": 98}}\n{{"event": "state", "time": {began}, "state": "done"}}\n'
-        )
-        (tmp_path / name / "events.jsonl").write_text(started, encoding="utf-8")
-
-    run("2026-01-01T000000_a", "first", 1.0)
+    done = {"event": "state", "time": 1.0, "state": "done"}
+    write_run(tmp_path / "2026-01-01T000000_a", STARTED | {"sample": "first"}, done)
     with _served(tmp_path) as (server, client):
         server.look()
         assert (client.get("T:SampleName"), client.get("T:ScanStatus")) == ("first", "done")
         assert client.get("T:ImagesSaved") == 49 and client.get("T:PercentComplete") == 50.0
-        run("2026-01-01T000001_b", "second", 2.0)
+        write_run(tmp_path / "2026-01-01T000001_b", STARTED | {"sample": "second"}, done)
         server.look()
         assert client.get("T:SampleName") == "second"
 
 
 def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> None:
-    (tmp_path / "2026-01-01T000000_a").mkdir()
-    run = tmp_path / "2026-01-01T000000_a"
-    scan = TwoCylinders()
-    write_flagged(run / "scan.h5", frames_of(scan), {})
-    events = [
-        {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98},
-        {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
-        {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
-    ]
-    (run / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events), encoding="utf-8")
+    write_run(tmp_path / "2026-01-01T000000_a", *FAILED)
     begin = time.time()
     with _served(tmp_path) as (server, client):
         server.look()
@@ -101,7 +85,7 @@ def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> N
             for value in [client.get(f"T:{name}")]
         }  # fmt: skip
         assert client.get("T:ScanStatus").raw.alarm.message == "the stage does not answer"
-    newest = frames_of(scan)[-1].time
+    newest = frames_of(TwoCylinders())[-1].time
     assert alarm["SampleName"] == (0, 1.7e9) and alarm["Warnings"] == (0, 1.7e9)
     assert alarm["Alarms"] == alarm["LastFlag"] == (2, 1.7e9 + 1.25)
     assert alarm["ScanStatus"] == alarm["Message"] == (2, 1.7e9 + 2.5)
@@ -121,12 +105,7 @@ def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path)
 
 def test_a_monitor_gets_each_frame_with_its_time(tmp_path: Path) -> None:
     """Also where the value is the one before."""
-    run = tmp_path / "2026-01-01T000000_a"
-    run.mkdir()
-    write_flagged(run / "scan.h5", frames_of(TwoCylinders()), {})
-    log = run / "events.jsonl"
-    started = {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a", "sample": "s", "n_frames": 98}
-    log.write_text(json.dumps(started) + "\n", encoding="utf-8")
+    log = write_run(tmp_path / "2026-01-01T000000_a", STARTED) / "events.jsonl"
     seen: list[float] = []
     with _served(tmp_path) as (server, client):
         server.look()

@@ -13,9 +13,8 @@ import pytest
 import tifffile
 from PIL import Image, ImageSequence
 
+from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
-from beamline.storage.writers.recon_file import ReconRecord
-from recon.base.volume import Grid, Volume
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
 
@@ -24,19 +23,8 @@ VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
 
 @pytest.fixture
 def volume(folder: Path) -> Path:
-    grid = Grid(VALUES.shape, 0.5)
-    write_volume(
-        folder / "v.h5",
-        ReconRecord(
-            volume=Volume(VALUES, grid),
-            length_unit="mm",
-            raw_file="scan.h5",
-            title="t",
-            sample="s",
-            time=0.0,
-            parameters={"method": "fbp"},
-        ),
-    )
+    record = bare_record(folder / "scan.h5", VALUES, (0.5, 0.5, 0.5))
+    write_volume(folder / "v.h5", replace(record, parameters={"method": "fbp"}))
     return folder
 
 

@@ -11,13 +11,12 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from click.testing import CliRunner, Result
 
-from beamline.cli.main import main
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
+from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
@@ -43,22 +42,18 @@ def folder(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
-def _beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, list(arguments))
-
-
 @pytest.mark.parametrize(
     "command", ["segment loop.h5", "export scan.h5 -o loop.h5", "simulate plain --frames 2 --out loop.h5"]
 )
 def test_a_link_that_leads_to_itself_is_a_file_that_is_not_there(folder: Path, command: str) -> None:
     (folder / "loop.h5").symlink_to("loop.h5")
-    result = _beamline(*command.split())
+    result = beamline(*command.split())
     assert result.exit_code in (2, 5) and "loop.h5" in result.stderr, result.output
     assert (folder / "loop.h5").is_symlink()
 
 
 def test_info_for_people(folder: Path) -> None:
-    result = _beamline("info", "scan.h5")
+    result = beamline("info", "scan.h5")
     assert result.exit_code == 0, result.output
     said = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
     assert said["format"] == "nxtomo"
@@ -71,13 +66,13 @@ def test_info_for_people(folder: Path) -> None:
 
 
 def test_info_takes_a_line_for_each_fact_of_a_volume(folder: Path) -> None:
-    assert _beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
-    lines = _beamline("info", "v.h5").stdout.splitlines()
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
+    lines = beamline("info", "v.h5").stdout.splitlines()
     assert [line.split(maxsplit=1)[1] for line in lines if line.startswith("recipe ")] == ["method: fbp; axis: 19.5"]
 
 
 def test_info_for_machines(folder: Path) -> None:
-    result = _beamline("info", "exchange.h5", "--json")
+    result = beamline("info", "exchange.h5", "--json")
     (line,) = result.stdout.splitlines()
     said = json.loads(line)
     assert (said["event"], said["quantity"], said["pixel_size_mm"]) == ("done", "counts", 0.5)
@@ -87,7 +82,7 @@ def test_info_for_machines(folder: Path) -> None:
 def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
     with h5py.File("exchange.h5", "r+") as file:
         file.attrs["quantity"] = "NOT what we call it"
-    lines = _beamline("info", "exchange.h5").stdout.splitlines()
+    lines = beamline("info", "exchange.h5").stdout.splitlines()
     assert [" ".join(line.split()) for line in lines if line.startswith("quantity")] == [
         "quantity counts",
         "quantity (of the file) NOT what we call it",
@@ -97,13 +92,13 @@ def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
 def test_info_takes_what_the_caller_says(folder: Path) -> None:
     with h5py.File("exchange.h5", "r+") as file:
         del file["exchange/data_white"], file["exchange/data_dark"]
-    assert "quantity" in _beamline("info", "exchange.h5").stdout
-    result = _beamline("info", "exchange.h5", "--quantity", "line-integrals")
+    assert "quantity" in beamline("info", "exchange.h5").stdout
+    result = beamline("info", "exchange.h5", "--quantity", "line-integrals")
     assert "line_integrals" in result.stdout
 
 
 def test_validate_passes_what_we_write(folder: Path) -> None:
-    result = _beamline("validate", "scan.h5")
+    result = beamline("validate", "scan.h5")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == ["scan.h5: 0 errors, 0 warnings"]
 
@@ -112,11 +107,11 @@ def test_validate_names_each_fault(folder: Path) -> None:
     with h5py.File("scan.h5", "r+") as file:
         file["entry/sample/rotation_angle"][7] = np.nan
         seal(file)
-    result = _beamline("validate", "scan.h5")
+    result = beamline("validate", "scan.h5")
     assert result.exit_code == 5
     assert "error    angles" in result.stdout
     assert "beamline: scan.h5: 1 error against" in result.stderr
-    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--json").stdout.splitlines()]
+    events = [json.loads(line) for line in beamline("validate", "scan.h5", "--json").stdout.splitlines()]
     assert [event["event"] for event in events][-1] == "done"
     assert events[-1]["error"] == 1
     assert events[0]["rule"] == "angles"
@@ -124,7 +119,7 @@ def test_validate_names_each_fault(folder: Path) -> None:
 
 def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
     for name in ("diad_k11-18014.nxs", "esrf_bm05_nxtomo_20x16x16.nx"):
-        result = _beamline("info", str(shared_data / "fixtures" / name))
+        result = beamline("info", str(shared_data / "fixtures" / name))
         assert result.exit_code == 0, result.output
         assert "reconstructable" in result.stdout
     assert "there is no beam in them" in result.stdout
@@ -141,7 +136,7 @@ def _stack(folder: Path) -> Path:
 def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
     _stack(folder)
     options = ("--angles", "angles.txt", "--quantity", "line-integrals", "--pixel-size-um", "500", "--no-data", "-1")
-    result = _beamline("ingest", "in.tif", "out.h5", *options, "--sample", "cylinders", "--energy-kev", "25")
+    result = beamline("ingest", "in.tif", "out.h5", *options, "--sample", "cylinders", "--energy-kev", "25")
     assert result.exit_code == 0, result.output
     assert "out.h5" in result.stdout
     assert "18, 0 without a valid pixel" in result.stdout
@@ -154,7 +149,7 @@ def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
 
 def test_ingest_for_machines(folder: Path) -> None:
     _stack(folder)
-    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
+    result = beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
     said = json.loads(result.stdout.splitlines()[-1])
     assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
 
@@ -162,12 +157,10 @@ def test_ingest_for_machines(folder: Path) -> None:
 def test_ingest_says_how_far_it_is(folder: Path) -> None:
     _stack(folder)
     options = ("--angles", "angles.txt", "--quantity", "line-integrals")
-    events = [
-        json.loads(line) for line in _beamline("ingest", "in.tif", "a.h5", *options, "--json").stdout.splitlines()
-    ]
+    events = [json.loads(line) for line in beamline("ingest", "in.tif", "a.h5", *options, "--json").stdout.splitlines()]
     progress = [event for event in events if event["event"] == "progress"]
     assert (progress[-1]["n"], progress[-1]["of"], progress[-1]["eta_s"]) == (18, 18, 0.0)
-    result = _beamline("ingest", "in.tif", "b.h5", *options)
+    result = beamline("ingest", "in.tif", "b.h5", *options)
     assert "frames: 18/18" in result.stderr
     assert "18/18" not in result.stdout
 
@@ -179,7 +172,7 @@ def test_sigterm_leaves_no_part_of_an_ingest(folder: Path, monkeypatch: pytest.M
     _stack(folder)
     monkeypatch.setattr("beamline.features.files.ingest.digest", interrupted)
     before = {path.name for path in folder.iterdir()}
-    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt")
+    result = beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt")
     assert result.exit_code == 130
     assert {path.name for path in folder.iterdir()} == before
 
@@ -198,7 +191,7 @@ def test_sigterm_leaves_no_part_of_an_ingest(folder: Path, monkeypatch: pytest.M
 def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...], said: str) -> None:
     _stack(folder)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    result = _beamline("ingest", *arguments)
+    result = beamline("ingest", *arguments)
     assert result.exit_code == 5, result.output
     assert said in result.stderr
     assert "Traceback" not in result.output
@@ -230,7 +223,7 @@ def test_messages_speak_of_options_as_they_are_typed(
     folder: Path, command: str, options: tuple[str, ...], said: str
 ) -> None:
     _bare(folder)
-    result = _beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
+    result = beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
     assert result.exit_code == (0 if command == "info" and not options else 5)
     assert said in result.output
     assert "angle_rows" not in result.output
@@ -240,22 +233,22 @@ def test_messages_speak_of_options_as_they_are_typed(
 @pytest.mark.parametrize("command", ["info", "validate"])
 def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
     _bare(folder)
-    said = _beamline(command, "stack.tif").stdout
+    said = beamline(command, "stack.tif").stdout
     assert "say --quantity counts, --quantity transmission or --quantity line-integrals." in said
-    said = _beamline(command, "stack.tif", "--quantity", "counts").stdout
+    said = beamline(command, "stack.tif", "--quantity", "counts").stdout
     assert "Counts without flats: give --flats FILE (or a folder). If the frames were divided" in said
     assert "Counts without darks: give --darks FILE (or a folder). If the frames were divided" in said
 
 
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:
-    good = _beamline("validate", "scan.h5", "--deep")
+    good = beamline("validate", "scan.h5", "--deep")
     assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
     with h5py.File("scan.h5", "r+") as file:
         file["entry/instrument/detector/data"][9, 1, 1] ^= 1
-    result = _beamline("validate", "scan.h5", "--deep")
+    result = beamline("validate", "scan.h5", "--deep")
     assert result.exit_code == 5
     assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
-    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
+    events = [json.loads(line) for line in beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
 
 
@@ -263,9 +256,9 @@ def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) 
     with h5py.File("scan.h5", "r+") as file:
         file["entry/title"][()] = "a\x1b]0;owned\x07\x1b[2J"
     for command in ("info", "validate"):
-        output = _beamline(command, "scan.h5").output
+        output = beamline(command, "scan.h5").output
         assert "\x1b" not in output and "\x07" not in output
-    assert "a\\x1b]0;owned" in _beamline("info", "scan.h5").stdout
+    assert "a\\x1b]0;owned" in beamline("info", "scan.h5").stdout
 
 
 @pytest.mark.parametrize("command", ["info", "validate", "monitor"])
@@ -273,16 +266,16 @@ def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command:
     data = (folder / "scan.h5").read_bytes()
     parts = data.split(b"EAIB")  # where HDF5 keeps the places of chunks
     (folder / "scan.h5").write_bytes(b"EAIB".join([parts[0], *(part[:8] + b"?" + part[9:] for part in parts[1:])]))
-    result = _beamline(command, "scan.h5")
+    result = beamline(command, "scan.h5")
     assert result.exit_code == 5, result.output
     assert len(parts) > 1 and "damaged" in result.output
 
 
 def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:
     scan = write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
-    result = CliRunner().invoke(main, ["info", str(scan), "--statistics", "-o", str(tmp_path / "h.png")])
+    result = beamline("info", scan, "--statistics", "-o", tmp_path / "h.png")
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()] == ["kind", "dark", "flat", "projection", "output"]
     assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
     for wrong in (["-o", "x.png"], ["--statistics", "--truth", "t.npy"]):
-        assert CliRunner().invoke(main, ["info", str(scan), *wrong]).exit_code == 2
+        assert beamline("info", scan, *wrong).exit_code == 2

@@ -18,6 +18,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.rows import Rows
 from drivers.base.frame import Frame, FrameKind
+from tests.beamline.cli.small_scan import left
 
 SHAPE = (24, 32)
 N = 9
@@ -91,10 +92,6 @@ def test_a_scan_of_ours_can_be_ingested_again(
         np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames])
         assert source.image_key.tolist() == [int(frame.kind) for frame in frames]
         assert source.axis_col == 7.25
-
-
-def left(folder: Path) -> set[str]:
-    return {file.name for file in folder.iterdir()}
 
 
 @pytest.mark.parametrize(

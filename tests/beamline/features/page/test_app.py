@@ -22,6 +22,7 @@ from beamline.scan.control import verbs_taken
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.features.page.served import Served, served
+from tests.beamline.features.run_folder import write_run
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
@@ -144,8 +145,7 @@ def test_what_is_not_there_is_a_sentence(page: Served) -> None:
 
 def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All threads that answer requests are busy with a file that does not answer."""
-    write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
-    (tmp_path / "events.jsonl").write_text('{"event": "state", "state": "finishing"}\n')  # how it answers
+    write_run(tmp_path, {"event": "state", "state": "finishing"})  # how it answers
     free, stop = threading.Event(), StopRequest()
     monkeypatch.setattr(Recording, "facts", lambda file: {"free": free.wait(60)})
     with (
@@ -217,8 +217,7 @@ def test_an_invalid_address_is_refused() -> None:
 
 def test_the_volume_of_a_run_is_shown_once_it_is_there(tmp_path: Path) -> None:
     values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
-    (tmp_path / "events.jsonl").write_text("")
-    write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
+    write_run(tmp_path)
     write_volume(tmp_path / "recon.h5", bare_record(tmp_path / "scan.h5", values, (0.2, 0.1, 0.1)))
     with served(tmp_path) as page:
         (facts,) = json.loads(page.ask("/view/api/volumes")[2])

@@ -19,8 +19,9 @@ from tests.beamline.cli.small_scan import beamline
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.features.page.served import Served, listed
 from tests.beamline.features.page.test_app import tile
+from tests.beamline.features.run_folder import write_run
 from tests.beamline.ran import Ran
-from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders()
 EVIL = "<img src=x>"
@@ -28,15 +29,9 @@ EVIL = "<img src=x>"
 
 def made(folder: Path, day: int, sample: str) -> Path:
     """A run of a day, which was stopped before it had all its frames."""
-    run = folder / f"202601{day:02d}T120000Z_s"
-    run.mkdir()
-    events = (
-        {"event": "run_started", "time": 1.0, "sample": sample, "n_frames": 60},
-        {"event": "state", "time": 2.0, "state": "stopped"},
-    )
-    (run / "events.jsonl").write_text("".join(f"{json.dumps(event)}\n" for event in events))
-    write_flagged(run / "scan.h5", frames_of(SCAN), {})
-    return run
+    started = {"event": "run_started", "time": 1.0, "sample": sample, "n_frames": 60}
+    stopped = {"event": "state", "time": 2.0, "state": "stopped"}
+    return write_run(folder / f"202601{day:02d}T120000Z_s", started, stopped)
 
 
 def rows(page: Served) -> list[dict[str, Any]]:

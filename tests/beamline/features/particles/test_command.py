@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from beamline.features.particles import run as segment_run
-from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.writers.recon_file import write_reconstruction
 from recon.base.volume import Grid, Volume
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
@@ -48,18 +49,7 @@ def _rows(path: Path) -> list[dict[str, float]]:
 def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> None:
     data = can()
     grid = Grid(data.shape, VOXEL, CENTRE)  # type: ignore[arg-type]
-    write_reconstruction(
-        here / "recon.h5",
-        ReconRecord(
-            volume=Volume(data, grid),
-            length_unit="mm",
-            raw_file="scan.h5",
-            title="t",
-            sample="s",
-            time=0.0,
-            parameters={},
-        ),
-    )
+    write_reconstruction(here / "recon.h5", replace(bare_record(here, data, (VOXEL,) * 3), volume=Volume(data, grid)))
     result = beamline("segment", "recon.h5", *MARGIN)
     assert result.exit_code == 0, result.output
     assert left(here) == {"recon.h5", "recon_particles.h5", "recon_particles.csv", "recon_particles.png"}
@@ -94,18 +84,9 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.usefixtures("undrawn")
 def test_error_bars_in_the_file_give_each_volume_an_interval(here: Path) -> None:
     data = can(noise=0.02)
-    record = ReconRecord(
-        volume=Volume(data, Grid(data.shape, VOXEL)),
-        length_unit="mm",
-        raw_file="scan.h5",
-        title="t",
-        sample="s",
-        time=0.0,
-        parameters={},
-    )  # type: ignore[arg-type]
+    record = bare_record(here, data, (VOXEL,) * 3)
     rows = []
     for deviation in (None, np.full_like(data, 0.05), np.full_like(data, 0.4)):
         write_reconstruction(here / "v.h5", replace(record, deviation=deviation), replace=True)

@@ -13,9 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from beamline.cli.main import main
 from beamline.core.installed import shipped_scenes
 from beamline.features.simulate import command as module
 from beamline.features.simulate import write
@@ -30,6 +28,7 @@ from recon.base.volume import Grid
 from simulators.devices.clock import VirtualClock
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.expose import Scan
+from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.simulate.read_labels import read_labels
 
 SCENE = """
@@ -57,12 +56,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def _beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, list(arguments))
-
-
 def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
-    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--frames", "6", "--seed", "4")
+    result = beamline("simulate", "scene.yaml", "--out", "scan.h5", "--frames", "6", "--seed", "4")
     assert result.exit_code == 0, result.output
     assert "10 frames" in result.stdout
     assert "no anomaly" in result.stdout
@@ -77,15 +72,15 @@ def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
         frames = source.read(slice(None)).astype(float)
     assert frames[:2].mean() == pytest.approx(200, abs=1)
     assert frames[2:4].mean() == pytest.approx(200 + 2000 / 0.107, rel=0.01)
-    assert _beamline("validate", "scan.h5").exit_code == 0
-    again = _beamline("simulate", "scene.yaml", "--out", "again.h5", "--frames", "6", "--seed", "4")
+    assert beamline("validate", "scan.h5").exit_code == 0
+    again = beamline("simulate", "scene.yaml", "--out", "again.h5", "--frames", "6", "--seed", "4")
     assert again.exit_code == 0
     with open_scan("again.h5") as source:
         np.testing.assert_array_equal(source.read(slice(None)), frames)
 
 
 def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
-    result = _beamline("simulate", "scene.yaml", "--truth", "truth.h5", "--truth-bin", "2")
+    result = beamline("simulate", "scene.yaml", "--truth", "truth.h5", "--truth-bin", "2")
     assert result.exit_code == 0, result.output
     grid = Grid.matching(Geometry.parallel([0.0], (32, 40), pixel_pitch=0.012, axis_col=21.0).binned(2))
     with h5py.File("truth.h5") as file:
@@ -101,7 +96,7 @@ def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
 
 
 def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
-    result = _beamline("simulate", "scene.yaml", "--explain")
+    result = beamline("simulate", "scene.yaml", "--explain")
     assert result.exit_code == 0, result.output
     head, tail = result.stdout.split("Not named by the scene")
     lines = [line.split()[0] for line in head.splitlines() if line]
@@ -109,7 +104,7 @@ def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
     assert [line for line in lines if line in steps] == steps
     assert "rolling_shutter" in tail
     assert "photon_noise" not in tail
-    said = json.loads(_beamline("simulate", "scene.yaml", "--explain", "--json").stdout.splitlines()[0])
+    said = json.loads(beamline("simulate", "scene.yaml", "--explain", "--json").stdout.splitlines()[0])
     assert said["event"] == "explain"
     assert [cost["name"] for cost in said["costs"]] == steps
     assert said["ms"] > 0
@@ -125,7 +120,7 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
         return real(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(write, "expose", stopping)
-    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5")
+    result = beamline("simulate", "scene.yaml", "--out", "scan.h5")
     assert result.exit_code == 4
     assert "Stopping after this frame. Ctrl-C again stops at once." in result.stderr
     assert "Stopped after 7 of 16 frames; scan.h5 holds them and is readable." in result.stderr
@@ -150,7 +145,7 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
         return real(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(write, "expose", ending)
-    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--json", "--set", f"effects=[{BAND}]")
+    result = beamline("simulate", "scene.yaml", "--out", "scan.h5", "--json", "--set", f"effects=[{BAND}]")
     assert result.exit_code == code
     events = [json.loads(line)["event"] for line in result.stdout.splitlines()]
     assert (events[-1], events.count("failed"), "done" in events) == ("failed", 1, False)
@@ -165,39 +160,39 @@ def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.
     def asked(*arguments: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    before = sorted(path.name for path in folder.iterdir())
+    before = left(folder)
     monkeypatch.setattr("beamline.scenes.scene_file.write_truth", asked)
-    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
+    result = beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
     assert result.exit_code == 130
     assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
-    assert sorted(path.name for path in folder.iterdir()) == before
+    assert left(folder) == before
 
 
 def test_with_nothing_to_do_programs_are_told_too(folder: Path) -> None:
-    result = _beamline("simulate", "scene.yaml", "--json")
+    result = beamline("simulate", "scene.yaml", "--json")
     assert result.exit_code == 2
     assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
 
 
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = sorted(path.name for path in folder.iterdir())
+    before = left(folder)
     for arguments, code, words in (
         (("--out", "scan.h5", *HUGE), 5, r"scan.h5 would take 23\.4 TB with 1000004 frames, its disk has .* free"),
         (("--truth", "t.h5", "--truth-bin", "1"), 2, r"--truth-bin 1: the truth takes 819 kB of memory, 300 kB are"),
     ):
         monkeypatch.setattr(module, "free_memory", lambda: 300_000)
-        result = _beamline("simulate", "scene.yaml", *arguments)
+        result = beamline("simulate", "scene.yaml", *arguments)
         assert result.exit_code == code
         assert re.search(words, result.stderr), result.stderr
-        assert sorted(path.name for path in folder.iterdir()) == before
-    assert _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
+        assert left(folder) == before
+    assert beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
 
 
 @pytest.mark.usefixtures("real_pictures")
 @pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
 def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
     wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")
-    result = _beamline("simulate", "scene.yaml", *wanted)
+    result = beamline("simulate", "scene.yaml", *wanted)
     assert result.exit_code == 0, result.output
     width, height = struct.unpack(">II", Path("p.png").read_bytes()[16:24])
     assert 100 <= height < 3 * width
@@ -212,7 +207,7 @@ def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
 
 
 def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
-    result = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
+    result = beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
     assert result.exit_code == 2
     assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
     assert not Path("s.h5").exists()
@@ -223,23 +218,23 @@ def test_no_truth_is_left_of_a_scene_that_cannot_be_exposed(folder: Path, output
     """The body is at the source in the first view alone, so that the rehearsal of the last one shows nothing."""
     body = "{kind: ellipsoid, semi_axes: [0.1, 0.1, 0.1], attenuation: 4.0, centre: [0.0, -0.3, 0.0]}"
     wrong = ("--set", "beam.sod=0.35", "--set", "beam.sdd=1", "--set", f"phantom.solids=[{body}]")
-    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", output, "s.h5", *wrong)
+    result = beamline("simulate", "scene.yaml", "--truth", "t.h5", output, "s.h5", *wrong)
     assert (result.exit_code, "reaches" in result.stderr) == (2, True), result.stderr
     assert not Path("t.h5").exists()
 
 
 def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
     wanted = ("--frames", "1", "--set", "beam.energy_kev=20.5")
-    assert _beamline("simulate", "scene.yaml", "--out", "s.h5", *wanted).exit_code == 0
+    assert beamline("simulate", "scene.yaml", "--out", "s.h5", *wanted).exit_code == 0
     with open_scan("s.h5") as source:
         assert source.energy_kev == 20.5
 
 
 def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
-    made = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
+    made = beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
     assert "voxels of 0.048 mm, for `beamline recon --bin 4`" in made.stdout
     shape = "--truth has shape (8, 10, 10), the volume (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
-    refused = _beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
+    refused = beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
     assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
 
 
@@ -263,15 +258,15 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
 def test_refused_before_anything_is_written(folder: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
     Path("there.h5").write_bytes(b"")
     Path("broken.yaml").write_text("phantom: {kind: solids, solids: []}\nbeam: {photons: 1}\n", encoding="utf-8")
-    before = sorted(path.name for path in folder.iterdir())
-    result = _beamline("simulate", *arguments)
+    before = left(folder)
+    result = beamline("simulate", *arguments)
     assert (result.exit_code, words in result.stderr) == (code, True), result.stderr
-    assert sorted(path.name for path in folder.iterdir()) == before
+    assert left(folder) == before
 
 
 @pytest.mark.parametrize("name", [name for name in shipped_scenes() if name != "pet"])  # which emits
 def test_every_shipped_scene_can_be_simulated(folder: Path, name: str) -> None:
-    result = _beamline("simulate", name, "--frames", "1", "--picture", "p.png")
+    result = beamline("simulate", name, "--frames", "1", "--picture", "p.png")
     assert result.exit_code == 0, result.output
 
 

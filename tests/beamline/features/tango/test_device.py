@@ -22,7 +22,8 @@ from beamline.scan.control import Verb
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.cli.small_scan import beamline
-from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.beamline.features.run_folder import FAILED, write_run
+from tests.beamline.scans import TwoCylinders, frames_of
 
 WITHIN = 60.0  # s
 
@@ -71,19 +72,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[ServedRun
         yield run, runs, device
 
 
-def _write_run(runs: Path) -> TwoCylinders:
-    scan, folder = TwoCylinders(), runs / "2026-01-01T000000_a"
-    folder.mkdir()
-    write_flagged(folder / "scan.h5", frames_of(scan), {})
-    events = [
-        {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98},
-        {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
-        {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
-    ]
-    (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events), encoding="utf-8")
-    return scan
-
-
 def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
     run, runs, device = served
     run.look()
@@ -92,9 +80,9 @@ def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
     with pytest.raises(tango.DevFailed, match="There is no run"):
         device.Stop()
 
-    scan = _write_run(runs)
+    folder = write_run(runs / "2026-01-01T000000_a", *FAILED)
     run.look()
-    frames = frames_of(scan)
+    frames = frames_of(TwoCylinders())
     expected = {
         "SampleName": ("s", 1.7e9, "VALID"), "ScanStatus": ("failed", 1.7e9 + 2.5, "VALID"),
         "Alarms": (1, 1.7e9 + 1.25, "ALARM"), "FlagNames": (("beam",), 1.7e9 + 1.25, "VALID"),
@@ -110,7 +98,7 @@ def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
     assert device.state() == tango.DevState.FAULT and device.status() == "failed; the stage does not answer"
     assert device.LastView.shape == frames[-1].counts.shape and np.isfinite(device.LastView).any()
     assert device.read_attribute("Slice").quality == tango.AttrQuality.ATTR_INVALID
-    values, folder = np.arange(60, dtype=np.float32).reshape(3, 4, 5), runs / "2026-01-01T000000_a"
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
     write_volume(folder / "recon.h5", bare_record(folder / "scan.h5", values))
     assert np.array_equal(device.Slice, values[1])
     with pytest.raises(tango.DevFailed, match="no scan is running"):
@@ -128,7 +116,7 @@ def test_only_what_was_set_again_is_pushed(tmp_path: Path) -> None:
         before = run.look()
         push_changes(Recorder(), before, run.look())
         assert pushed == {}
-        _write_run(tmp_path)
+        write_run(tmp_path / "2026-01-01T000000_a", *FAILED)
         push_changes(Recorder(), before, run.look())
     quality = tango.AttrQuality
     assert pushed["SampleName"] == ("s", quality.ATTR_VALID) and pushed["FlagCounts"] == ([1], quality.ATTR_VALID)

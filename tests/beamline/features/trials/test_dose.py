@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from beamline.cli.main import main
 from beamline.config.load import config_folder
 from beamline.features.trials import dose, runner
 from beamline.features.trials.dose import plans_of
 from beamline.features.trials.launch import DATA, TrialData
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import run
+from tests.beamline.cli.small_scan import beamline
 
 
 def test_all_plans_of_a_kind_have_equal_dose_and_equal_time() -> None:
@@ -50,7 +49,7 @@ def test_each_plan_is_a_row_with_its_time_dose_and_blur(folder: Path, monkeypatc
 
     monkeypatch.setattr(runner, "run_trial", trial)
     monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)
-    result = CliRunner().invoke(main, ["study", "dose", "mine.yaml", "-m", "fbp"])
+    result = beamline("study", "dose", "mine.yaml", "-m", "fbp")
     assert result.exit_code == 0, result.output
     with (folder / "mine_dose" / "study.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -32,7 +32,7 @@ from tests.beamline.prepared_views import prepared_views
 pytestmark = pytest.mark.usefixtures("one_thread")
 VIEWS, HELD_OUT, SIDE, ROWS = 40, 5, 20, 2
 SECTIONS = np.array([[0.2, 1.0], [1.0, 0.3]])  # [energy, material]
-SHORT = {"weight": 0.01, "sweeps": 15}  # the weight is given, for fewer sweeps
+SHORT = {"weight": 0.01, "sweeps": 8}  # the weight is given, for fewer sweeps
 SERIES = Trial("one fit", "series", VIEWS, settings={"volumes": 2, "moves": False, **SHORT})
 MATERIALS = Trial("one fit", "materials", VIEWS, settings={"materials": "a,b"})
 
@@ -108,7 +108,7 @@ def kept(trial: Trial, data: TrialData, folder: Path) -> F32:
 def test_one_fit_in_time_is_that_of_recon(in_time: TrialData, tmp_path: Path) -> None:
     times = in_time.shown
     views = TimedViews(in_time.prepared.projections.data, in_time.geometry, times)
-    expected = fit_series(views, 2, motion=False, tv_weight=0.01, sweeps=15)
+    expected = fit_series(views, 2, motion=False, tv_weight=0.01, sweeps=8)
     np.testing.assert_array_equal(kept(SERIES, in_time, tmp_path), expected.at(float(np.sort(times)[VIEWS // 2])))
 
 

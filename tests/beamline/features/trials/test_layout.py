@@ -152,14 +152,6 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return figures
 
 
-@pytest.mark.usefixtures("real_pictures")
-def test_they_are_png() -> None:
-    points = [(FBP, 1.0, 20.0), (FIGURES_FIT, 30.0, 25.0), (FEW, math.nan, 1.0)]
-    assert pareto_plot(points, [0, 1], "time (s)", "PSNR (dB)").startswith(b"\x89PNG")
-    assert pareto_plot([], [], "time (s)", "PSNR (dB)").startswith(b"\x89PNG")
-    assert cost_curves([Outcome(FIGURES_FIT, "done", curve=[(1, 2), (2, 3)])]).startswith(b"\x89PNG")
-
-
 def test_every_trial_is_a_point_and_the_front_a_line_through_its_own(drawn: list[Figure]) -> None:
     points = [(FBP, 1.0, 20.0), (FEW, 20.0, 19.0), (FIGURES_FIT, 30.0, 25.0), (FEW, math.nan, 30.0)]
     pareto_plot(points, [0, 2], "time (s)", "PSNR (dB)", "s", pick=1)

@@ -22,7 +22,7 @@ from beamline.features.trials import runner, tradeoff
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.layout import text
 from beamline.features.trials.runner import ComparedScan, run_comparison
-from beamline.features.trials.table import TIME, TrialTable
+from beamline.features.trials.table import TrialTable
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.scan_statistics import LightAsked
@@ -32,6 +32,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from tests.beamline.cli.small_scan import left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
@@ -73,10 +74,6 @@ def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., Outcome]
     return use
 
 
-def _left(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
-
-
 def _rows(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "tradeoff.csv").read_text(encoding="utf-8").splitlines()))
 
@@ -85,7 +82,7 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) -> None:
     events: list[Event] = []
     table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
-    assert _left(tmp_path / "out") == TABLES | FIGURES | {"curves.png", "slices.png"}
+    assert left(tmp_path / "out") == TABLES | FIGURES | {"curves.png", "slices.png"}
     record = json.loads((tmp_path / "out" / "tradeoff.json").read_text(encoding="utf-8"))
     rows = _rows(tmp_path / "out")
     assert len(record["trials"]) == len(rows) == len(table.outcomes)
@@ -117,15 +114,6 @@ def test_each_trial_has_the_photons_of_its_views(tmp_path: Path, made_up: object
         assert float(row["photons"]) == pytest.approx(photons * outcome.trial.views)
 
 
-def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path: Path, made_up: object) -> None:
-    table = run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
-    said = text(table, TRADEOFF)
-    best = {table.compared[i].trial.label for i in table.front(TIME)}
-    marked = {line[2:].split("  ")[0] for line in said.splitlines() if line.startswith("* ")}
-    assert marked == best
-    assert " ".join(said.split()).count("s a dB") == len(best) - 1
-
-
 def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> None:
     grid = Grid.matching(Geometry.parallel([0.0], SCAN.shape))
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
@@ -134,8 +122,6 @@ def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> N
     table = run_tradeoff(_options(tmp_path, truth=str(tmp_path / "truth.npy")), lambda e: None, SystemClock())
     assert table.by == "psnr"
     assert max(trial.views for trial in seen) == 30
-    held_out = run_tradeoff(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
-    assert held_out.outcomes[0].trial.views == 27
 
 
 def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> None:
@@ -154,8 +140,8 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> N
     rows = _rows(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] * 3 + ["interrupted"] + ["not run"] * (len(rows) - 4)
     assert "interrupted: ended before it was done" in text(table, TRADEOFF)
-    assert _left(tmp_path / "out") >= TABLES | FIGURES
-    assert "work" not in _left(tmp_path / "out")
+    assert left(tmp_path / "out") >= TABLES | FIGURES
+    assert "work" not in left(tmp_path / "out")
     assert events[-1].event == "done" and events[-1].data["stopped"]
 
 
@@ -170,7 +156,7 @@ def test_ctrl_c_before_the_first_trial_is_done_leaves_nothing(
     events: list[Event] = []
     with pytest.raises(KeyboardInterrupt):
         run_tradeoff(_options(tmp_path), events.append, SystemClock())
-    assert _left(tmp_path) == {"scan.h5"}
+    assert left(tmp_path) == {"scan.h5"}
     assert events[-1].event != "done"
 
 
@@ -187,7 +173,7 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
         full.setattr(*where, _full)
         with pytest.raises(DataError, match=rf"{re.escape(name)} could"):
             run_tradeoff(options, lambda e: None, SystemClock())
-    assert _left(tmp_path) == {"scan.h5"}
+    assert left(tmp_path) == {"scan.h5"}
     assert run_tradeoff(options, lambda e: None, SystemClock()).n_done
 
 
@@ -203,7 +189,7 @@ def test_a_disk_that_is_full_later_keeps_the_trials_written(
     with pytest.raises(DataError, match=r"tradeoff\.json"):
         run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
     assert [row["status"] for row in _rows(tmp_path / "out")][:2] == ["done", "done"]
-    assert _left(tmp_path / "out") == {"tradeoff.json", "tradeoff.csv"}
+    assert left(tmp_path / "out") == {"tradeoff.json", "tradeoff.csv"}
 
 
 def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_up: Any) -> None:
@@ -227,20 +213,6 @@ def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_
         assert "0.00 s" not in words and " µs" in words and ">0.00<" not in words
     fbp = next(o for o in table.compared if o.trial.method == "fbp")
     assert f"{fbp.seconds:.2e}".replace("e-0", "e-") in said  # 5.40e-05 s: three digits where two decimals say 0.00
-
-
-def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any) -> None:
-    time = iter(range(0, 10_000, 5))
-    limits: list[float] = []
-
-    def timed(trial: Trial, work: Path, seed: int, left: float, keep: Path | None) -> Outcome:
-        limits.append(left)
-        return _made_up(trial)
-
-    made_up(timed)
-    table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: float(next(time)))
-    assert 0 < table.n_done < len(table.outcomes)
-    assert all(0 < left <= 60 for left in limits) and limits == sorted(limits, reverse=True)
 
 
 def test_a_limit_of_time_bounds_reading_compiling_and_the_page(
@@ -300,7 +272,7 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
     made_up(lambda trial, *_, **__: Outcome(trial, "failed", message="no room"))
     table = run_tradeoff(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
     assert "No trial has both" in text(table, TRADEOFF)
-    assert _left(tmp_path / "b") == TABLES
+    assert left(tmp_path / "b") == TABLES
 
 
 @pytest.mark.parametrize(
@@ -318,7 +290,7 @@ def test_what_cannot_be_done_leaves_nothing(
 ) -> None:
     with pytest.raises(error, match=said):
         run_tradeoff(_options(tmp_path, **changes), lambda e: None, SystemClock())
-    assert _left(tmp_path) == {"scan.h5"}
+    assert left(tmp_path) == {"scan.h5"}
 
 
 def test_two_views_leave_none_to_judge_by(tmp_path: Path) -> None:

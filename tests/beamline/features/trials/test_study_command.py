@@ -11,24 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from beamline.cli.main import main
 from beamline.features.trials import runner
 from beamline.features.trials.launch import DATA, TrialData, averaged
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import measured
 from beamline.report.sheets import SliceSheet
 from recon.base.volume import Grid
+from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 1.875)), shape=(4, 40))  # 96 views
 ERROR = 1e-3  # 1/mm, of every voxel that a row reconstructs
-
-
-def _beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, ["study", *arguments])
 
 
 @pytest.fixture
@@ -61,7 +56,7 @@ def test_rows_are_compared_with_the_volume_of_all_views_and_with_the_truth(folde
     truth = SCAN.truth(Grid((4, 40, 40)))
     np.save(folder / "truth.npy", truth)
     light = "--photons-per-count", "0.5"
-    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp", *light)
+    result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp", *light)
     assert result.exit_code == 0, result.output
     rows = _rows(folder / "many_fixed-views")
     assert [(row["views"], row["status"]) for row in rows] == [
@@ -94,7 +89,9 @@ def test_rows_are_compared_with_the_volume_of_all_views_and_with_the_truth(folde
 def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[Any]) -> None:
     write_exchange(folder / "many.h5", SCAN)
     methods = ("-m", "r2", "-m", "sirt", "-m", "fbp")
-    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", *methods, "--steps", "50", "--iterations", "7")
+    result = beamline(
+        "study", "fixed-views", "many.h5", "--axis", "20.7", *methods, "--steps", "50", "--iterations", "7"
+    )
     assert result.exit_code == 0, result.output
     settings = {trial.method: trial.settings for trial, _ in seen[1:]}
     assert settings == {"r2": {"steps": 50}, "sirt": {"iterations": 7}, "fbp": {}}
@@ -106,7 +103,7 @@ def test_in_equal_time_the_table_says_what_was_asked_what_it_took_and_how_far_ea
     folder: Path, seen: list[Any]
 ) -> None:
     write_exchange(folder / "many.h5", SCAN)
-    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "sirt", "-m", "fbp", "--seconds", "3")
+    result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "sirt", "-m", "fbp", "--seconds", "3")
     assert result.exit_code == 0, result.output
     assert [trial.seconds_asked for trial, _ in seen] == [None, 3.0, 3.0, None, 3.0, None]
     assert "Each row had 3 s" in result.stdout and "s asked" in result.stdout and "7 iterations" in result.stdout
@@ -118,7 +115,7 @@ def test_in_equal_time_the_table_says_what_was_asked_what_it_took_and_how_far_ea
 
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
     write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 0.5)), shape=(2, 40)))
-    result = _beamline("window-average", "many.h5", "--axis", "20.7", "-m", "fbp", "--json")
+    result = beamline("study", "window-average", "many.h5", "--axis", "20.7", "-m", "fbp", "--json")
     assert result.exit_code == 0, result.output
     whole, *rows = (data for _, data in seen)
     mean = rows[3]  # after three of single views: two views side by side
@@ -142,7 +139,7 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
         return trial(*arguments, **named)
 
     monkeypatch.setattr(runner, "run_trial", interrupted)
-    result = _beamline("random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")
+    result = beamline("study", "random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")
     assert result.exit_code == 4, result.output
     assert "stopped after 2 of 6 rows" in result.stderr and "interrupted" in result.stdout
     done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
@@ -165,20 +162,12 @@ def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
 
 def test_a_dry_run_names_the_rows_that_the_scan_has_and_writes_nothing(folder: Path, seen: list[Any]) -> None:
     write_exchange(folder / "many.h5", SCAN)
-    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "--dry-run")
+    result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "--dry-run")
     assert result.exit_code == 0, result.output
     rows = [line.rsplit(None, 2)[0] for line in result.stdout.splitlines() if ": fbp" in line]
     assert rows == ["all views: fbp", "fixed, 90 views: fbp", "fixed, 45 views: fbp"]
     assert "fixed, 180 views is left out" in result.stderr
     assert not seen and not (folder / "many_fixed-views").exists()
-
-
-def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_exchange(folder / "many.h5", SCAN)
-    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))
-    result = _beamline("random", "many.h5", "--axis", "20.7", "-o", "out")
-    assert result.exit_code == 130, result.output
-    assert not (folder / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +182,7 @@ def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: p
     ],
 )
 def test_bad_input_leaves_nothing(folder: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
-    result = _beamline(*arguments)
+    result = beamline("study", *arguments)
     assert result.exit_code == code, result.output
     assert said in result.stderr and result.stdout == ""
-    assert {p.name for p in folder.iterdir()} == {"scan.h5"}
+    assert left(folder) == {"scan.h5"}

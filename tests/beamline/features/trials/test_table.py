@@ -108,25 +108,11 @@ def test_the_best_of_each_axis_is_on_it_and_both_rise_along_it(points: list[tupl
     assert all(costs[a] < costs[b] and qualities[a] < qualities[b] for a, b in pairwise(kept))
 
 
-@given(POINTS, st.randoms(use_true_random=False))
-def test_neither_order_nor_beaten_points_matter(points: list[tuple[float, float]], random: object) -> None:
-    def found(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-        return [points[i] for i in front([p[0] for p in points], [p[1] for p in points])]
-
-    shuffled = list(points)
-    random.shuffle(shuffled)  # type: ignore[attr-defined]
-    assert found(shuffled) == found(points) == found(found(points))
-
-
 @given(st.floats(1e-9, 1e12), st.floats(1e-9, 1e12))
 def test_rounding_moves_a_cost_by_half_a_percent_and_keeps_the_order(one: float, other: float) -> None:
     assert rounded(one) == pytest.approx(one, rel=0.0051)
     assert rounded(min(one, other)) <= rounded(max(one, other))
     assert rounded(rounded(one)) == pytest.approx(rounded(one), rel=1e-9)
-
-
-def test_what_is_no_cost_stays_as_it_is() -> None:
-    assert rounded(0.0) == 0 and rounded(math.inf) == math.inf and math.isnan(rounded(math.nan))
 
 
 METHODS = names_of_one_volume()

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.energies import EnergyScans, read_spectra
 from beamline.features.trials import runner
@@ -26,6 +24,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from simulators.samples.materials.materials import known
+from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.features.materials.test_command import ENERGIES, scans, spectra  # noqa: F401 - scans is a fixture
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -102,10 +101,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def _beamline(*arguments: str) -> Result:
-    return CliRunner().invoke(main, ["tradeoff", *arguments])
-
-
 @pytest.fixture
 def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
     seen: list[Trial] = []
@@ -119,7 +114,7 @@ def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
 
 
 def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trials: list[Trial]) -> None:
-    result = _beamline("scan.h5", "--axis", "20.7", "--methods", "fbp", "--views", "fixed:20")
+    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "--methods", "fbp", "--views", "fixed:20")
     assert result.exit_code == 0, result.output
     assert (folder / "scan_tradeoff" / "tradeoff.html").is_file()
     assert "fbp, 20 views" in result.stdout and "s a dB" in result.stdout
@@ -129,7 +124,7 @@ def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trial
 
 
 def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> None:
-    result = _beamline("scan.h5", "--axis", "20.7", "--full", "--json", "-o", "out")
+    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "--full", "--json", "-o", "out")
     assert result.exit_code == 0, result.output
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert (events[0]["event"], events[-1]["event"]) == ("tradeoff_started", "done")
@@ -139,7 +134,7 @@ def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> No
 
 
 def test_a_sample_that_changes_is_compared_by_parts_and_in_one_fit(folder: Path, quick_trials: list[Trial]) -> None:
-    result = _beamline("scan.h5", "--axis", "20.7", "--methods", "fbp", "--time", "2")
+    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "--methods", "fbp", "--time", "2")
     assert result.exit_code == 0, result.output
     assert [t.group for t in quick_trials] == ["method", "parts", "parts", "one fit", "one fit", "one fit"]
     assert "series, 27 views, 2 volumes, motion learnt" in result.stdout
@@ -149,38 +144,37 @@ def test_a_sample_that_changes_is_compared_by_parts_and_in_one_fit(folder: Path,
 
 def test_a_dry_run_says_what_would_run_and_writes_nothing(folder: Path, quick_trials: list[Trial]) -> None:
     asked = ("scan.h5", "--axis", "20.7", "--methods", "fbp,sirt", "--dry-run")
-    result = _beamline(*asked)
+    result = beamline("tradeoff", *asked)
     assert result.exit_code == 0, result.output
     rows = [line.split() for line in result.stdout.splitlines() if line.startswith(("fbp", "sirt"))]
     said = {" ".join(row[:-2]): (float(row[-2]), float(row[-1])) for row in rows}
     assert list(said)[:2] == ["fbp, 27 views", "sirt, 27 views, 60 iterations"] and len(said) == 5
     assert said["sirt, 27 views, 60 iterations"][0] >= said["sirt, 27 views, 20 iterations"][0]
     assert "scan_tradeoff: tradeoff.csv" in result.stdout and not quick_trials
-    assert {path.name for path in folder.iterdir()} == {"scan.h5"}
-    event = json.loads(_beamline(*asked, "--json").stdout.splitlines()[-1])
+    assert left(folder) == {"scan.h5"}
+    event = json.loads(beamline("tradeoff", *asked, "--json").stdout.splitlines()[-1])
     assert event["event"] == "done" and [trial["label"] for trial in event["trials"]] == list(said)
 
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
 
 
-@pytest.mark.parametrize("number", SIGNALS)
 def test_ctrl_c_is_exit_code_4_with_a_table(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial], number: signal.Signals
+    folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial]
 ) -> None:
     trial = runner.run_trial
 
     def interrupted(*arguments: Any, **named: Any) -> Outcome:
         if len(quick_trials) == 2:
-            signal.raise_signal(number)
+            signal.raise_signal(signal.SIGINT)
         return trial(*arguments, **named)
 
     monkeypatch.setattr(runner, "run_trial", interrupted)
-    result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
+    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 4, result.output
     assert "after 2 of" in result.stderr
     assert "fbp, 27 views" in result.stdout and "interrupted" in result.stdout and "not run" in result.stdout
-    assert {"tradeoff.json", "tradeoff.csv", "tradeoff.html"} < {p.name for p in (folder / "out").iterdir()}
+    assert {"tradeoff.json", "tradeoff.csv", "tradeoff.html"} < left(folder / "out")
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -188,10 +182,10 @@ def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(number))
-    result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
+    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 130, result.output
     assert result.stderr.endswith("beamline: interrupted\n") and result.stdout == ""
-    assert {p.name for p in folder.iterdir()} == {"scan.h5"}
+    assert left(folder) == {"scan.h5"}
 
 
 @pytest.mark.parametrize(
@@ -215,8 +209,8 @@ def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
     ],
 )
 def test_bad_input_leaves_nothing(folder: Path, options: list[str], code: int, said: str) -> None:
-    result = _beamline("scan.h5", *options)
+    result = beamline("tradeoff", "scan.h5", *options)
     assert result.exit_code == code, result.output
     assert said in result.stderr
     assert result.stdout == ""
-    assert {p.name for p in folder.iterdir()} == {"scan.h5"}
+    assert left(folder) == {"scan.h5"}

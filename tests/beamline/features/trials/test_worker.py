@@ -115,8 +115,8 @@ def test_fewer_views_are_worse_and_spread_over_all_angles(data: TrialData) -> No
 
 @pytest.mark.parametrize(
     "change",
-    [{}, {"binning": 2}, {"fit.ssim_weight": 0.0}, {"fit.loss": "l2"}, {"fit.loss": "poisson"},
-     {"fit.truncation.sigmas": 2.5}, {"start": "tv"}],
+    [{}, {"binning": 2, "fit.loss": "l2"}, {"fit.ssim_weight": 0.0, "fit.loss": "poisson"},
+     {"fit.truncation.sigmas": 2.5, "start": "tv"}],
 )  # fmt: skip
 def test_a_fit_with_each_setting(data: TrialData, change: dict[str, Any]) -> None:
     binning = change.pop("binning", 1)

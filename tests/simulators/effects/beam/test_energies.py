@@ -35,11 +35,6 @@ def test_a_frame_has_a_twenty_seventh_of_the_attenuation_at_the_third_harmonic()
     assert (flat == round(4000 / CONVERSION)).all()
 
 
-def test_an_opaque_sample_lets_the_harmonic_through() -> None:
-    seen = Harmonics(0.01).apply(np.array([[80.0]]), shots.shot())
-    assert seen[0, 0] == pytest.approx(80 / 27 - math.log(0.01), rel=1e-12)
-
-
 SPECTRA = st.lists(st.tuples(st.floats(1e-3, 1e3), st.floats(5, 120)), min_size=1, max_size=6)
 
 

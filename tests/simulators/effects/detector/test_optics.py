@@ -162,11 +162,12 @@ def test_scratches_take_the_light_of_lines() -> None:
         rng = fixed_rng("flat_structure", seed)
         row, col, angle, chance, deep = rng.random(5) * (2304, 4096, math.pi, 1, 0.1)
         length = -math.log1p(-chance) * 80
-        reach = length / 2 + 10
+        reach = length / 2 + 18
         if not (reach < row < 2304 - reach and reach < col < 4096 - reach):
             continue
         inside += 1
-        loss = 1 - scratch.transmission(_roi(0, 0, 2304, 4096))
+        row0, col0, size = 4 * (int(row - reach) // 4), 4 * (int(col - reach) // 4), 4 * (int(2 * reach) // 4)
+        loss = 1 - scratch.transmission(_roi(row0, col0, size, size))
         assert loss.sum() == pytest.approx(deep * (length * math.sqrt(2 * math.pi) * 2 + 8 * math.pi), rel=2e-3)
         j, i = np.nonzero(loss > 0.5 * loss.max())
         if length > 40:  # its direction is its angle: rows along its sine, columns along its cosine
@@ -237,20 +238,6 @@ def test_light_is_kept_and_none_is_negative(
     assert seen.min() >= 0
 
 
-def test_a_point_becomes_a_gaussian_of_its_width() -> None:
-    point = np.zeros((81, 81))
-    point[40, 40] = 1.0
-    seen = ScintillatorBlur(100.0).apply(point, _shot((81, 81)))  # 10 pixels of FWHM
-    line = seen[40] / seen[40, 40]
-    right = 40 + int(np.argmax(line[40:] < 0.5))
-    half = right - 1 + (line[right - 1] - 0.5) / (line[right - 1] - line[right]) - 40
-    assert 2 * half == pytest.approx(10.0, rel=5e-3)
-    at = np.arange(81) - 40
-    spread = np.sqrt((seen.sum(axis=0) * at**2).sum())
-    assert spread == pytest.approx(10 * SIGMA, rel=1e-5)  # exact but for what lies beyond the frame
-    assert (line[:40] - line[:40:-1] == 0).all()
-
-
 def test_the_core_is_the_gaussian_of_another_implementation(rng: np.random.Generator) -> None:
     image = rng.random((60, 90))
     seen = ScintillatorBlur(150.0).apply(image.copy(), _shot((60, 90)))
@@ -287,17 +274,6 @@ def test_waves_are_weakened_by_the_transfer_of_core_and_tail(pixel_um: float, ta
         s = 2 * math.pi * f * 80
         wide = (1 + s**2) ** -1.5 if tail == "exponential" else math.exp(-s)
         assert _amplitude(effect, k, shot) == pytest.approx(0.8 * core + 0.2 * wide, abs=4e-3)
-
-
-def test_glare_lights_up_what_lies_behind_an_opaque_edge() -> None:
-    """Line spread of the Lorentzian: w / pi (x² + w²), so that beyond an edge there is 1/2 - atan(x / w) / pi."""
-    image = np.zeros((16, 4096))
-    image[:, :2048] = 1.0
-    seen = ScintillatorBlur(5.0, 0.1, 200.0, "lorentzian").apply(image, _shot((16, 4096)))[8]
-    for x in (200, 400, 1000):  # um; the mirrors are 20 mm away
-        column = 2048 + x // 10
-        between = (seen[column - 1] + seen[column]) / 2
-        assert between / 0.1 == pytest.approx(0.5 - math.atan(x / 200) / math.pi, abs=0.008)
 
 
 def test_a_core_as_wide_as_a_slip_of_units_is_refused() -> None:

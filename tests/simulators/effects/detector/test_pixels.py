@@ -85,14 +85,6 @@ def test_dead_pixels_hold_their_charge_and_the_others_theirs() -> None:
     np.testing.assert_array_equal(stuck == 7000, dead == 0)
 
 
-def test_they_move_with_the_region_and_are_not_the_hot_ones() -> None:
-    dead = DeadPixels(0.01).apply(np.ones((60, 80)), shots.shot())
-    moved = DeadPixels(0.01).apply(np.ones((60, 80)), shots.shot(roi=(1124, 2016, 60, 80)))
-    np.testing.assert_array_equal(dead[4:, 8:], moved[:-4, :-8])
-    hot = HotPixels(0.01, 1e6).apply(np.zeros((60, 80)), shots.shot())
-    assert ((dead == 0) & (hot > 0)).sum() <= 3  # 0.5 expected
-
-
 def test_a_binned_pixel_loses_the_share_of_its_dead_pixels() -> None:
     dead = DeadPixels(0.1).apply(np.ones((60, 80)), shots.shot())
     shot = shots.shot(detector=shots.sized(30, 40).detector, binning=2)
@@ -211,8 +203,3 @@ def test_blur_and_shutter_are_the_same_in_either_order() -> None:
     times = [1000.0 + (k + 0.5) / 3 * 0.01 + 15 * LINE for k in range(3)]
     mean = np.mean([np.exp(-shots.depth(shots.scene(), _fast(time))[30]) for time in times], axis=0)
     np.testing.assert_allclose(one[30] * CONVERSION / 4000, mean, atol=2e-5)
-
-
-def test_a_standing_sample_has_neither_blur_nor_skew() -> None:
-    moving = shots.scene("motion_blur", "rolling_shutter")
-    np.testing.assert_array_equal(shots.frame(moving, angle_at=lambda time: 0.4), shots.frame(shots.scene()))

@@ -98,18 +98,6 @@ def test_each_keeps_its_number_from_view_to_view() -> None:
         assert (np.abs(np.diff(cols)) < 1.1 * np.diff(views))[np.diff(views) == 1].all()
 
 
-def test_only_the_pixels_that_it_covers_are_touched() -> None:
-    (effect,) = shots.scene(ONE).chain.effects
-    assert isinstance(effect, Floaters)
-    for view in range(0, VIEWS, 10):
-        shot = _view(view)
-        depth = _depth(effect, shot)
-        for label in effect.labels(shot):
-            top, below, left, right = label.region
-            depth[top:below, left:right] = 0
-        assert not depth.any()
-
-
 def test_loose_ones_drift_through_from_either_side() -> None:
     loose = ONE | {"motion": "loose", "views": [10, 40], "speed": 0.05}
     sides = set()

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.special import fresnel
 
 from simulators.effects.scattering.phase_fringes import HC, PhaseFringes
 from simulators.frame.shot import Detector, Shot
@@ -48,23 +47,6 @@ def test_a_gaussian_wave_spreads_or_is_focused_as_the_closed_form_says(
     seen = _intensity(PhaseFringes(delta_beta, z, 20.0), r2 / s**2)
     np.testing.assert_allclose(seen, expected, atol=5e-5)
     assert expected.max() == pytest.approx(peak, rel=0.02)  # a phase of the other sign would spread it
-
-
-def test_a_phase_step_has_the_fringes_of_fresnels_integral() -> None:
-    """An edge of phase p: |1 + (exp(-ip) - 1) F|² with F = (1 + (1 - i)(C + i S)(x sqrt(2 / wavelength z))) / 2 (Born &
-    Wolf 1999, ch. 8.7); as far out as the fringes have ten pixels, where sampling makes them 2 % too strong."""
-    n, phase, number = 1024, 1.2, 1 / 400
-    depth = np.zeros((4, n))
-    depth[:, n // 2 :] = 2e-6 * phase  # hardly absorbs
-    seen = _intensity(PhaseFringes(1e6, _distance(number), 20.0), np.repeat(depth, n // 4, axis=0))[n // 2]
-    x = np.arange(n) + 0.5 - n / 2
-    s, c = fresnel(x * math.sqrt(2 * number))
-    edge = 0.5 * (1 + (1 - 1j) * (c + 1j * s))
-    expected = np.abs(1 + (np.exp(-1j * phase) - 1) * edge) ** 2
-    inside = slice(n // 2 - 40, n // 2 + 40)
-    np.testing.assert_allclose(seen[inside], expected[inside], atol=0.012)
-    assert expected.max() > 1.3
-    assert expected.min() < 0.75
 
 
 def test_a_phase_gaussian_agrees_with_fresnels_integral_summed_directly() -> None:

@@ -55,14 +55,10 @@ def test_the_rest_is_drawn_for_each_frame() -> None:
     assert error[:, 0].var() == pytest.approx(9.0, rel=5 * math.sqrt(2 / 400))
 
 
-def _moved(*angles: float, wait: float = 2.0) -> TrapezoidStage:
-    return TrapezoidStage(angles, wait)
-
-
 class TrapezoidStage:
     """Moves from angle to angle (radians) and stands `wait` s after each move."""
 
-    def __init__(self, angles: tuple[float, ...], wait: float) -> None:
+    def __init__(self, *angles: float, wait: float) -> None:
         self.moves: list[TrapezoidMove] = []
         self.end = 1000.0
         for here, there in pairwise(angles):
@@ -89,12 +85,12 @@ def test_backwards_the_sample_stands_further_than_the_stage() -> None:
 )
 def test_a_standing_stage_lags_by_its_last_move(turn: float, before: float, wait: float) -> None:
     """Whatever it did before, and however long it has stood."""
-    stage = _moved(0.0, before, before + turn, wait=wait)
+    stage = TrapezoidStage(0.0, before, before + turn, wait=wait)
     assert came_forwards(stage, stage.end) is (turn > 0)
 
 
 def test_going_beyond_and_back_to_the_target_is_a_move_backwards() -> None:
-    stage = _moved(0.0, 1.05, 1.0, wait=0.1)
+    stage = TrapezoidStage(0.0, 1.05, 1.0, wait=0.1)
     now = stage.end + 3.0
     assert stage(now - 2.048) == stage(now) > stage(now - 4.096)  # two looks: it stood, and it came from below
     assert not came_forwards(stage, now)
@@ -139,25 +135,6 @@ def test_no_wave_is_an_axis_that_leans_always_to_the_same_side() -> None:
     np.testing.assert_allclose(about_u, [[0.0, -0.4e-3, 0.4]] * 3, atol=1e-6)
     about_b = seen(posed(StageWobble(((0, 1000.0, -90.0),)), np.array([0.0, 1.0, 2.0])), high)
     np.testing.assert_allclose(about_b, [[0.4e-3, 0.0, 0.4]] * 3, atol=1e-6)
-
-
-def test_a_ball_high_on_a_leaning_axis_is_seen_beside_it() -> None:
-    """0.2 mm up, on an axis that leans by 0.05 rad to the side."""
-    ball = {"kind": "ellipsoid", "semi_axes": [0.06, 0.06, 0.06], "attenuation": 5.0, "centre": [0.0, 0.0, 0.2]}
-    wobble = {"kind": "stage_wobble", "harmonics": [[0, 50_000.0, -90.0]]}
-    scene = shots.scene(wobble, phantom={"kind": "solids", "solids": [ball]})
-    lost = -np.log(shots.frame(scene) / shots.frame(scene).max())
-    detector = shots.shot().detector
-    u, v = (lost.sum(axis=0) @ detector.u()) / lost.sum(), (lost.sum(axis=1) @ detector.v()) / lost.sum()
-    assert (u, v) == pytest.approx((0.2 * math.sin(0.05), 0.2 * math.cos(0.05)), abs=1e-4)
-
-
-def test_two_waves_lean_at_the_turned_angle() -> None:
-    angle = 0.6
-    tilt = posed(StageWobble(((2, 20.0, 40.0),)), angle).tilt
-    assert tilt is not None
-    at = 2 * angle + math.radians(40.0)
-    np.testing.assert_allclose(tilt, [[20e-6 * math.cos(at), -20e-6 * math.sin(at)]] * 3, rtol=1e-12)
 
 
 def test_the_rest_is_drawn_for_each_frame_and_the_same_at_every_moment_of_it() -> None:

@@ -18,8 +18,7 @@ from simulators.samples.composed import build_sample
 from tests.simulators.bodies import volume
 
 
-@pytest.mark.parametrize("field", [(0.9, 0.9), (0.72, 0.3), (2.0, 5.0)])
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("field", "seed"), [((0.9, 0.9), 0), ((0.72, 0.3), 1), ((2.0, 5.0), 2)])
 def test_battery_is_dense_inside_the_field_and_lets_light_through(field: tuple[float, float], seed: int) -> None:
     solids = battery(np.random.default_rng(seed), field)
     assert len(solids) == 153

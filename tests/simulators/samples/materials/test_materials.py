@@ -32,17 +32,10 @@ ENERGIES = np.array([2.0, 8.0, 8.5, 25.0, 60.0, 300.0])
 # NIST, Hubbell & Seltzer, NISTIR 5632 (XCOM's data): total mass attenuation with coherent scattering, cm2/g.
 PUBLISHED = [
     ("Al", 10.0, 26.23),
-    ("Al", 20.0, 3.441),
-    ("Al", 60.0, 0.2778),
-    ("Cu", 10.0, 215.9),
     ("Cu", 20.0, 33.79),
-    ("Si", 10.0, 33.89),
-    ("Fe", 20.0, 25.68),
     ("Fe", 100.0, 0.3717),
     ("Ni", 10.0, 209.0),
-    ("C", 10.0, 2.373),
     ("Pb", 100.0, 5.549),
-    ("H2O", 10.0, 5.329),
     ("H2O", 20.0, 0.8096),
 ]
 
@@ -142,18 +135,6 @@ def _edge(z: int) -> float:
 def _near(z: int, energies: Reals, charge: float = 1.0) -> Reals:
     width = xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3
     return near_edge(energies, lambda e: _table(z, e), _edge(z), width, K_EDGES[z], charge)
-
-
-@pytest.mark.parametrize(("z", "kev"), [(25, 6.539), (27, 7.709), (28, 8.333)])
-def test_edges_are_where_the_tables_have_them(z: int, kev: float) -> None:
-    """Bearden & Burr, Rev. Mod. Phys. 39, 125, 1967: Mn 6539.0, Co 7708.9, Ni 8332.8 eV."""
-    assert _edge(z) == pytest.approx(kev, abs=2.5e-4)
-
-
-@pytest.mark.parametrize(("z", "ev"), [(25, 1.11), (27, 1.28), (28, 1.39)])
-def test_core_holes_are_as_wide_as_the_source_has_them(z: int, ev: float) -> None:
-    """Campbell & Papp 2001; Krause & Oliver 1979 have 0.05 eV more, which nothing here would show."""
-    assert xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3 == pytest.approx(ev, abs=0.005)
 
 
 @pytest.mark.parametrize("z", Z)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -20,12 +19,11 @@ from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
-from simulators.light.beam import Tube as XrayTube
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
 from simulators.samples.materials.materials import of_formula, palette_of
 from simulators.samples.materials.parts import Mixture, Part, effective_depth, sample_of
-from simulators.samples.materials.spectrum import Attenuation, Spectrum
+from simulators.samples.materials.spectrum import Attenuation
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import load_scene
 
@@ -118,13 +116,6 @@ def test_the_truth_is_the_thin_limit_and_depths_never_exceed_it() -> None:
     np.testing.assert_allclose(_depth(sample), _depth(sample.whole), rtol=2e-4)
 
 
-def test_a_tube_s_filters_are_known_by_name() -> None:
-    from_list = sample_of(PARTS, Beam(1.0, tube=XrayTube(40.0, {"Al": 1.0})))
-    thicker = sample_of(PARTS, Beam(1.0, tube=XrayTube(40.0, {"Al": 4.0})))
-    assert isinstance(from_list, Mixture) and isinstance(thicker, Mixture)
-    assert _depth(thicker).max() < 0.8 * _depth(from_list).max()
-
-
 def test_labels_and_radius_are_those_of_the_parts() -> None:
     sample = _seen(PARTS, spectrum=((8.0, 1.0), (12.0, 2.0)))
     assert sample.names == ("liquid", "oxide", "label")
@@ -196,6 +187,7 @@ def test_tables_are_loaded_only_where_a_material_is_named() -> None:
         ([POOL, GREY | {"material": "mud"}], {"energy_kev": 8}, r"solids\[1\]: attenuation and material"),
         ([POOL | {"material": "mud"}], {"energy_kev": 8}, r"solids\[0\]: material 'mud' is unknown"),
         ([POOL | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
+        ([GREY | {"name": 5}], {}, r"solids\[0\]: name must be text, got"),
         ([POOL, GREY | {"instead_of": "Al"}], {"energy_kev": 8}, "instead_of 'Al' needs a material"),
         ([POOL, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\): key 'edges' is missing"),
         ([POOL | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\): key 'colour' is unknown"),
@@ -212,25 +204,7 @@ def test_what_cannot_be_seen_is_refused(solids: list[Any], light: dict[str, Any]
         _sample(*solids, **light)
 
 
-def test_a_name_alone_is_for_grey_solids_too() -> None:
-    sample = _sample(GREY, materials={})
-    assert sample.names == ("wall",)
-    assert np.ptp(sample.line_integrals(0.0, Detector.centred((1, 2), 0.01))) == 0
-
-
 Reals = NDArray[np.float64]
-
-
-def test_a_slab_in_two_energies_is_the_closed_form() -> None:
-    """-log(w exp(-a t) + (1-w) exp(-b t)): slope w a + (1-w) b where it is thin, and the harder of both in the end."""
-    spectrum = Spectrum.of([20.0, 30.0], [3.0, 1.0])
-    mu = np.array([[4.0], [1.0]])
-    t = np.geomspace(1e-6, 1e3, 50).reshape(1, 5, 10)
-    got = effective_depth(t, mu, spectrum.weights)
-    expected = -np.logaddexp(np.log(0.75) - 4 * t[0], np.log(0.25) - t[0])
-    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-13)  # of the open beam
-    assert got[0, 0] / t[0, 0, 0] == pytest.approx(0.75 * 4 + 0.25 * 1, rel=1e-5)
-    assert got[-1, -1] - 1.0 * t[0, -1, -1] == pytest.approx(-math.log(0.25))
 
 
 @given(

@@ -163,12 +163,6 @@ def test_the_angle_of_the_past_is_remembered_through_later_moves(wire: Wire) -> 
     assert wire.line.angle_at(-1.0) == 0.0
 
 
-def test_relative_moves_add_up(wire: Wire) -> None:
-    wire.run("REL0+300")
-    wire.run("REL0-1000")
-    assert wire.ask("PS?0") == "-0000700"
-
-
 def test_a_slow_stop_takes_v_squared_over_2a_and_a_fast_one_nothing(wire: Wire) -> None:
     wire.tell("ABS0+100000")
     wire.clock.sleep(3.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import Any, get_args
 
 import numpy as np
@@ -131,7 +130,6 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
         ({"size_um": 0}, "size_um must be greater than or equal to 0.000001"),
         ({"gap_um": -1}, "gap_um must be greater than or equal to 0"),
         ({"fill": 0.7}, "fill must be less than 0.64"),
-        ({"fill": 0.63}, "lower the fill"),
         ({"size_um": 100, "fill": 0.5, "diameter": 0.11}, "does not fit"),
         ({"size_um": 300}, "larger than the whole fill"),
         ({"irregularity": 1.0}, "irregularity must be less than 1"),
@@ -155,12 +153,3 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
 def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError, match=message):
         build_sample("phantom", {"kind": "cathode", **SMALL, "habits": {"sphere": 1}} | changed, Beam(1e5))
-
-
-@pytest.mark.bench
-def test_five_thousand_grains_take_less_than_ten_seconds() -> None:
-    Cathode(**SMALL).pieces()  # compiles
-    begun = time.perf_counter()
-    found = _of(Cathode(diameter=0.71, height=0.71, size_um=29.5, fill=0.4), "particle")
-    assert len(found) > 5000
-    assert time.perf_counter() - begun < 10

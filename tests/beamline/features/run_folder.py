@@ -1,0 +1,26 @@
+"""A folder of a run with a small scan, for what watches runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+STARTED = {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98}
+FAILED = (
+    STARTED,
+    {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
+    {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
+)
+"""Events of a run of 98 frames that ended with an alarm and a failure."""
+
+
+def write_run(run: Path, *events: dict[str, Any]) -> Path:
+    """49 of its frames, and these events."""
+    run.mkdir(exist_ok=True)
+    write_flagged(run / "scan.h5", frames_of(TwoCylinders()), {})
+    lines = "".join(f"{json.dumps(event)}\n" for event in events)
+    (run / "events.jsonl").write_text(lines, encoding="utf-8")
+    return run
