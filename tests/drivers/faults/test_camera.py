@@ -86,25 +86,26 @@ def calls_of_a_scan(library: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_an_error_of_the_library(rig: Rig, call: str, calls_of_a_scan: dict[str, int], tmp_path: Path) -> None:
-    """At the first, a middle and the last such call of a scan: it ends with that error; or, where it came while frames
-    were waited for, it is reported and nothing is lost, or what is lost is named."""
+    """Of one call the first of a scan, of the next a middle one, of the third the last (the driver's own tests let each
+    fail): the scan ends with that error; or, where it came while frames were waited for, it is reported and nothing is
+    lost, or what is lost is named."""
     n = calls_of_a_scan[call]
     assert n > 0
-    for nth in sorted({1, (n + 1) // 2, n}):
-        rig.after_connecting = lambda nth=nth: rig.world.fail(call, Error.FAILREADCAMERA, nth)  # type: ignore[misc]
-        scanned = rig.scan(tmp_path)
-        reports = [message for message in scanned.warnings if "FAILREADCAMERA" in message]
-        if scanned.error is None or isinstance(scanned.error, LedgerError):
-            assert len(reports) == 1 and call in reports[0], nth
-            assert_complete(scanned) if scanned.error is None else assert_reported_once(scanned)
-        else:
-            assert_ends_as("an error of the library", scanned)
-            assert isinstance(scanned.error, DcamError)
-            assert scanned.error.code == Error.FAILREADCAMERA
-            assert scanned.error.request.split()[0] == call
-            assert_speaks(scanned.error, "camera")
-            assert reports == []
-        assert_at_rest(rig, scanned)
+    nth = (1, (n + 1) // 2, n)[CALLS.index(call) % 3]
+    rig.after_connecting = lambda: rig.world.fail(call, Error.FAILREADCAMERA, nth)
+    scanned = rig.scan(tmp_path)
+    reports = [message for message in scanned.warnings if "FAILREADCAMERA" in message]
+    if scanned.error is None or isinstance(scanned.error, LedgerError):
+        assert len(reports) == 1 and call in reports[0]
+        assert_complete(scanned) if scanned.error is None else assert_reported_once(scanned)
+    else:
+        assert_ends_as("an error of the library", scanned)
+        assert isinstance(scanned.error, DcamError)
+        assert scanned.error.code == Error.FAILREADCAMERA
+        assert scanned.error.request.split()[0] == call
+        assert_speaks(scanned.error, "camera")
+        assert reports == []
+    assert_at_rest(rig, scanned)
     assert_next_scan_works(rig, tmp_path)
 
 

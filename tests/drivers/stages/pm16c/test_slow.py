@@ -41,18 +41,6 @@ def test_the_room_before_the_first_pulse_is_in_the_limits_and_asked_for() -> Non
         Rig().open(first_pulse="sometimes")
 
 
-def test_a_setting_that_is_lost_once_is_sent_again_and_one_that_is_lost_for_good_is_told() -> None:
-    rig = Rig()
-    stage = rig.open()
-    rig.lose("SPDHB3")
-    with pytest.raises(DeviceError, match=r"was not taken.*Asked 'SPDHB3000'.*Nothing has moved"):
-        stage.start_move(0.5, stage.to_angle(3000))
-    rig.lose("nothing")
-    stage.start_move(0.5, stage.to_angle(3000))
-    stage.wait(60.0)
-    stage.close()
-
-
 def test_firmware_without_the_status_of_one_channel_is_refused_in_words() -> None:
     rig = Rig(version="1.46 06-10-14 PM16C-04X")
     with pytest.raises(DeviceRefused, match=r"firmware 1\.46.*Expected 1\.47 or later.*Nothing has moved"):
