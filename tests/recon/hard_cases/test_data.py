@@ -120,19 +120,6 @@ def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean:
 
 
 @pytest.mark.filterwarnings("ignore:.*are not finite")
-def test_values_that_are_not_finite_weigh_nothing_whatever_they_are(clean: F32, bad: NDArray[np.bool_]) -> None:
-    volumes = []
-    for value in (np.nan, -np.inf):
-        volumes.append(fitted(np.where(bad, np.float32(value), clean), steps=40).volume.data)
-    # Or any garbage, where weights say so: the same bits.
-    volumes.append(
-        fitted(np.where(bad, np.float32(1e30), clean), weights=(~bad).astype(np.float32), steps=40).volume.data
-    )
-    for other in volumes[1:]:
-        np.testing.assert_array_equal(other, volumes[0])
-
-
-@pytest.mark.filterwarnings("ignore:.*are not finite")
 @pytest.mark.slow
 def test_a_fit_loses_little_by_values_that_are_not_finite(clean: F32, truth: F32, bad: NDArray[np.bool_]) -> None:
     losses = [
@@ -172,31 +159,6 @@ def test_views_with_only_wild_pixels_do_not_cause_filling_in_others(clean: F32) 
     tame = without_wild_pixels(closed)
     np.testing.assert_array_equal(np.delete(tame, 5, 0), np.delete(clean, 5, 0))
     assert tame[5].max() <= 10 * clean.max()
-
-
-def test_a_nan_in_naive_arithmetic_takes_everything(clean: F32) -> None:
-    marred = clean.copy()
-    marred[0, 0, 0] = np.nan
-    assert np.isnan(np.abs(marred - clean).mean())
-    spectrum = np.fft.irfft(np.fft.rfft(marred[0, 0]))  # FBP's filter, unmasked: the whole row
-    assert np.isnan(spectrum).all()
-
-
-@settings(max_examples=15)
-@given(st.lists(st.tuples(st.integers(0, 31), st.integers(0, 11), st.integers(0, 47)), min_size=1, max_size=40),
-       st.sampled_from([np.nan, np.inf, -np.inf, 3e38]))  # fmt: skip
-def test_masked_pixels_anywhere_have_no_pull(where: list[tuple[int, int, int]], value: float) -> None:
-    data = spheres.projections(VIEWS.select([0, 9])).repeat(16, 0)
-    clean_at = np.zeros(data.shape, bool)
-    clean_at[tuple(np.transpose(where))] = True
-    weights = None if not np.isfinite(value) else (~clean_at).astype(np.float32)
-    marred = np.where(clean_at, np.float32(value), data)
-    problem = fit.problem_of(marred, VIEWS, GRID, 0.05, SHORT, None, weights)
-    view = where[0][0]
-    image = project(a_few(), VIEWS, [view])[0].numpy() / problem.scale
-    loss, slope = problem.loss(image, problem.images[view], problem.target_maps[view], problem.weights[view])
-    assert math.isfinite(float(loss)) and np.isfinite(slope).all()
-    assert not slope[clean_at[view]].any()
 
 
 def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> None:
