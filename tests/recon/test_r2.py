@@ -24,8 +24,10 @@ from tests.slow_cases import others_slow
 
 def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> None:
     other = next(kernel for kernel in Kernel if kernel is not FitSettings().kernel)
-    first = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=1500, fit=FitSettings(kernel=other)))
-    second = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=first.gaussians, fit=FitSettings(policy=None)))
+    first = recon.reconstruct(noisy, VIEWS, R2(steps=60, gaussians=800, finish=0, fit=FitSettings(kernel=other)))
+    second = recon.reconstruct(
+        noisy, VIEWS, R2(steps=60, gaussians=first.gaussians, finish=0, fit=FitSettings(policy=None))
+    )
     assert second.history[-1].residual < first.history[-1].residual
     assert second.history[-1].n_gaussians == first.history[-1].n_gaussians
     assert second.settings["kernel"] is other and second.gaussians is not None and second.gaussians.kernel is other
@@ -64,7 +66,7 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
 def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
     spoilt = noisy.copy()
     spoilt[5] *= 3
-    fit, use = R2(steps=60, gaussians=800), DataUse(held_out=(5, 17))
+    fit, use = R2(steps=60, gaussians=500, finish=0), DataUse(held_out=(5, 17))
     kept, other = (recon.reconstruct(data, VIEWS, fit, use=use) for data in (noisy, spoilt))
     np.testing.assert_array_equal(kept.volume.data, other.volume.data)
     assert kept.history[-1].n_views == 22
@@ -87,19 +89,19 @@ def test_a_fit_may_end_where_views_held_out_stop_getting_better(noisy: np.ndarra
 
 
 def test_a_fit_can_be_left_and_taken_up_again(noisy: np.ndarray) -> None:
-    whole = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600))
+    whole = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600, finish=0))
     asked: list[int] = []
     control = RunControl(should_stop=lambda: asked.append(0) or len(asked) >= 50)
-    part = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600), control=control)
+    part = recon.reconstruct(noisy, VIEWS, R2(steps=120, gaussians=600, finish=0), control=control)
     assert part.history[-1].step == 50 and part.checkpoint is not None
-    rest = recon.reconstruct(noisy, VIEWS, R2(steps=120), control=RunControl(resume=part.checkpoint))
+    rest = recon.reconstruct(noisy, VIEWS, R2(steps=120, finish=0), control=RunControl(resume=part.checkpoint))
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
 def test_checkpoints_are_handed_out_as_the_fit_goes_on(noisy: np.ndarray) -> None:
     kept: list[dict[str, np.ndarray]] = []
     ticks = iter(range(100_000))
-    fit = R2(steps=60, gaussians=600)
+    fit = R2(steps=60, gaussians=600, finish=0)
     control = RunControl(
         now=lambda: float(next(ticks)), checkpoint_every=50.0, on_checkpoint=lambda arrays: kept.append(dict(arrays))
     )
@@ -128,7 +130,7 @@ def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
 @pytest.mark.parametrize("weight", others_slow([1e-20, 1e-3, 1e20]))
 def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
     alone, weighed = (
-        recon.reconstruct(noisy, VIEWS, R2(steps=30, gaussians=400), use=DataUse(weights=w)).volume.data
+        recon.reconstruct(noisy, VIEWS, R2(steps=30, gaussians=400, finish=2), use=DataUse(weights=w)).volume.data
         for w in (None, np.full(noisy.shape, weight, np.float32))
     )
     np.testing.assert_allclose(weighed, alone, atol=1e-3 * float(alone.max()))

@@ -91,7 +91,7 @@ def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_th
 
 def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_be() -> None:
     # No body that fits into the field has them: its edge would have to be infinitely dense.
-    found = fitted(np.ones((32, *SHAPE), np.float32))
+    found = fitted(np.ones((32, *SHAPE), np.float32), finish=0)
     assert found.history[-1].residual < 0.2
     assert np.isfinite(fbp(np.ones((32, *SHAPE), np.float32), VIEWS, GRID)).all()
 
@@ -113,7 +113,11 @@ def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean:
     best = correct(good.astype(np.uint16), np.arange(32.0), references)
     of_good, with_masks, without = (
         psnr(truth, found.volume.data)
-        for found in (fitted(best.data), fitted(given.data, weights=weights), fitted(given.data))
+        for found in (
+            fitted(best.data, steps=60, finish=0),
+            fitted(given.data, steps=60, weights=weights, finish=0),
+            fitted(given.data, steps=60, finish=0),
+        )
     )
     assert with_masks > of_good - 0.5
     assert with_masks > without
@@ -136,7 +140,7 @@ def of_all_but_one(clean: F32) -> F32:
     without = clean.copy()
     without[9, 4, 31] = np.nan
     with pytest.warns(UserWarning, match="1 of .* are not finite"):
-        return fitted(without).volume.data
+        return fitted(without, steps=60, finish=0).volume.data
 
 
 @pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
@@ -144,7 +148,7 @@ def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
     wild[9, 4, 31] = value
-    found, expected = fitted(wild).volume.data, of_all_but_one
+    found, expected = fitted(wild, steps=60, finish=0).volume.data, of_all_but_one
     if abs(value) > 1e6:  # beyond what `make_problem` takes: as if it were not finite
         np.testing.assert_array_equal(found, expected)
     assert psnr(truth, found) > psnr(truth, expected) - 0.5
@@ -259,12 +263,11 @@ def test_a_tenth_of_a_pixel_of_the_axis_costs_little(clean: F32, truth: F32) -> 
     assert costs[0.0] - costs[0.5] > 1
 
 
-@pytest.mark.parametrize("photons", [3, 30])
-def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32, photons: int) -> None:
+def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32) -> None:
     # With three photons a pixel, some count none at all: their line integral is -log(floor), and finite.
-    rng = np.random.default_rng(6)
+    rng, photons = np.random.default_rng(6), 3
     counts = rng.poisson(photons * np.exp(-clean)).astype(np.float32)
-    assert (counts == 0).any() == (photons == 3)
+    assert (counts == 0).any()
     references = References(np.zeros(SHAPE, np.float32), ((0.0, np.full(SHAPE, photons, np.float32)),))
     data = correct(counts, np.arange(32.0), references).data
     direct = fbp(data, VIEWS, GRID, "hann")

@@ -206,30 +206,6 @@ def test_the_unit_of_length_does_not_matter(random_gaussians: Make, rng: np.rand
     assert loss(length) == pytest.approx(loss(1.0), rel=1e-3)
 
 
-def test_bad_data_are_refused(random_gaussians: Make) -> None:
-    data = project(random_gaussians(3), VIEWS).numpy()
-    with pytest.raises(ValueError, match="shape"):
-        fit.problem_of(data[1:], VIEWS, GRID, 1.0, PLAIN)
-    data[2] = np.nan
-    with pytest.raises(ValueError, match="that is finite"):
-        fit.problem_of(data, VIEWS, GRID, 1.0, PLAIN)
-
-
-def test_values_that_are_not_finite_pull_at_nothing(random_gaussians: Make) -> None:
-    # What stands in a pixel of no weight must not change a bit of the fit.
-    g = random_gaussians(20, extent=6.0)
-    data = project(g, VIEWS).numpy()
-    marred, other = data.copy(), data.copy()
-    marred[:, 3:6, 4:8], other[:, 3:6, 4:8] = np.nan, np.inf
-    start = replace(g, means=g.means + 0.1)
-    runs = [
-        run_steps(fit.init(start, 0), fit.problem_of(d, VIEWS, GRID, 1.0, PLAIN), PLAIN, 5) for d in (marred, other)
-    ]  # fmt: skip
-    for name in NAMES:
-        assert np.isfinite(runs[0].parameters[name]).all()
-        np.testing.assert_array_equal(runs[0].parameters[name], runs[1].parameters[name])
-
-
 def test_a_step_on_all_views_takes_the_mean_gradient(random_gaussians: Make) -> None:
     # Adam's first moment after one step is a tenth of the gradient; the mean over views is that of the single ones.
     g = random_gaussians(12, extent=6.0)

@@ -51,7 +51,7 @@ def data(phantom: Phantom) -> np.ndarray:
 
 
 def _stream(data: np.ndarray, order: np.ndarray, seed: int = 0) -> StreamingFit:
-    model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, seed, gaussians=800, now=SteppedClock(tick=0.01))
     for view in order:
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
         model.advance(0.1)
@@ -72,7 +72,7 @@ def streamed(data: np.ndarray, phantom: Phantom) -> tuple[np.ndarray, float]:
 
 def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom: Phantom) -> None:
     truth = phantom.attenuation(GRID)
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     quality = []
     for view in range(40):
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[n
 @pytest.mark.slow
 def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
     mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
-    method = recon.R2(gaussians=1500, fit=FitSettings(**mine))  # type: ignore[arg-type]
+    method = recon.R2(gaussians=800, fit=FitSettings(**mine))  # type: ignore[arg-type]
     model = method.stream(VIEWS, 0, SteppedClock(tick=0.01))
     assert model.settings == replace(WHILE_VIEWS_COME, **mine)
     assert recon.R2().stream(VIEWS, 0, SteppedClock(tick=0.01)).settings == WHILE_VIEWS_COME
@@ -212,7 +212,7 @@ def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.Mo
 
 
 def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phantom: Phantom) -> None:
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
     model.advance(4.0)
     truth, settings = phantom.attenuation(GRID), model.settings
@@ -239,7 +239,7 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
 @pytest.mark.parametrize("offset", others_slow([1e-5, -1e-5]))
 def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
     # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     for view, angle in enumerate(np.linspace(0, 1, 10)):
         noise = np.random.default_rng(view).normal(offset, 1e-5, (1, *SHAPE)).astype(np.float32)
         model.add_views(noise, [angle])
@@ -347,7 +347,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
     """Half a circle of views about an axis that is off by d shows the sample off by 4 d / π across its middle."""
     truth, off = phantom.attenuation(GRID), 0.8
     wrong = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + off)
-    model = StreamingFit(wrong, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(wrong, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
     model.advance(4.0)
     before, quality = model.gaussians, psnr(truth, model.snapshot().data)
@@ -362,7 +362,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
 def _disturbed(data: np.ndarray, truth: np.ndarray, batches: list[np.ndarray], axis_off: float = 0.0) -> float:
     """PSNR in dB of a stream of these batches of views, whose axis is corrected once half of the views are there."""
     template = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + axis_off)
-    model = StreamingFit(template, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(template, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     for batch in batches:
         model.add_views(data[batch], ANGLES[batch])
         model.advance(0.1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numba
 import numpy as np
@@ -15,14 +15,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import RayModel
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_kernels
 from recon.kernels.cpu import joseph
-from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project as gaussian_views
-from recon.splatting.splat import voxelize
 from recon.voxels.direct import fdk
 from recon.voxels.projector import Projector, project
 from simulators.frame.shot import Detector
@@ -129,7 +125,7 @@ def slices(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
 
 
 @given(slices())
-@settings(max_examples=100)
+@settings(max_examples=60)
 def test_a_single_slice_is_the_explicit_matrix_in_both_directions(case: tuple[Geometry, Grid, int]) -> None:
     _assert_the_matrix(*case, lambda matrix: 4e-5 * (abs(matrix).max() if matrix.nnz else 1.0))
 
@@ -265,7 +261,12 @@ def ellipsoid_shadow(geometry: Geometry, axes: NDArray[np.float64], centre: NDAr
 
 
 def smooth_ball(grid: Grid, axes: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Share of each voxel [z, y, x] inside the ellipsoid, (x, y, z) axes, from 4³ points."""
+    """Share of each voxel [z, y, x] inside the ellipsoid, (x, y, z) axes, from 4³ points; read-only."""
+    return _smooth_ball(grid, tuple(axes), tuple(centre))
+
+
+@cache
+def _smooth_ball(grid: Grid, axes: tuple[float, ...], centre: tuple[float, ...]) -> NDArray[np.float32]:
     fine = Grid(tuple(4 * n for n in grid.shape), grid.voxel_size / 4, grid.centre)  # type: ignore[arg-type]
     z, y, x = fine.coordinates()
     inside = (
@@ -274,11 +275,12 @@ def smooth_ball(grid: Grid, axes: NDArray[np.float64], centre: NDArray[np.float6
         + ((z[:, None, None] - centre[2]) / axes[2]) ** 2
     ) <= 1
     nz, ny, nx = grid.shape
-    return inside.reshape(nz, 4, ny, 4, nx, 4).mean((1, 3, 5), dtype=np.float32)
+    shares = inside.reshape(nz, 4, ny, 4, nx, 4).mean((1, 3, 5), dtype=np.float32)
+    shares.flags.writeable = False
+    return shares
 
 
-@pytest.mark.parametrize("cone", [False, True])
-@pytest.mark.parametrize("lean", [0.0, 0.02, 0.5, 1.3])
+@pytest.mark.parametrize(("cone", "lean"), [(False, 0.0), (True, 0.0), (False, 0.5), (True, 0.02), (True, 1.3)])
 def test_an_ellipsoid_projects_to_its_chords(cone: bool, lean: float) -> None:
     angles = [0.0, 0.5, np.pi / 4, 2.0, 4.0]
     shifts = np.array([[0, 0], [1.3, 0], [0, -2.6], [0, 0], [-2.0, 1.0]])
@@ -301,42 +303,6 @@ def test_an_ellipsoid_projects_to_its_chords(cone: bool, lean: float) -> None:
     assert np.abs(error[inside]).max() < 0.02 * truth.max()
     assert np.sqrt(np.mean(error[inside] ** 2)) < 0.004 * truth.max()
     assert abs(error.sum()) < 0.002 * truth.sum()
-
-
-@pytest.mark.parametrize("cone", [False, True])
-def test_leaning_views_of_voxels_are_those_of_gaussians(cone: bool) -> None:
-    """The Gaussians' projection is a formula of its own: footprints, not rays (a cone: exact rays)."""
-    angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
-    lean = {"shifts": np.full((7, 2), (1.4, -2.3)), "roll": 0.2 * np.cos(angles), "tilt": 0.1 * np.sin(angles) - 0.05}
-    if cone:
-        geometry = Geometry.cone(angles, (40, 44), 0.06, 8.0, 12.0, axis_col=21.0, **lean)
-    else:
-        geometry = Geometry.parallel(angles, (40, 44), pixel_pitch=0.04, axis_col=21.0, **lean)
-    blobs = Gaussians.from_physical(
-        np.array([[0.2, -0.1, 0.15], [-0.25, 0.2, -0.1]]), np.array([0.12, 0.1]), np.array([1.0, 2.0])
-    )
-    shown = gaussian_views(blobs, geometry, model=RayModel(exact_above=0.0)).numpy()
-    grid = Grid((66, 66, 66), 0.025)
-    found = project(Volume(voxelize(blobs, grid).numpy(), grid), geometry)
-    # Linear interpolation across a ray errs in each of two directions by at most h²/8 of the second derivative.
-    assert np.abs(found - shown).max() < 2 * (0.025 / 0.1) ** 2 / 8 * shown.max()
-    assert found.sum() == pytest.approx(shown.sum(), rel=5e-3)
-
-
-@pytest.mark.parametrize("cone", [False, True])
-def test_views_that_hardly_lean_are_straight_ones(cone: bool, rng: np.random.Generator) -> None:
-    """Two kernels of different layout agree where both take the views, also where the box ends."""
-    angles, shifts = [0.3, 2.0, 5.0], [[0.4, -0.3], [2.0, 6.5], [0, 0]]
-    grid, shape = Grid((9, 14, 12), 0.05, (0.03, 0.02, -0.04)), (16, 18)
-    straight = (
-        Geometry.cone(angles, shape, 0.08, 5.0, 8.0, shifts=shifts)
-        if cone
-        else Geometry.parallel(angles, shape, pixel_pitch=0.05, shifts=shifts)
-    )
-    volume = rng.random(grid.shape, dtype=np.float32)
-    expected = Projector(straight, grid).forward(volume)
-    found = Projector(replace(straight, roll=np.full(3, 1e-12)), grid).forward(volume)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_parallel_chords_agree_with_the_simulator() -> None:
