@@ -287,8 +287,8 @@ def test_a_result_is_saved_as_a_whole(noisy: np.ndarray, tmp_path: Path) -> None
 @pytest.mark.parametrize("method", others_slow([recon.FistaTv(), recon.R2(steps=150)]))
 def test_a_helical_scan_is_a_height_a_view(method: recon.Method) -> None:
     """A ball higher than the detector, in two turns; without its heights it is a smear."""
-    heights = np.column_stack((np.zeros(60), np.linspace(-8, 8, 60)))
-    still = recon.Geometry.cone(np.linspace(0, 4 * np.pi, 60, endpoint=False), (16, 32), 1.0, 300.0, 300.0)
+    heights = np.column_stack((np.zeros(40), np.linspace(-8, 8, 40)))
+    still = recon.Geometry.cone(np.linspace(0, 4 * np.pi, 40, endpoint=False), (16, 32), 1.0, 300.0, 300.0)
     helix, grid = replace(still, shifts=heights), recon.Grid((32, 32, 32), 1.0)
     z, y, x = np.indices(grid.shape) - 15.5
     truth = (np.hypot(np.hypot(x - 3, y), z) < 11).astype(np.float32)
