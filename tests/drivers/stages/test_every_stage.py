@@ -1,4 +1,4 @@
-"""Every stage: figures that no stage has, other makers' controllers, a second program, pulses lost on the cable."""
+"""Every stage: figures that no stage has, other makers' controllers, a second program."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def test_units_of_density_at_the_ends_of_float32(on: On, unit: float) -> None:
 
 @pytest.mark.parametrize("wide", [True, False], ids=["scales", "densities"])
 def test_a_dynamic_range_of_1e8_leaves_each_pixel_its_digits(on: On, wide: bool) -> None:
-    """Densities fall by 1e8 along the columns, or both do by 1e4: the error is relative to what is in a pixel."""
+    """Densities, or widths along the beam, fall by 1e8 along the columns: errors are relative to what is in a pixel."""
     n, apart = 9, 8
     size = 10 ** np.linspace(4, -4, n)
     view = Geometry.parallel([0.0], (5, apart * n), pixel_pitch=1.0, axis_col=0.0, axis_row=0.0)

@@ -120,7 +120,7 @@ def test_a_flat_disc_seen_edge_on_and_face_on(on: On, edge_on: bool) -> None:
         assert float(found.slopes["quaternions"].abs().max()) < 2e3**2 * STEP * size
 
 
-@pytest.mark.parametrize("sigma", [0.05, 1e-3])
+@pytest.mark.parametrize("sigma", [0.2, 0.05, 1e-3])
 def test_dots_smaller_than_a_pixel(on: On, sigma: float) -> None:
     # On the lattice of the pixels, and off it by half a standard deviation: else no pixel sees the small ones.
     n, rng = 12, np.random.default_rng(1)
@@ -164,7 +164,7 @@ def test_gaussians_larger_than_the_field(on: On, sigma: float) -> None:
         assert found.worst < gradient_bound(on.far, thin), found.gradients
 
 
-@pytest.mark.parametrize("shape", [(1e-15,) * 3, (1e15,) * 3, (1e-12, 1e-12, 1e12)])
+@pytest.mark.parametrize("shape", [(1e-15,) * 3, (1e15,) * 3, (1e-12, 1.0, 1e8)])
 def test_a_covariance_that_is_singular_to_rounding_is_finite(on: On, shape: Place) -> None:
     # Σ₂ in float32 has no inverse here: its determinant is a difference of equal numbers, zero or negative.
     for where in (*on.beams.values(), on.grid):

@@ -1,4 +1,4 @@
-"""PI GCS 2.0 trains: what is sent, where firmware puts the first pulse, the times of pulses, and trains refused."""
+"""PI GCS 2.0 trains: where firmware puts the first pulse, and trains refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PM16C driver and a controller that takes its time over settings, older firmware, and where the first pulse comes."""
+"""PM16C driver on older firmware, wherever the first pulse comes, and widths in microseconds."""
 
 from __future__ import annotations
 
