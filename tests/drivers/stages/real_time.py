@@ -59,7 +59,6 @@ class Kind:
         usual: values of them.
         wire: makes the stand-in.
         unreferenced: settings of the stand-in that has not found its reference yet, where there is such a state.
-        homed: what it says of its reference at power-on otherwise.
         home: counts at which a search ends.
         garbage: what may come instead of a reply to a question after the position.
         opening: beginnings of the first two things that the driver sends; `among`: a part of a later one.
@@ -74,7 +73,6 @@ class Kind:
     among: str
     farewell: tuple[str, ...]
     unreferenced: Mapping[str, Any] = field(default_factory=dict)
-    homed: bool = True
     home: int = 0
 
 
@@ -102,7 +100,6 @@ KINDS = {
         opening=(r"b'\r\n'", r"b'VER?\r\n'"),
         among="b'TMGR?0",
         farewell=(r"b'LOC\r\n'",),
-        homed=False,
         home=50,
     ),
     "pi_gcs": Kind(

@@ -1,4 +1,4 @@
-"""Every stage on real time over a pseudo-terminal and TCP: short moves, a search, a train, a stop, garbage, and the plug."""
+"""Every stage on real time, by pseudo-terminal and TCP: short moves, a search, a train, a stop, garbage, the plug."""
 
 from __future__ import annotations
 
