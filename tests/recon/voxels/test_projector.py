@@ -24,6 +24,7 @@ from recon.voxels.projector import Projector, project
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Ellipsoid
+from tests.recon.helpers import assert_transpose
 from tests.recon.kernels.voxels_reference import system_matrix
 
 
@@ -98,15 +99,9 @@ def _assert_the_matrix(geometry: Geometry, grid: Grid, seed: int, room: Callable
 @given(cases())
 @settings(max_examples=60)
 def test_the_transpose_is_exact(case: tuple[Geometry, Grid, int]) -> None:
-    """<A x, p> = <x, Aᵀ p> to the rounding of float32 sums, and of the coordinates of a ray that grazes a voxel."""
+    """To the rounding of float32 sums, and of the coordinates of a ray that grazes a voxel."""
     geometry, grid, seed = case
-    rng = np.random.default_rng(seed)
-    projector = Projector(geometry, grid)
-    volume = rng.random(grid.shape, dtype=np.float32)
-    views = rng.random(projector.projection_shape, dtype=np.float32)
-    left = np.vdot(projector.forward(volume).astype(np.float64), views)
-    right = np.vdot(volume.astype(np.float64), projector.adjoint(views))
-    assert left == pytest.approx(right, rel=2e-6, abs=1e-7 * grid.voxel_size)
+    assert_transpose(Projector(geometry, grid), np.random.default_rng(seed), rel=2e-6, abs=1e-7 * grid.voxel_size)
 
 
 @st.composite
@@ -135,11 +130,7 @@ def test_the_transpose_of_a_single_slice_is_exact_at_a_working_size(fan: bool, r
     angles = np.arange(37) * 0.37
     views = Geometry.fan(angles, 200, 1.0, 300.0, 400.0) if fan else Geometry.parallel(angles, (1, 200))
     projector = Projector(views, Grid((1, 170, 130), 1.1))
-    volume = rng.random(projector.grid.shape, dtype=np.float32)
-    data = rng.random(projector.projection_shape, dtype=np.float32)
-    forward = projector.forward(volume)
-    left = np.vdot(forward.astype(np.float64), data)
-    assert left == pytest.approx(np.vdot(volume.astype(np.float64), projector.adjoint(data)), rel=1e-7)
+    volume, forward = assert_transpose(projector, rng, rel=1e-7)
     np.testing.assert_array_equal(projector.forward(volume), forward)
     np.testing.assert_array_equal(projector.subset([30, 2]).forward(volume), forward[[30, 2]])
 
@@ -155,11 +146,7 @@ def test_the_transpose_is_exact_at_a_working_size(cone: bool, lean: float, rng: 
     )
     geometry = replace(geometry, roll=lean * np.sin(angles), tilt=lean * np.cos(angles))
     projector = Projector(geometry, Grid((290, 30, 36), 0.055))
-    volume = rng.random(projector.grid.shape, dtype=np.float32)
-    views = rng.random(projector.projection_shape, dtype=np.float32)
-    forward = projector.forward(volume)
-    left = np.vdot(forward.astype(np.float64), views)
-    assert left == pytest.approx(np.vdot(volume.astype(np.float64), projector.adjoint(views)), rel=1e-7)
+    volume, forward = assert_transpose(projector, rng, rel=1e-7)
     np.testing.assert_array_equal(projector.forward(volume), forward)  # no race: the same bits again
     np.testing.assert_array_equal(projector.subset([30, 2]).forward(volume), forward[[30, 2]])
 
