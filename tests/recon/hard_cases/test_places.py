@@ -1,4 +1,7 @@
-"""Gaussians at difficult places and of difficult weight: borders, far outside, the source, nothing, piles, ranges."""
+"""Gaussians at difficult places and of difficult weight: borders, far outside, the source, nothing, piles, ranges.
+
+On the CPU's kernels, and in slow tests on Triton's.
+"""
 
 from __future__ import annotations
 

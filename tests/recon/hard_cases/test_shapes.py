@@ -1,4 +1,7 @@
-"""Gaussians of difficult shape: needles, discs, dots, giants, singular covariances, quaternions without a length."""
+"""Gaussians of difficult shape: needles, discs, dots, giants, singular covariances, quaternions without a length.
+
+On the CPU's kernels, and in slow tests on Triton's.
+"""
 
 from __future__ import annotations
 
