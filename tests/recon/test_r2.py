@@ -13,12 +13,9 @@ from recon import R2, DataUse, RunControl
 from recon.assess.metrics import psnr
 from recon.base.kernel import Kernel, RayModel
 from recon.splatting.settings import FitSettings
-from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
-from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Cylinder, Ellipsoid
-from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
+from tests.recon.few_views import GRID, PITCH, SHAPE, VIEWS
 from tests.slow_cases import others_slow
 
 
@@ -31,20 +28,6 @@ def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> Non
     assert second.history[-1].residual < first.history[-1].residual
     assert second.history[-1].n_gaussians == first.history[-1].n_gaussians
     assert second.settings["kernel"] is other and second.gaussians is not None and second.gaussians.kernel is other
-
-
-@pytest.mark.slow
-def test_matter_beyond_the_default_grid_is_explained() -> None:
-    # A full turn with the axis near the edge: the detector sees a sample wider than itself.
-    sample = Phantom.of((Cylinder(2.6, 1.6, 0.2), Ellipsoid((0.5, 0.4, 0.4), 0.6, centre=(-0.6, 0.4, 0.1))))
-    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    detector = Detector(SHAPE, PITCH, 32.0, (SHAPE[0] - 1) / 2)
-    views = recon.Geometry.parallel(turn, SHAPE, pixel_pitch=PITCH, axis_col=32.0)
-    data = np.stack([sample.line_integrals(a, detector) for a in turn])
-    grid = recon.Grid.of_field(views, PITCH)
-    result = recon.reconstruct(data, views, R2(steps=400, gaussians=2500), grid=grid)
-    assert result.history[-1].residual < 0.06
-    assert psnr(sample.attenuation(grid), result.volume.data) > 25
 
 
 def test_no_step_gives_the_starting_point(noisy: np.ndarray) -> None:
@@ -193,16 +176,3 @@ def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.ini
     settings = FitSettings(rays=RayModel(exact_above=0.01))
     result = recon.reconstruct(data, cone, R2(steps=500, gaussians=2500, start=start, fit=settings), grid=GRID)
     assert psnr(truth, result.volume.data) > baseline + 1
-
-
-@pytest.mark.slow
-def test_tilted_views_are_fitted_as_they_are(phantom: Phantom, noisy: np.ndarray) -> None:
-    start = recon.reconstruct(noisy, VIEWS, R2(steps=200, gaussians=2000)).gaussians
-    assert start is not None
-    tilted = recon.Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=18.3, tilt=0.15, roll=0.03)
-    data = project(start, tilted).numpy()
-    with pytest.warns(UserWarning, match="leans along the beam"):
-        told = recon.reconstruct(data, tilted, R2(steps=300, gaussians=2000), grid=GRID)
-    untold = recon.reconstruct(data, VIEWS, R2(steps=300, gaussians=2000), grid=GRID)
-    truth = voxelize(start, GRID).numpy()
-    assert psnr(truth, told.volume.data) > psnr(truth, untold.volume.data) + 3
