@@ -86,7 +86,7 @@ def test_picks_need_no_avx512(level: Mapping[str, str]) -> None:
         __file__,
         str(root / "tests/recon/voxels/test_projector.py"),
         "-k",
-        "pick or lanes or matrix",
+        "pick or lanes or tiles or steps_of_any_length or single_slice_is",
     ]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", *tests],

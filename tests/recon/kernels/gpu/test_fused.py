@@ -20,7 +20,7 @@ fused = importlib.import_module("recon.kernels.gpu.fused")
 SETTINGS = FitSettings(policy=None, tv_size=5, tv_weight=0.05, views_per_step=2)
 
 
-def _start(side: int = 12, n: int = 30, wide: float = 0.5) -> tuple[fit.FitState, fit.FitProblem]:
+def _start(side: int = 24, n: int = 60, wide: float = 0.5) -> tuple[fit.FitState, fit.FitProblem]:
     rng, backend = np.random.default_rng(3), backend_for("cuda")
     geometry = Geometry.parallel(np.linspace(0, np.pi, 7, endpoint=False), (side, side))
     data = rng.random((7, side, side)).astype(np.float32)
