@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.features.rings.rings import REMOVERS, width_for
+from recon.features.rings import REMOVERS, width_for
 from tests.recon.features.rings.test_rings import ANGLES, COLS, noisy_disc
 from tests.recon.prep.real_views import tooth_views
 from tests.recon.prep.ring_score import ring_score
