@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.features.calibration.joint import knowable
 from recon.features.calibration.learn import learn_geometry
-from tests.recon.features.calibration.bodies import Bodies, balls, sponge
+from tests.recon.bodies import Bodies, balls, sponge
 
 VIEWS, SHAPE, NOISE = 80, (32, 80), 0.01
 METHOD = recon.FistaTv(8, tv_weight=3e-3)

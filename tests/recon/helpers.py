@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 import torch
 
 from recon.base.arrays import F32
@@ -14,7 +15,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.optimise import FitState, step
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import FitSettings
-from recon.voxels.projector import project
+from recon.voxels.projector import Projector, project
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
@@ -59,6 +60,17 @@ def run_steps(
         if on_step is not None and on_step(state):
             break
     return state
+
+
+def assert_transpose(projector: Projector, rng: np.random.Generator, rel: float, abs: float = 0.0) -> tuple[F32, F32]:
+    """<A x, p> = <x, Aᵀ p> of a random volume x and views p; returns x and A x."""
+    volume = rng.random(projector.grid.shape, dtype=np.float32)
+    views = rng.random(projector.projection_shape, dtype=np.float32)
+    forward = projector.forward(volume)
+    left = np.vdot(forward.astype(np.float64), views)
+    right = np.vdot(volume.astype(np.float64), projector.adjoint(views))
+    assert left == pytest.approx(right, rel=rel, abs=abs)
+    return volume, forward
 
 
 def data_residual(volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None = None) -> float:

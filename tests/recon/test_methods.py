@@ -110,11 +110,6 @@ def test_a_weight_that_no_total_variation_has_is_refused(method: type[recon.Fist
         method(tv_weight=weight)
 
 
-def test_a_class_in_place_of_a_method_is_refused(projections: NDArray[np.float32]) -> None:
-    with pytest.raises(ValueError, match=r"got the class R2; give an object, such as R2\(\)"):
-        recon.reconstruct(projections, VIEWS, recon.R2)  # type: ignore[arg-type]
-
-
 def test_every_trait_is_asked_somewhere() -> None:
     assert methods.with_trait("direct") == ("fbp",)
     for trait in (f.name for f in fields(Traits)):

@@ -33,23 +33,17 @@ def test_few_noisy_views_beat_fbp(phantom: Phantom, noisy: np.ndarray) -> None:
         psnr(truth, recon.reconstruct(noisy, VIEWS, Fbp(name)).volume.data)
         for name in ("ram-lak", "shepp-logan", "hann")
     )
-    result = recon.reconstruct(noisy, VIEWS, R2(steps=500, gaussians=2500))
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=250, gaussians=2000))
     assert psnr(truth, result.volume.data) > best + 1
     assert result.volume.data.shape == GRID.shape and result.volume.data.dtype == np.float32
-    assert result.history[-1].step == 500 and result.gaussians is not None
+    assert result.history[-1].step == 250 and result.gaussians is not None
     assert result.settings["seed"] == 0
 
 
-def test_the_same_seed_gives_the_same_volume(noisy: np.ndarray) -> None:
-    first, second = (recon.reconstruct(noisy, VIEWS, R2(steps=30), seed=4).volume.data for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    other = recon.reconstruct(noisy, VIEWS, R2(steps=30), seed=5).volume.data
-    assert not np.array_equal(first, other)
-
-
-def test_a_negative_seed_is_refused(noisy: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="seed"):
-        recon.reconstruct(noisy, VIEWS, "fbp", seed=-1)
+def test_another_seed_gives_another_volume(noisy: np.ndarray) -> None:
+    fit = R2(steps=10, gaussians=300, finish=0)
+    one, other = (recon.reconstruct(noisy, VIEWS, fit, seed=seed).volume.data for seed in (4, 5))
+    assert not np.array_equal(one, other)
 
 
 def test_a_small_box_equals_that_part_of_the_whole_volume(noisy: np.ndarray) -> None:
@@ -61,11 +55,6 @@ def test_a_small_box_equals_that_part_of_the_whole_volume(noisy: np.ndarray) -> 
     np.testing.assert_allclose(part, whole[9:15, 20:32, 5:15], atol=1e-3 * whole.max())
 
 
-@pytest.fixture(scope="module")
-def of_five_steps(noisy: np.ndarray) -> np.ndarray:
-    return recon.reconstruct(noisy, VIEWS, R2(steps=5, gaussians=300)).volume.data
-
-
 @pytest.mark.parametrize(
     "kind",
     [
@@ -75,19 +64,9 @@ def of_five_steps(noisy: np.ndarray) -> np.ndarray:
         lambda a: a.astype(np.float64).tolist(),
     ],
 )
-def test_any_kind_of_array_gives_the_same_volume(
-    noisy: np.ndarray, of_five_steps: np.ndarray, kind: Callable[[np.ndarray], object]
-) -> None:
-    found = recon.reconstruct(kind(noisy), VIEWS, R2(steps=5, gaussians=300)).volume.data  # type: ignore[arg-type]
-    np.testing.assert_array_equal(found, of_five_steps)
-
-
-def test_it_can_be_stopped_and_watched(noisy: np.ndarray) -> None:
-    seen: list[int] = []
-    control = RunControl(on_progress=lambda p: seen.append(p.step), should_stop=lambda: len(seen) >= 3)
-    result = recon.reconstruct(noisy, VIEWS, R2(steps=10_000, gaussians=500), control=control)
-    assert result.history[-1].step < 10_000 and len(seen) >= 3
-    assert np.isfinite(result.volume.data).all() and result.volume.data.max() > 0
+def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callable[[np.ndarray], object]) -> None:
+    found, expected = (recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (kind(noisy), noisy))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize(
@@ -104,6 +83,7 @@ def test_it_can_be_stopped_and_watched(noisy: np.ndarray) -> None:
         ({"use": DataUse(held_out=tuple(range(24)))}, "none is left"),
         ({"control": RunControl(resume={})}, "not a checkpoint"),
         ({"device": "abacus"}, "'abacus' was asked for"),
+        ({"seed": -1}, "seed"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
     ],
 )
@@ -295,25 +275,20 @@ def test_a_result_says_in_a_line_what_it_is(noisy: np.ndarray) -> None:
     )
 
 
-def test_a_result_is_saved_as_a_whole_and_nothing_is_overwritten(noisy: np.ndarray, tmp_path: Path) -> None:
+def test_a_result_is_saved_as_a_whole(noisy: np.ndarray, tmp_path: Path) -> None:
     result = recon.reconstruct(noisy, VIEWS, "fbp")
     result.save(tmp_path / "v.npz")
     with np.load(tmp_path / "v.npz", allow_pickle=False) as saved:
         np.testing.assert_array_equal(saved["volume"], result.volume.data)
         assert (float(saved["voxel_mm"]), str(saved["method"])) == (PITCH, "fbp")
         assert json.loads(str(saved["settings"]))["filter"] == "hann"
-    with pytest.raises(FileExistsError, match="not overwritten"):
-        result.save(tmp_path / "v.npz")
-    with pytest.raises(ValueError, match="beamline export"):
-        result.save(tmp_path / "v.tif")
-    assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]
 
 
 @pytest.mark.parametrize("method", others_slow([recon.FistaTv(), recon.R2(steps=150)]))
 def test_a_helical_scan_is_a_height_a_view(method: recon.Method) -> None:
     """A ball higher than the detector, in two turns; without its heights it is a smear."""
-    heights = np.column_stack((np.zeros(60), np.linspace(-8, 8, 60)))
-    still = recon.Geometry.cone(np.linspace(0, 4 * np.pi, 60, endpoint=False), (16, 32), 1.0, 300.0, 300.0)
+    heights = np.column_stack((np.zeros(40), np.linspace(-8, 8, 40)))
+    still = recon.Geometry.cone(np.linspace(0, 4 * np.pi, 40, endpoint=False), (16, 32), 1.0, 300.0, 300.0)
     helix, grid = replace(still, shifts=heights), recon.Grid((32, 32, 32), 1.0)
     z, y, x = np.indices(grid.shape) - 15.5
     truth = (np.hypot(np.hypot(x - 3, y), z) < 11).astype(np.float32)

@@ -67,7 +67,7 @@ class Moves:
         bench.go(3.0)
         assert bench.go(3.0) == pytest.approx(3.0, abs=bench.count)
 
-    @pytest.mark.parametrize("degrees", [-5.1, 100.1, 4000.0, math.nan, math.inf])
+    @pytest.mark.parametrize("degrees", [-5.1, 100.1, 4000.0, 1e300, math.nan, math.inf])
     def test_a_target_beyond_the_limits_is_refused_and_nothing_moves(self, bench: StageBench, degrees: float) -> None:
         bench.go(7.0)
         with pytest.raises(DeviceRefused, match="Nothing has moved"):
@@ -78,7 +78,7 @@ class Moves:
     def test_the_limits_themselves_can_be_reached(self, bench: StageBench) -> None:
         assert bench.go(math.degrees(bench.stage.limits.low)) == pytest.approx(-5.0, abs=bench.count)
 
-    @pytest.mark.parametrize("times_max", [1.01, 0.0, -1.0, math.nan])
+    @pytest.mark.parametrize("times_max", [1.01, 1e300, math.inf, 0.0, -1.0, math.nan])
     def test_a_speed_it_cannot_do_is_refused_and_nothing_moves(self, bench: StageBench, times_max: float) -> None:
         with pytest.raises(DeviceRefused, match="Nothing has moved"):
             bench.stage.start_move(0.1, times_max * bench.stage.limits.max_speed)

@@ -7,7 +7,6 @@ into the fake camera's trigger input.
 from __future__ import annotations
 
 import math
-from collections.abc import Set
 from types import TracebackType
 from typing import Self
 from uuid import uuid4
@@ -31,25 +30,14 @@ COUNTS = 360_000
 
 
 class FlyRig:
-    """Closes its devices at the end of a `with` block, and then nothing of the library may be left open.
+    """Closes its devices at the end of a `with` block, and then nothing of the library may be left open."""
 
-    Args:
-        lost_pulses: trigger pulses (from 0) that never reach the cable.
-        stall_at: count at which the stage is stopped by its emergency stop.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        options: DcamOptions | None = None,
-        lost_pulses: Set[int] = frozenset(),
-        stall_at: int | None = None,
-    ) -> None:
+    def __init__(self, world: World, options: DcamOptions | None = None) -> None:
         world.reset(*SENSOR)
         self.world, self.clock = world, world.clock
         self.line = TriggerLine(self.clock)
         world.plug(self.line)
-        build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS, lost=lost_pulses, stall_at=stall_at))
+        build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS))
         box = build.controller(self.clock, self.line)
         figures = StageFigures(COUNTS, math.radians(30), math.radians(60))
         self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), PM16CSettings(figures), self.clock)

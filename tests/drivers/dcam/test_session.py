@@ -26,13 +26,9 @@ def test_a_camera_on_a_fast_link_is_ready() -> None:
     [(2, Verdict.SLOW), (3, Verdict.SLOW), (4, Verdict.READY), (5, Verdict.READY), (6, Verdict.READY)],
 )
 def test_speed_decides(speed: int, verdict: Verdict) -> None:
-    assert preflight(backend=Bus(Descriptor(speed=speed))).verdict is verdict
-
-
-def test_a_slow_link_says_which_and_what_to_do() -> None:
-    found = preflight(backend=Bus(Descriptor(speed=3)))
-    assert "480 Mbit/s needs a SuperSpeed link" in found.message
-    assert "another cable" in found.message
+    found = preflight(backend=Bus(Descriptor(speed=speed)))
+    assert found.verdict is verdict
+    assert verdict is Verdict.READY or "needs a SuperSpeed link" in found.message
 
 
 @pytest.mark.parametrize("speed", [None, 0])

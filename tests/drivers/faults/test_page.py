@@ -31,7 +31,3 @@ def test_what_the_run_says_at_the_end_is_quoted() -> None:
     words = re.sub(r"\s+", " ", TEXT)
     assert SAFE.split(";")[0] in words
     assert UNSAFE.split(";")[0] in words
-
-
-def test_the_readme_leads_here() -> None:
-    assert "docs/faults.md" in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -8,8 +8,6 @@ import time
 
 import pytest
 import serial
-from hypothesis import given
-from hypothesis import strategies as st
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
@@ -64,30 +62,6 @@ def ask(line: SerialLine, n: int) -> int:
 
 
 # in step
-
-
-@given(st.lists(st.integers(), max_size=10))
-def test_each_request_gets_its_own_reply(numbers: list[int]) -> None:
-    line = connect(Echo())
-    assert [ask(line, n) for n in numbers] == numbers
-
-
-def test_commands_without_a_reply_go_out_and_leave_the_line_in_step() -> None:
-    echo = Echo()
-    line = connect(echo)
-    line.send("GO")
-    assert ask(line, 5) == 5
-    assert echo.heard == ["GO", "N?5"]
-
-
-@given(st.lists(st.integers(1, 4), max_size=6))
-def test_a_reply_in_pieces_is_one_reply(sizes: list[int]) -> None:
-    whole, pieces = b"-12345\r\n", []
-    for k, size in enumerate(sizes):
-        pieces.append((0.1 * k, whole[:size]))
-        whole = whole[size:]
-    pieces.append((0.1 * len(sizes), whole))
-    assert ask(connect(Echo({0: pieces})), 0) == -12345
 
 
 def test_notes_that_nobody_asked_for_are_passed_over() -> None:
@@ -159,14 +133,6 @@ def test_a_reply_byte_by_byte_is_whole_however_slowly_they_come(gap: float) -> N
     assert ask(line, 0) == -123456
     assert echo.clock.now() == pytest.approx(gap * (len(whole) - 1), abs=0.06)
     assert ask(line, 7) == 7
-
-
-def test_a_late_reply_is_not_taken_for_the_next_ones() -> None:
-    line = connect(Echo({0: [(1.3, b"111\r\n")]}))
-    with pytest.raises(DeviceTimeout):
-        ask(line, 111)
-    assert ask(line, 222) == 222
-    assert ask(line, 333) == 333
 
 
 def test_a_reply_so_late_that_it_comes_between_probe_and_answer_is_passed_over() -> None:

@@ -35,7 +35,6 @@ class Rig(StageRig):
         spoil = {"spoil": lambda number, reply: self.spoil(reply)}
         super().__init__(PiGcsBuild, CABLE | spoil | (wire or {}) | build)
         self.heard = bytearray()
-        self.unasked = bytearray()
         self._lost: list[tuple[bytes, bytes]] = []
 
     def receive(self, data: bytes) -> None:
@@ -44,10 +43,6 @@ class Rig(StageRig):
             if data.startswith(prefix) and b"?" not in data:
                 data = instead
         self.controller.receive(data)
-
-    def transmit(self) -> bytes:
-        unasked, self.unasked = bytes(self.unasked), bytearray()
-        return unasked + super().transmit()
 
     def open(self, clock: Clock | None = None, **settings: Any) -> PiGcsStage:
         return PiGcsStage(self.url, flat(PiGcsSettings, **(USUAL | settings)), clock or self.clock)

@@ -44,7 +44,6 @@ def serve_sim(wire: Wire) -> Iterator[str]:
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 PLUGS = [pytest.param(serve_pty, marks=needs_pty, id="pty"), pytest.param(serve_tcp, id="tcp")]
 """Those that can be pulled out."""
-TRANSPORTS = [pytest.param(serve_sim, id="sim"), *PLUGS]
 SPEEDS: dict[Serve, float] = {serve_sim: 8.0, serve_pty: 2.0, serve_tcp: 1.0}
 """Seconds of the clock of controller and driver in one real second. In one thread nothing can be late, so that sim://
 may be fast; a terminal is as real at twice the speed, with twice the timeout."""
@@ -59,7 +58,6 @@ class Kind:
         usual: values of them.
         wire: makes the stand-in.
         unreferenced: settings of the stand-in that has not found its reference yet, where there is such a state.
-        homed: what it says of its reference at power-on otherwise.
         home: counts at which a search ends.
         garbage: what may come instead of a reply to a question after the position.
         opening: beginnings of the first two things that the driver sends; `among`: a part of a later one.
@@ -74,11 +72,10 @@ class Kind:
     among: str
     farewell: tuple[str, ...]
     unreferenced: Mapping[str, Any] = field(default_factory=dict)
-    homed: bool = True
     home: int = 0
 
 
-GARBAGE = (b"\xff\xfe\x00\x80 noise \r\n", b"\r\n\r\n\r\n", b"x" * 3000)
+NOISE = b"\xff\xfe\x00\x80 noise \r\n"
 QUICK = {"max_speed": FAST, "acceleration": math.radians(2000)}
 PATIENCE = 0.25
 """s of real time for a reply."""
@@ -98,18 +95,17 @@ KINDS = {
         QUICK
         | {"counts_per_turn": 36_000, "low": math.radians(-5), "high": math.radians(100), "home": math.radians(0.5)},
         _pm16c,
-        garbage=(*GARBAGE, b"R0S0", b"\x00" * 50 + b"\r\n+0000000\r\n"),
+        garbage=(NOISE, b"R0S0", b"\x00" * 50 + b"\r\n+0000000\r\n"),
         opening=(r"b'\r\n'", r"b'VER?\r\n'"),
         among="b'TMGR?0",
         farewell=(r"b'LOC\r\n'",),
-        homed=False,
         home=50,
     ),
     "pi_gcs": Kind(
         PiGcsStage,
         pi_gcs_rig.USUAL | QUICK,
         pi_gcs_rig.controller,
-        garbage=(*GARBAGE, b"1=0.0", b"2=0.000000\n"),
+        garbage=(NOISE, b"1=0.0", b"2=0.000000\n"),
         opening=(r"b'\n'", r"b'*IDN?\n'"),
         among="b'ACC 1 2000",
         farewell=("b'SPA 1 0xC ", r"b'ERR?\n'"),  # what opening changed is restored, and taken
@@ -119,7 +115,7 @@ KINDS = {
         ZaberStage,
         zaber_rig.USUAL | QUICK,
         _zaber,
-        garbage=(*GARBAGE, b"@01 1 ", b"@01 1 00 OK IDLE -- 7\r\n"),
+        garbage=(NOISE, b"@01 1 ", b"@01 1 00 OK IDLE -- 7\r\n"),
         opening=("b'", "b'/1 0 00 get comm.checksum:"),
         among="get device.id",
         farewell=("set comm.checksum 0",),

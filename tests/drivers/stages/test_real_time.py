@@ -1,4 +1,4 @@
-"""Every stage on real time over every transport: short moves, a search, a train, a stop, garbage, and the plug."""
+"""Every stage on real time, by pseudo-terminal and TCP: short moves, a search, a train, a stop, garbage, the plug."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from drivers.base.errors import DeviceError
-from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, TRANSPORTS, Kind, Real, Serve
+from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, Kind, Real, Serve, serve_sim
+from tests.simulators.wires.transports import serve_tcp
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
-@pytest.fixture(scope="module", params=TRANSPORTS)
+@pytest.fixture(scope="module", params=PLUGS)
 def serve(request: pytest.FixtureRequest) -> Serve:
     return request.param
 
@@ -68,15 +69,6 @@ def test_a_search_and_then_a_train_that_gives_its_pulses_at_its_counts(kind: Kin
         stage.close()
 
 
-def test_a_search_ends_at_the_reference(real: Real) -> None:
-    """From above; the one before came from below."""
-    stage = real.stage
-    stage.start_move(math.radians(2), FAST)
-    stage.wait(SOON)
-    stage.start_home()
-    assert stage.to_counts(stage.wait(SOON)) == real.kind.home
-
-
 def test_a_stop_on_the_way_stands_short(real: Real) -> None:
     stage = real.stage
     stage.start_move(math.radians(90), math.radians(10))
@@ -84,14 +76,12 @@ def test_a_stop_on_the_way_stands_short(real: Real) -> None:
     with pytest.raises(DeviceError, match="stopped short"):
         stage.wait(SOON)
     assert 0 <= stage.to_counts(stage.position()) < real.bench.counts(90)
-    stage.start_move(0.0, FAST)
-    assert stage.wait(SOON) == 0.0
 
 
 @every_kind
-def test_the_transcript_of_a_real_conversation_is_whole(kind: Kind, serve: Serve, tmp_path: Path) -> None:
+def test_the_transcript_of_a_conversation_is_whole(kind: Kind, tmp_path: Path) -> None:
     with ExitStack() as plugged:
-        stage = Real(kind, serve, plugged, {"transcript": tmp_path / "line.txt"}).stage
+        stage = Real(kind, serve_sim, plugged, {"transcript": tmp_path / "line.txt"}).stage
         stage.position()
         stage.close()
     text = (tmp_path / "line.txt").read_text()
@@ -102,10 +92,10 @@ def test_the_transcript_of_a_real_conversation_is_whole(kind: Kind, serve: Serve
     assert any(kind.among in line for line in sent)
 
 
-# disturbed; over sim:// the fuzz does the same on a virtual clock
+# disturbed, over one transport; the fuzz does the same on a virtual clock
 
 
-@pytest.mark.parametrize("serve", PLUGS, scope="module")
+@pytest.mark.parametrize("serve", [serve_tcp], scope="module")
 def test_after_garbage_the_line_finds_its_step_again(real: Real) -> None:
     stage = real.stage
     stage.start_move(math.radians(1), FAST)
@@ -119,7 +109,7 @@ def test_after_garbage_the_line_finds_its_step_again(real: Real) -> None:
         assert not stage.moving()
 
 
-@pytest.mark.parametrize("serve", PLUGS, scope="module")
+@pytest.mark.parametrize("serve", [serve_tcp], scope="module")
 def test_after_garbage_in_the_middle_of_a_move_the_move_is_still_waited_for(real: Real) -> None:
     stage = real.stage
     stage.start_move(math.radians(7), math.radians(20))

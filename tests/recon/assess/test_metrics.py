@@ -164,13 +164,6 @@ def test_regions_without_an_interior_are_none() -> None:
     assert interior_regions(np.ones((4, 40, 40), np.float32)) is None
 
 
-def test_snr_and_cnr_in_closed_form(rng: np.random.Generator) -> None:
-    volume, _ = particles(rng, 0.1)
-    snr, cnr = snr_cnr(volume, kmeans_mask(volume))
-    assert snr == pytest.approx(20 * np.log10(3 / 0.1), abs=0.1)
-    assert cnr == pytest.approx(20 * np.log10(2 / 0.1), abs=0.1)
-
-
 def test_snr_of_exact_numbers() -> None:
     volume = np.array([[[5.0, 5.0, 1.0, 3.0, 99.0]]])
     mask = np.array([[[1, 1, 0, 0, -1]]], np.int8)  # μ = 5, μ_b = 2, σ_b = 1

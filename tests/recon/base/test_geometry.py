@@ -31,16 +31,6 @@ def test_the_axis_is_in_the_middle_unless_told() -> None:
     assert Geometry.parallel([0.0], (4, 10), axis_col=3.2).axis_col == 3.2
 
 
-@given(factor=st.integers(1, 4), axis=st.floats(0, 30), col=st.integers(0, 6))
-def test_a_binned_pixel_sits_at_the_mean_of_its_pixels(factor: int, axis: float, col: int) -> None:
-    fine = Geometry.parallel([0.0], (8, 31), pixel_pitch=0.3, axis_col=axis)
-    coarse = fine.binned(factor)
-    members = np.arange(col * factor, (col + 1) * factor)
-    expected = ((members - fine.axis_col) * fine.pixel_pitch).mean()
-    assert (col - coarse.axis_col) * coarse.pixel_pitch == pytest.approx(expected, abs=1e-9)
-    assert coarse.detector_shape == (8 // factor, 31 // factor)
-
-
 def test_selected_views_keep_their_order() -> None:
     chosen = Geometry.parallel([0.1, 0.2, 0.3], (2, 2)).select([2, 0])
     assert chosen.angles.tolist() == [0.3, 0.1]

@@ -91,7 +91,7 @@ def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_th
 
 def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_be() -> None:
     # No body that fits into the field has them: its edge would have to be infinitely dense.
-    found = fitted(np.ones((32, *SHAPE), np.float32))
+    found = fitted(np.ones((32, *SHAPE), np.float32), finish=0)
     assert found.history[-1].residual < 0.2
     assert np.isfinite(fbp(np.ones((32, *SHAPE), np.float32), VIEWS, GRID)).all()
 
@@ -113,23 +113,14 @@ def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean:
     best = correct(good.astype(np.uint16), np.arange(32.0), references)
     of_good, with_masks, without = (
         psnr(truth, found.volume.data)
-        for found in (fitted(best.data), fitted(given.data, weights=weights), fitted(given.data))
+        for found in (
+            fitted(best.data, steps=60, finish=0),
+            fitted(given.data, steps=60, weights=weights, finish=0),
+            fitted(given.data, steps=60, finish=0),
+        )
     )
     assert with_masks > of_good - 0.5
     assert with_masks > without
-
-
-@pytest.mark.filterwarnings("ignore:.*are not finite")
-def test_values_that_are_not_finite_weigh_nothing_whatever_they_are(clean: F32, bad: NDArray[np.bool_]) -> None:
-    volumes = []
-    for value in (np.nan, -np.inf):
-        volumes.append(fitted(np.where(bad, np.float32(value), clean), steps=40).volume.data)
-    # Or any garbage, where weights say so: the same bits.
-    volumes.append(
-        fitted(np.where(bad, np.float32(1e30), clean), weights=(~bad).astype(np.float32), steps=40).volume.data
-    )
-    for other in volumes[1:]:
-        np.testing.assert_array_equal(other, volumes[0])
 
 
 @pytest.mark.filterwarnings("ignore:.*are not finite")
@@ -149,7 +140,7 @@ def of_all_but_one(clean: F32) -> F32:
     without = clean.copy()
     without[9, 4, 31] = np.nan
     with pytest.warns(UserWarning, match="1 of .* are not finite"):
-        return fitted(without).volume.data
+        return fitted(without, steps=60, finish=0).volume.data
 
 
 @pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
@@ -157,7 +148,7 @@ def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
     wild[9, 4, 31] = value
-    found, expected = fitted(wild).volume.data, of_all_but_one
+    found, expected = fitted(wild, steps=60, finish=0).volume.data, of_all_but_one
     if abs(value) > 1e6:  # beyond what `make_problem` takes: as if it were not finite
         np.testing.assert_array_equal(found, expected)
     assert psnr(truth, found) > psnr(truth, expected) - 0.5
@@ -172,31 +163,6 @@ def test_views_with_only_wild_pixels_do_not_cause_filling_in_others(clean: F32) 
     tame = without_wild_pixels(closed)
     np.testing.assert_array_equal(np.delete(tame, 5, 0), np.delete(clean, 5, 0))
     assert tame[5].max() <= 10 * clean.max()
-
-
-def test_a_nan_in_naive_arithmetic_takes_everything(clean: F32) -> None:
-    marred = clean.copy()
-    marred[0, 0, 0] = np.nan
-    assert np.isnan(np.abs(marred - clean).mean())
-    spectrum = np.fft.irfft(np.fft.rfft(marred[0, 0]))  # FBP's filter, unmasked: the whole row
-    assert np.isnan(spectrum).all()
-
-
-@settings(max_examples=15)
-@given(st.lists(st.tuples(st.integers(0, 31), st.integers(0, 11), st.integers(0, 47)), min_size=1, max_size=40),
-       st.sampled_from([np.nan, np.inf, -np.inf, 3e38]))  # fmt: skip
-def test_masked_pixels_anywhere_have_no_pull(where: list[tuple[int, int, int]], value: float) -> None:
-    data = spheres.projections(VIEWS.select([0, 9])).repeat(16, 0)
-    clean_at = np.zeros(data.shape, bool)
-    clean_at[tuple(np.transpose(where))] = True
-    weights = None if not np.isfinite(value) else (~clean_at).astype(np.float32)
-    marred = np.where(clean_at, np.float32(value), data)
-    problem = fit.problem_of(marred, VIEWS, GRID, 0.05, SHORT, None, weights)
-    view = where[0][0]
-    image = project(a_few(), VIEWS, [view])[0].numpy() / problem.scale
-    loss, slope = problem.loss(image, problem.images[view], problem.target_maps[view], problem.weights[view])
-    assert math.isfinite(float(loss)) and np.isfinite(slope).all()
-    assert not slope[clean_at[view]].any()
 
 
 def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> None:
@@ -234,10 +200,10 @@ def test_a_fit_takes_angles_in_any_order_and_range(clean: F32, truth: F32) -> No
     rng = np.random.default_rng(4)
     order = rng.permutation(32)
     odd = Geometry.parallel(VIEWS.angles[order] + 2 * math.pi * rng.integers(-9, 10, 32), SHAPE)
-    # A step draws other views: over seeds a fit's PSNR scatters by 0.2 dB, the mean of eight by 0.07. What depends on
+    # A step draws other views: over seeds a fit's PSNR scatters by 0.2 dB, the mean of four by 0.1. What depends on
     # the order itself is the weight of total variation, by the views that tell of noise, which these data do not have.
     plain, mixed = (
-        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(8)])
+        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(4)])
         for data, views in ((clean, VIEWS), (clean[order], odd))
     )
     assert abs(plain - mixed) < 0.3
@@ -297,12 +263,11 @@ def test_a_tenth_of_a_pixel_of_the_axis_costs_little(clean: F32, truth: F32) -> 
     assert costs[0.0] - costs[0.5] > 1
 
 
-@pytest.mark.parametrize("photons", [3, 30])
-def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32, photons: int) -> None:
+def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32) -> None:
     # With three photons a pixel, some count none at all: their line integral is -log(floor), and finite.
-    rng = np.random.default_rng(6)
+    rng, photons = np.random.default_rng(6), 3
     counts = rng.poisson(photons * np.exp(-clean)).astype(np.float32)
-    assert (counts == 0).any() == (photons == 3)
+    assert (counts == 0).any()
     references = References(np.zeros(SHAPE, np.float32), ((0.0, np.full(SHAPE, photons, np.float32)),))
     data = correct(counts, np.arange(32.0), references).data
     direct = fbp(data, VIEWS, GRID, "hann")

@@ -65,12 +65,11 @@ def along_the_rays(parameters: Parameters, geometry: Geometry, view: int, kernel
 
 
 @pytest.mark.parametrize("kernel", Kernel)
-@pytest.mark.parametrize("view", [0, 1])
 @pytest.mark.parametrize("geometry", [PARALLEL, CONE], ids=["parallel", "cone"])
 def test_the_reference_is_the_integral_along_the_ray(
-    geometry: Geometry, view: int, kernel: Kernel, rng: np.random.Generator
+    geometry: Geometry, kernel: Kernel, rng: np.random.Generator
 ) -> None:
-    parameters = some(rng)
+    parameters, view = some(rng), 1
     every = torch.ones(12, dtype=torch.bool)
     image = reference.project_view(parameters, geometry, view, exact=every, kernel=kernel).numpy()
     expected = along_the_rays(parameters, geometry, view, kernel)
@@ -91,11 +90,11 @@ PUBLISHED = Geometry.cone([0.3], (128, 128), 4 / 128, 5.0, 7.0)  # of R²-Gaussi
 def test_the_affine_cone_is_off_as_published_and_as_estimated(
     scale: tuple[float, float, float], median: float, largest: float, rng: np.random.Generator
 ) -> None:
-    parameters = some(rng, 25, 1.2, np.tile(scale, (25, 1)))
+    parameters = some(rng, 15, 1.2, np.tile(scale, (15, 1)))
     for kernel in reversed(Kernel):
         estimate = reference.affine_error(*parameters[:3], PUBLISHED, 0, kernel).numpy()
-        measured = np.empty(25)
-        for i in range(25):
+        measured = np.empty(15)
+        for i in range(15):
             one = tuple(p[i : i + 1] for p in parameters)
             affine, exact = (
                 reference.project_view(one, PUBLISHED, 0, exact=torch.tensor([e]), kernel=kernel).numpy()
@@ -113,7 +112,7 @@ def test_the_affine_cone_is_off_as_published_and_as_estimated(
 def test_gradients_equal_finite_differences(
     geometry: Geometry, length: float, kernel: Kernel, rng: np.random.Generator
 ) -> None:
-    tensors = [p.requires_grad_() for p in some(rng, 3, 4.0)]
+    tensors = [p.requires_grad_() for p in some(rng, 2, 4.0)]
     assert torch.autograd.gradcheck(
         lambda *t: reference.project_view(t, geometry.select([0]), 0, length=length, kernel=kernel), tensors
     )

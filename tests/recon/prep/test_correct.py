@@ -337,18 +337,6 @@ def test_a_scan_may_end_after_its_last_view_was_fed(rng: np.random.Generator, ai
     np.testing.assert_array_equal(merge_and_empty(parts).data, whole.data)
 
 
-def test_a_view_waits_for_the_one_after_it(rng: np.random.Generator) -> None:
-    counts, references = beer_lambert(sphere(3), rng)
-    correction = Correction(references, CorrectionSettings(air="none"))
-    given = [
-        correction.line_integrals(
-            correction.transmission(counts[v : v + 1], np.array([float(v)]), np.array([v])), last=v == 2
-        ).view_ids.tolist()
-        for v in range(3)
-    ]
-    assert given == [[], [0], [1, 2]]
-
-
 def test_bad_input_is_refused_with_its_values() -> None:
     counts, references = good()
     at = positions(counts)

@@ -41,12 +41,6 @@ def test_the_misfit_is_the_ratio_of_norms(weighted: bool, rng: np.random.Generat
     assert Cpu().misfit(image, np.zeros_like(image), weights) == 0
 
 
-def test_lengths_are_added(rng: np.random.Generator) -> None:
-    vectors, sums = rng.normal(size=(50, 2)).astype(np.float32), np.full(50, 2.0, np.float32)
-    Cpu().add_lengths(vectors, 3.5, sums)
-    np.testing.assert_allclose(sums, 2 + 3.5 * np.hypot(*vectors.T), rtol=1e-6)
-
-
 def test_arrays_come_and_go_as_copies() -> None:
     values = np.ones(4, np.float32)
     array = Cpu().array(values)
@@ -115,18 +109,6 @@ def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: n
     assert found[0][0].any() and not found[1][0].any()
     for with_means, without in zip(found[0][1:], found[1][1:], strict=True):
         np.testing.assert_array_equal(with_means, without)
-
-
-def test_bounds_hold_after_an_update_and_none_means_unbounded(rng: np.random.Generator) -> None:
-    p = [rng.normal(size=(40, width)).astype(np.float32) for width in (3, 3, 4, 1)]
-    slopes = [rng.normal(size=a.shape).astype(np.float32) for a in p]
-    free = [a.copy() for a in p]
-    for arrays, limits in ((p, (None, (-0.4, 0.6), None, None)), (free, (None,) * 4)):
-        first, second = ([np.zeros_like(a) for a in arrays] for _ in range(2))
-        Cpu().adam(arrays, slopes, first, second, (0.1,) * 4, 1, limits)
-    for k, (held, loose) in enumerate(zip(p, free, strict=True)):
-        np.testing.assert_array_equal(held, np.clip(loose, np.float32(-0.4), np.float32(0.6)) if k == 1 else loose)
-    assert float(free[1].min()) < -0.4 and float(free[1].max()) > 0.6
 
 
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

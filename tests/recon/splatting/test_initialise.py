@@ -7,7 +7,6 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     first_volume,
     mean_change,
@@ -137,11 +136,6 @@ def test_morton_order_is_a_permutation_that_keeps_neighbours(rng: np.random.Gene
     assert sorted(order.tolist()) == list(range(2000))
     walk = np.linalg.norm(np.diff(means[order], axis=0), axis=1).mean()
     assert walk < 0.35 * np.linalg.norm(np.diff(means, axis=0), axis=1).mean()
-
-
-def test_one_gaussian_has_an_order() -> None:
-    one = Gaussians.from_physical([[1.0, 2.0, 3.0]], [1.0], [1.0])
-    assert morton_order(one.means.numpy(), 1.0).tolist() == [0]
 
 
 def test_the_change_of_matter_is_its_variation_over_its_voxels() -> None:

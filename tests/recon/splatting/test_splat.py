@@ -16,7 +16,6 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
-from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxel_means, voxelize
 from tests.recon.conftest import Make
@@ -140,16 +139,6 @@ def test_a_width_and_the_uncorrected_factor_are_refused(random_gaussians: Make) 
         project(random_gaussians(), STRAIGHT.seen_with(RayWidth(pixel=1)), model=RayModel(rectified=False))
 
 
-def test_the_choice_of_exact_rays_is_a_choice(random_gaussians: Make) -> None:
-    # Between none and all: the mixed case of the paths above has to have both kinds in every view.
-    views, model = PATHS["cone, some exact"]
-    a = random_gaussians().arrays()
-    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
-    for view in range(views.n_views):
-        chosen = render_view(active, views, view, 1e-6, 3.5, model).exact.size
-        assert 5 < chosen < 35, chosen
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [({"exact_above": -0.1}, "relative error"), ({"exact_above": 0.01, "rectified": False}, "rectified")],
@@ -199,24 +188,6 @@ def test_projection_is_linear_in_density_and_its_adjoint_is_the_density_gradient
     left = float((image.detach().double() * y).sum())
     right = float((g.densities.detach().double() * back).sum())
     assert left == pytest.approx(right, rel=3e-5)
-
-
-def test_views_that_share_memory_give_what_views_of_their_own_give(
-    random_gaussians: Make, rng: np.random.Generator
-) -> None:
-    views, model = PATHS["cone, some exact"]
-    a = random_gaussians().arrays()
-    active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], 0.7)
-    buffers, y = Scratch.of(40, SHAPE), rng.normal(size=SHAPE).astype(np.float32)
-    for view in range(views.n_views):
-        found = []
-        for scratch in (buffers, None):
-            into, centres = Gradients.zeros(40), np.empty((40, 2), np.float32)
-            seen = render_view(active, views, view, 1e-6, 3.5, model, scratch=scratch)
-            seen.backward(y, into, centres)
-            found.append((seen.image, into.means, into.log_scales, into.rotations, into.densities, centres))
-        for shared, own in zip(*found, strict=True):
-            np.testing.assert_array_equal(shared, own)
 
 
 def test_without_gradients_the_memory_is_that_of_the_images_however_many_views(random_gaussians: Make) -> None:
@@ -280,36 +251,6 @@ def test_what_is_faint_is_left_out(above: float, seen: bool) -> None:
     assert bool(project(one, views, truncation=cut).any()) == seen
     one = Gaussians.from_physical([[0.0, 0, 0]], [sigma], [above * cut.faint * unit], density_unit=unit)
     assert bool(voxelize(one, Grid((5, 5, 5), 0.5), truncation=cut).any()) == seen
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    exponent=st.floats(-3, 3),
-    aspect=st.floats(0, 3),
-    far=st.sampled_from([0.0, 1.0, 30.0, 1e4]),
-    length=st.sampled_from([0.0, 1e-30, 1e-6, 1.0, 1e6]),
-    path=st.sampled_from(sorted(PATHS)),
-    kernel=st.sampled_from(Kernel),
-)
-def test_extreme_gaussians_stay_finite(
-    exponent: float, aspect: float, far: float, length: float, path: str, kernel: Kernel
-) -> None:
-    base = 10.0**exponent
-    g = Gaussians(
-        torch.tensor([[far, -far, far / 2], [0.1, 0.2, 0.3]]),
-        torch.log(torch.tensor([[base, base * 10**aspect, base], [0.5, 0.5, 0.5]])),
-        torch.tensor([[length, 0.0, length, 0.0], [1.0, 0.2, 0.0, 0.0]]),
-        torch.tensor([-80.0, 0.5]),
-        kernel=kernel,
-    )
-    leaves = as_leaves(g)
-    views, model = PATHS[path]
-    image = project(leaves, views, model=model)
-    assert torch.isfinite(image).all() and float(image.detach().min()) >= 0
-    image.sum().backward()
-    assert all(torch.isfinite(value).all() for value in gradients(leaves).values())
-    volume = voxelize(g, Grid((6, 7, 8)))
-    assert torch.isfinite(volume).all() and float(volume.min()) >= 0
 
 
 def test_the_cpu_kernel_refuses_doubles(random_gaussians: Make) -> None:

@@ -51,7 +51,7 @@ def data(phantom: Phantom) -> np.ndarray:
 
 
 def _stream(data: np.ndarray, order: np.ndarray, seed: int = 0) -> StreamingFit:
-    model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, seed, gaussians=800, now=SteppedClock(tick=0.01))
     for view in order:
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
         model.advance(0.1)
@@ -66,20 +66,20 @@ def streamed(data: np.ndarray, phantom: Phantom) -> tuple[np.ndarray, float]:
     """The volume of all views in that order before its last steps, and its PSNR in dB after them."""
     model = _stream(data, SCATTERED)
     volume = model.snapshot().data.copy()
-    model.finish(4.0)
+    model.finish(2.0)
     return volume, psnr(phantom.attenuation(GRID), model.snapshot().data)
 
 
 def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom: Phantom) -> None:
     truth = phantom.attenuation(GRID)
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     quality = []
     for view in range(40):
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
         model.advance(0.1)
         if view in (19, 39):
             quality.append(psnr(truth, model.snapshot().data))
-    end = model.finish(6.0)
+    end = model.finish(3.0)
     quality.append(psnr(truth, model.snapshot().data))
     assert quality[0] < quality[1] < quality[2]
     assert quality[2] > 27
@@ -94,7 +94,7 @@ def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[n
 @pytest.mark.slow
 def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
     mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
-    method = recon.R2(gaussians=1500, fit=FitSettings(**mine))  # type: ignore[arg-type]
+    method = recon.R2(gaussians=800, fit=FitSettings(**mine))  # type: ignore[arg-type]
     model = method.stream(VIEWS, 0, SteppedClock(tick=0.01))
     assert model.settings == replace(WHILE_VIEWS_COME, **mine)
     assert recon.R2().stream(VIEWS, 0, SteppedClock(tick=0.01)).settings == WHILE_VIEWS_COME
@@ -131,14 +131,14 @@ def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_e
     monkeypatch.setattr(fit, "step", spy)
     model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
-    model.advance(3.0)
+    model.advance(2.0)
     newest = [view for view, _ in taken if view is not None]
-    assert len(taken) >= 300 and 0.22 < len(newest) / len(taken) < 0.45
+    assert len(taken) >= 200 and 0.22 < len(newest) / len(taken) < 0.45
     assert set(newest) == set(range(32, 40))  # the last fifth of forty
     rates = [fraction for _, fraction in taken]
     assert rates == sorted(rates) and rates[0] == 0 and rates[-1] < 0.6
     taken.clear()
-    model.finish(3.0)
+    model.finish(2.0)
     fractions = [fraction for _, fraction in taken]
     assert fractions == sorted(fractions) and abs(fractions[0] - rates[-1]) < 0.02 and fractions[-1] > 0.95
     assert all(view is None for view, _ in taken)
@@ -212,9 +212,9 @@ def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.Mo
 
 
 def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phantom: Phantom) -> None:
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
-    model.advance(4.0)
+    model.advance(2.0)
     truth, settings = phantom.attenuation(GRID), model.settings
     state = model._state
     assert state is not None and state.mean is not None
@@ -239,7 +239,7 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
 @pytest.mark.parametrize("offset", others_slow([1e-5, -1e-5]))
 def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
     # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     for view, angle in enumerate(np.linspace(0, 1, 10)):
         noise = np.random.default_rng(view).normal(offset, 1e-5, (1, *SHAPE)).astype(np.float32)
         model.add_views(noise, [angle])
@@ -247,7 +247,7 @@ def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phan
     assert model.started == (offset > 0)
     model.add_views(data, ANGLES)
     model.advance(0.1)
-    end = model.finish(6.0)
+    end = model.finish(3.0)
     assert end.n_views == 50
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 15
 
@@ -300,7 +300,7 @@ def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
     with pytest.raises(ValueError, match="no value"):
         model.add_views(np.full((1, *SHAPE), 1e30, np.float32), [0.1])
     assert model.n_views == 40
-    model.finish(4.0)
+    model.finish(2.0)
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > streamed[1] - 1.0
 
 
@@ -347,9 +347,9 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
     """Half a circle of views about an axis that is off by d shows the sample off by 4 d / π across its middle."""
     truth, off = phantom.attenuation(GRID), 0.8
     wrong = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + off)
-    model = StreamingFit(wrong, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(wrong, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
-    model.advance(4.0)
+    model.advance(2.0)
     before, quality = model.gaussians, psnr(truth, model.snapshot().data)
     model.move_axis(VIEWS.axis_col)
     after = model.gaussians
@@ -362,7 +362,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
 def _disturbed(data: np.ndarray, truth: np.ndarray, batches: list[np.ndarray], axis_off: float = 0.0) -> float:
     """PSNR in dB of a stream of these batches of views, whose axis is corrected once half of the views are there."""
     template = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + axis_off)
-    model = StreamingFit(template, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
+    model = StreamingFit(template, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
     for batch in batches:
         model.add_views(data[batch], ANGLES[batch])
         model.advance(0.1)

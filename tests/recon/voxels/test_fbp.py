@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -165,20 +164,6 @@ def test_bad_input_is_refused() -> None:
     bad[1, 0, 3] = np.nan
     with pytest.raises(ValueError, match="NaN or infinite"):
         fbp(bad, geometry)
-
-
-@pytest.mark.bench
-def test_time_of_90_views_of_256_cubed(rng: np.random.Generator) -> None:
-    geometry = Geometry.parallel(half_turn(90), (256, 256))
-    views = rng.random((90, 256, 256), dtype=np.float32)
-    fbp(views[:, :1], Geometry.parallel(geometry.angles, (1, 256)))
-    seconds = []
-    for _ in range(5):
-        start = time.perf_counter()
-        fbp(views, geometry)
-        seconds.append(time.perf_counter() - start)
-    print(f"FBP of 90 views of 256 x 256 into 256³: {min(seconds):.3f} s")
-    assert min(seconds) < 2
 
 
 @pytest.mark.parametrize("turns", [1.0, 3.0, 0.5])

@@ -12,26 +12,13 @@ from recon.kernels.cpu import joseph
 from recon.voxels import direct as direct_module
 from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
+from tests.recon.bodies import Bodies
 from tests.slow_cases import others_slow
 
 
 def ball_views(geometry: Geometry, radius: float, centre: tuple[float, float, float]) -> NDArray[np.float32]:
-    """Line integrals of a ball of attenuation 1 at (x, y, z): twice the root of r² less the squared distance."""
-    rows, cols = geometry.detector_shape
-    out = np.zeros((geometry.n_views, rows, cols))
-    fine = (-0.25, 0.25)  # a pixel sees the mean of its rays
-    for view in range(geometry.n_views):
-        along_u, along_v, beam = geometry.axes(view)
-        col0, row0 = geometry.origin(view)
-        for dv in fine:
-            for du in fine:
-                u, v = np.meshgrid(np.arange(cols) + du - col0, np.arange(rows) + dv - row0)
-                run = (u[..., None] * along_u + v[..., None] * along_v) * geometry.pixel_pitch + geometry.sdd * beam
-                run /= np.linalg.norm(run, axis=-1, keepdims=True)
-                to = np.array(centre) + geometry.sod * beam
-                distance2 = to @ to - (run @ to) ** 2
-                out[view] += 2 * np.sqrt(np.maximum(radius**2 - distance2, 0)) / 4
-    return out.astype(np.float32)
+    """Line integrals of a ball of attenuation 1 at (x, y, z)."""
+    return Bodies(np.array([centre]), np.eye(3)[None] / radius, np.ones(1)).views(geometry)
 
 
 def circle(n: int) -> NDArray[np.float64]:
@@ -45,9 +32,9 @@ def inside(grid: Grid, radius: float, centre: tuple[float, float, float]) -> NDA
 
 @pytest.mark.parametrize("arc", [210, 250, 320])
 def test_a_short_scan_shows_the_ball_as_a_full_turn_does(arc: float, rng: np.random.Generator) -> None:
-    angles = rng.permutation(np.deg2rad(np.linspace(0, arc, 240) + 40))
+    angles = rng.permutation(np.deg2rad(np.linspace(0, arc, 160) + 40))
     short = Geometry.cone(angles, (17, 48), 1.0, 80.0, 160.0)
-    whole = Geometry.cone(circle(360), (17, 48), 1.0, 80.0, 160.0)
+    whole = Geometry.cone(circle(240), (17, 48), 1.0, 80.0, 160.0)
     grid, centre = Grid((3, 48, 48), 0.5), (3.0, -2.0, 0.0)
     found, expected = (fdk(ball_views(views, 5.0, centre), views, grid, "hann") for views in (short, whole))
     ball = inside(grid, 4.0, centre)

@@ -252,14 +252,6 @@ def test_momentum_saves_sweeps() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_unit_of_attenuation_does_not_matter(method: IterativeMethod) -> None:
-    projector, _, views = parallel_case(noise=0.02)
-    one = solve(replace(method, iterations=4), projector, views)
-    small = solve(replace(method, iterations=4), projector, views * np.float32(2**-9))
-    np.testing.assert_allclose(small.data * 2**9, one.data, atol=2e-4)
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_rays_without_weight_do_not_count(method: IterativeMethod) -> None:
     """Whatever they hold, NaN too."""
     projector, truth, views = parallel_case()

@@ -17,6 +17,7 @@ from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution, smoothed
 from recon.voxels.voxel_problem import largest_eigenvalue
+from tests.recon.helpers import assert_transpose
 
 SIDE, WIDTH = 192, 24.0
 
@@ -131,7 +132,7 @@ GEOMETRIES = {
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
-@pytest.mark.parametrize("voxel", [0.9, 1.0, 1.4])
+@pytest.mark.parametrize("voxel", [0.9, 1.4])
 @pytest.mark.parametrize("others", [1.0, 0.01])
 def test_the_step_knows_that_the_model_is_sharpened(
     name: str, voxel: float, others: float, rng: np.random.Generator
@@ -151,11 +152,7 @@ def test_the_step_knows_that_the_model_is_sharpened(
 
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_the_matched_transpose_is_exact(name: str, rng: np.random.Generator) -> None:
-    projector = Projector(GEOMETRIES[name], Grid((6, 24, 24), 1.4))
-    volume = rng.random(projector.grid.shape, dtype=np.float32)
-    views = rng.random(projector.projection_shape, dtype=np.float32)
-    left = np.vdot(projector.forward(volume).astype(np.float64), views)
-    assert left == pytest.approx(np.vdot(volume.astype(np.float64), projector.adjoint(views)), rel=1e-6)
+    assert_transpose(Projector(GEOMETRIES[name], Grid((6, 24, 24), 1.4)), rng, rel=1e-6)
 
 
 def test_the_bits_of_a_row_do_not_depend_on_the_slab(rng: np.random.Generator) -> None:

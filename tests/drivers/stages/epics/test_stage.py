@@ -86,16 +86,6 @@ def test_a_limit_switch_ends_the_move_with_its_name() -> None:
         stage.wait(60)
 
 
-def test_a_stop_by_another_client_is_not_taken_for_done() -> None:
-    record, url, clock = _record()
-    stage = _stage(url, clock)
-    stage.start_move(math.radians(20), SPEED)
-    clock.sleep(1)
-    record.write(".STOP", 1)
-    with pytest.raises(DeviceError, match=r"stopped short of 20.*what stopped it"):
-        stage.wait(60)
-
-
 def test_a_controller_that_is_lost_is_never_taken_for_standing() -> None:
     record, url, clock = _record()
     stage = _stage(url, clock)
@@ -104,15 +94,6 @@ def test_a_controller_that_is_lost_is_never_taken_for_standing() -> None:
     for act in (stage.moving, stage.position, lambda: stage.wait(60)):
         with pytest.raises(DeviceError, match=r"RBV.*is not known"):
             act()
-
-
-def test_speed_and_acceleration_are_those_before_once_it_is_closed() -> None:
-    record, url, clock = _record()
-    stage = _stage(url, clock)
-    stage.start_move(math.radians(20), SPEED)
-    assert (record.state[".VELO"], record.state[".ACCL"]) == pytest.approx((10, 10 / 60))
-    stage.close()
-    assert (record.state[".VELO"], record.state[".ACCL"]) == (1.0, 0.2)
 
 
 def test_halt_stops_the_move_of_a_program_that_died() -> None:

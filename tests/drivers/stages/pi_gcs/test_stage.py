@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -28,16 +27,6 @@ def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
     described = stage.describe()
     assert "C-863.12" in str(described["identity"])
     assert (described["axis"], described["trigger_output"]) == ("1", "digital output 2")
-
-
-def test_opening_asks_who_it_is_switches_the_servo_on_and_the_trigger_off(rig: Rig) -> None:
-    rig.say("TRO 2 1")
-    rig.open()
-    assert rig.sent() == [
-        "*IDN?", "CSV?", "SAI?", "#5", "SPA? 1 0xE", "SPA? 1 0xF", "TRO 2 0", "TRO? 2", "SVO? 1", "SVO 1 1", "SVO? 1",
-        "VEL? 1", "SPA? 1 0xB", "ACC 1 60", "ACC? 1", "SPA? 1 0xC", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
-    ]  # fmt: skip
-    assert (rig.say("SVO?"), rig.say("TRO? 2")) == ("1=1", "2=0")
 
 
 def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) -> None:
@@ -97,12 +86,6 @@ def test_another_controller_on_the_port_is_named(rig: Rig, spoilt: tuple[bytes, 
     rig.open().close()
 
 
-def test_a_transcript_has_the_dialogue(rig: Rig, tmp_path: Path) -> None:
-    stage = rig.open(transcript=tmp_path / "wire.txt")
-    stage.close()
-    assert "ACC 1 60" in (tmp_path / "wire.txt").read_text()
-
-
 def test_where_acc_and_dec_are_missing_parameters_do() -> None:
     rig = Rig(wire={"unknown": {"ACC", "DEC"}})
     rig.open()
@@ -110,17 +93,6 @@ def test_where_acc_and_dec_are_missing_parameters_do() -> None:
 
 
 # moves and the reference
-
-
-def test_a_move_on_the_wire(rig: Rig) -> None:
-    stage = rig.open()
-    rig.sent()
-    stage.start_move(math.radians(10.5), math.radians(20))
-    assert rig.sent() == ["#5", "VEL 1 20", "VEL? 1", "MOV 1 10.5", "MOV? 1"]
-    stage.stop()
-    assert rig.sent()[:2] == ["HLT 1", "#5"]
-    stage.abort()
-    assert rig.sent() == ["#24"]
 
 
 def test_an_unreferenced_axis_does_not_move_until_it_has_searched() -> None:
@@ -205,15 +177,6 @@ def test_a_motion_error_is_named_with_where_it_stands_and_no_move_follows_before
     stage = rig.open()
     stage.start_move(math.radians(5), SPEED)
     stage.wait(LONG)
-
-
-def test_a_servo_that_is_switched_off_on_the_way_is_named(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_move(math.radians(30), SPEED)
-    rig.clock.sleep(1.0)
-    rig.say("SVO 1 0")
-    with pytest.raises(DeviceError, match=r"stopped short.*servo is off"):
-        stage.wait(LONG)
 
 
 @pytest.mark.parametrize(("degrees", "side"), [(30.0, "positive"), (-4.0, "negative")])

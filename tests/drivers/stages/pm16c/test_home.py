@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.errors import DeviceError
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.pm16c_rig import Rig
@@ -109,15 +109,6 @@ def test_a_switch_that_is_not_plugged_in_is_named_at_once() -> None:
     assert not stage.moving()
 
 
-def test_a_stop_button_during_the_search_is_named(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_home()
-    rig.clock.sleep(0.3)
-    rig.say("ASSTP")
-    with pytest.raises(DeviceError, match="stop command"):
-        stage.wait(LONG)
-
-
 def test_a_stop_button_after_the_switch_was_found_is_no_less_a_stop(rig: Rig) -> None:
     """Between the switch and where the search stands: the way back must not begin."""
     stage = rig.open()
@@ -161,13 +152,3 @@ def test_a_move_after_a_search_that_failed_is_a_move(rig: Rig) -> None:
 
 
 # what gets lost
-
-
-def test_a_silent_line_during_the_search_says_that_the_stage_may_be_turning() -> None:
-    silent: set[int] = set()
-    rig = Rig(home_at=SWITCH, silent=silent)
-    stage = rig.open()
-    stage.start_home()
-    silent.update(range(10_000))
-    with pytest.raises(DeviceTimeout, match="may be turning"):
-        stage.wait(LONG)

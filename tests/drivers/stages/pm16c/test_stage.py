@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 
@@ -115,12 +114,6 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(rig: Rig) -> None
         with pytest.raises(ValueError, match=r"no pulses of|has one polarity|pulse_width is nan"):
             rig.open(**settings)
     assert rig.controller.queries == 0
-
-
-def test_the_transcript_holds_the_opening(rig: Rig, tmp_path: Path) -> None:
-    rig.open(transcript=tmp_path / "line.txt").close()
-    text = (tmp_path / "line.txt").read_text()
-    assert text.index(r"> b'VER?\r\n'") < text.index("PM16C-04XDL-SIMULATED") < text.index(r"> b'LOC\r\n'")
 
 
 def test_a_setting_that_another_program_took_back_is_noticed(rig: Rig) -> None:

@@ -7,8 +7,6 @@ import re
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import RotationStage
@@ -113,20 +111,6 @@ def test_without_a_reference_it_does_not_move_until_it_has_searched_one() -> Non
     assert stage.wait(LONG) == 0.0
     stage.start_move(0.1, SPEED)
     assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("fault", "words"), [("stall_at", "stalled and stopped .FS."), ("switch_at", "limit error .FE.")]
-)
-def test_a_move_that_ends_early_says_where_and_why(fault: str, words: str) -> None:
-    stage = Rig(**{fault: 10_000}).open()
-    stage.start_move(math.radians(30), SPEED)
-    with pytest.raises(DeviceError, match=rf"30\.0000 deg.*stands at 10\.0000 deg.*{words}") as error:
-        stage.wait(LONG)
-    assert not isinstance(error.value, DeviceTimeout)
-    assert "Find" in error.value.advice
-    stage.start_move(0.0, SPEED)
-    assert stage.wait(LONG) == 0.0
 
 
 def test_a_driver_that_somebody_disabled_is_named(rig: Rig) -> None:
@@ -249,20 +233,9 @@ def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -
 # a disturbed line
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
-        (Fault.SILENT, "no whole reply within 1 s"),
-        (Fault.TRUNCATED, "no whole reply within 1 s"),
-        (Fault.WRONG_CHECKSUM, "damaged on the way: its checksum is"),
-        (Fault.NOISE, "does not have the form"),
-        (Fault.OTHER_ID, "does not have the form.*reply to message"),
-    ],
-)
-def test_an_unreadable_reply_is_named_and_the_next_request_is_in_step_again(fault: Fault, words: str) -> None:
-    rig = Rig(faults={REPLIES_TO_OPEN: fault})
-    stage = rig.open()
-    with pytest.raises(DeviceError, match=words):
+def test_the_reply_to_another_message_is_named_and_the_next_request_is_in_step_again() -> None:
+    stage = Rig(faults={REPLIES_TO_OPEN: Fault.OTHER_ID}).open()
+    with pytest.raises(DeviceError, match=r"does not have the form.*reply to message"):
         stage.position()
     assert stage.position() == 0.0
 
@@ -282,56 +255,9 @@ def test_a_device_that_asks_to_repeat_for_ever_is_named() -> None:
         stage.position()
 
 
-def test_alerts_may_come_at_any_time(rig: Rig) -> None:
-    rig.say("/1 0 set comm.alert 1")
-    stage = rig.open()
-    for _ in range(5):
-        rig.controller.alert()
-        assert stage.position() == 0.0
-    stage.start_move(0.1, SPEED)
-    rig.clock.sleep(30.0)
-    rig.controller.alert()
-    assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
-
-
-def test_an_echoing_line_is_understood() -> None:
-    assert Rig(echo=True).bench().go(5.0) == pytest.approx(5.0)
-
-
 def test_a_stop_that_got_lost_is_noticed(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(100), math.radians(1))
     rig.lose("stop")
     with pytest.raises(DeviceTimeout, match=r"still moving .*the stop command"):
         stage.stop()
-
-
-class Junk(Rig):
-    """A rig whose next replies are replaced by other bytes."""
-
-    instead: tuple[bytes, ...] = ()
-
-    def transmit(self) -> bytes:
-        data = super().transmit()
-        if data and self.instead:
-            data, self.instead = self.instead[0], self.instead[1:]
-        return data
-
-
-LINES = st.sampled_from(
-    [b"", b"@", b"@01 1 ", b"@01 1 16 OK IDLE -- ", b"!01 1 IDLE --\r\n", b"#01 1 x\r\n", b"/1 1\r\n"]
-)
-
-
-@given(LINES, st.binary(max_size=60), st.booleans())
-def test_whatever_comes_instead_of_a_reply_is_an_error_or_passed_over_and_never_a_position(
-    begin: bytes, junk: bytes, end: bool
-) -> None:
-    rig = Junk()
-    stage = rig.open()
-    stage.start_move(0.1, SPEED)
-    where = stage.wait(LONG)
-    rig.instead = (begin + junk + (b"\r\n" if end else b""),)
-    with pytest.raises(DeviceError):
-        stage.position()
-    assert stage.position() == where

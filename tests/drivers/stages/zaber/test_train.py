@@ -154,23 +154,6 @@ def test_latency_of_the_firmware_shifts_all_pulses_by_the_same_angle() -> None:
     assert counts_of(bench) == [count + 20 for count in points(train)]
 
 
-def test_pulse_times_are_those_of_the_closed_form() -> None:
-    bench = Rig().bench()
-    limits = bench.stage.limits
-    begun = bench.clock.now()
-    bench.stage.arm(bench.train(0.5, 0.5, 60))
-    bench.stage.start_move(math.radians(40), SPEED)
-    bench.stage.wait(LONG)
-    ramp = SPEED / limits.acceleration
-    for pulse in bench.pulses():
-        way = 0.5 * SPEED * ramp
-        expected = math.sqrt(2 * pulse.angle / limits.acceleration)
-        if pulse.angle > way:
-            expected = ramp + (pulse.angle - way) / SPEED
-        assert pulse.time - begun == pytest.approx(expected, rel=1e-4)
-    assert len(bench.pulses()) == 60
-
-
 def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle() -> None:
     rig = Rig()
     bench = rig.bench(toggle=True)
@@ -238,14 +221,6 @@ def test_an_odd_interval_cannot_be_toggled() -> None:
     bench = Rig().bench(toggle=True)
     with pytest.raises(DeviceRefused, match=r"cannot be emitted.*even"):
         bench.stage.arm(TriggerTrain(1000, 501, 3))
-
-
-def test_a_train_that_a_dead_program_left_behind_gives_nothing() -> None:
-    rig = Rig()
-    rig.say("/1 trigger 1 when 1 pos >= 100", "/1 trigger 1 action a io set do 1 t", "/1 trigger 1 enable")
-    bench = rig.bench()
-    bench.go(5.0)
-    assert bench.pulses() == []
 
 
 def test_closing_takes_an_armed_train_away() -> None:

@@ -10,7 +10,7 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.features.calibration.joint import GeometryChange, knowable
 from recon.features.calibration.learn import LearntGeometry, better, learn_geometry
-from tests.recon.features.calibration.bodies import balls
+from tests.recon.bodies import balls
 
 VIEWS, SHAPE = 60, (24, 48)
 BODY = balls(20, 24)

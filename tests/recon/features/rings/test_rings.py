@@ -30,10 +30,8 @@ COLS, ANGLES = 240, np.linspace(0, np.pi, 150, endpoint=False)
 F32 = NDArray[np.float32]
 
 
-@pytest.fixture(scope="module")
-def clean() -> F32:
+def noisy_disc(rng: np.random.Generator) -> F32:
     """Line integrals [view, col] of a disc with bodies in it, and the noise of 2e4 photons."""
-    rng = np.random.default_rng(4)
     bodies = [Cylinder(84.0, 8.0, 0.01)]
     for _ in range(15):
         x, y = rng.uniform(-0.6, 0.6, 2) * 84
@@ -41,6 +39,11 @@ def clean() -> F32:
     sample, detector = Phantom.of(tuple(bodies)), Detector((1, COLS), 1.0, 119.5, 0.0)
     lines = np.stack([sample.line_integrals(angle, detector) for angle in ANGLES])[:, 0]
     return (-np.log(rng.poisson(2e4 * np.exp(-lines)) / 2e4)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def clean() -> F32:
+    return noisy_disc(np.random.default_rng(4))
 
 
 @pytest.fixture(scope="module")

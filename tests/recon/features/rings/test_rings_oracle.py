@@ -14,17 +14,13 @@ from numpy.typing import NDArray
 
 import recon
 from recon.features.rings import REMOVERS, width_for
-from simulators.frame.shot import Detector
-from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Cylinder
+from tests.recon.features.rings.test_rings import ANGLES, COLS, noisy_disc
 from tests.recon.prep.real_views import tooth_views
 from tests.recon.prep.ring_score import ring_score
 
 theirs = pytest.importorskip("algotom.prep.removal")
 
 F32 = NDArray[np.float32]
-VIEWS, COLS = 150, 240
-ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
 KINDS = "none", "small", "strong", "wide", "dead"
 
 ERROR, RINGS = 1.15, 1.3
@@ -49,17 +45,6 @@ def _oracle(width: int) -> Mapping[str, tuple[Callable[[F32], F32], ...]]:
     }
 
 
-def _clean(rng: np.random.Generator) -> F32:
-    """Line integrals [view, col] of a disc with bodies in it, and the noise of 2e4 photons."""
-    bodies = [Cylinder(84.0, 8.0, 0.01)]
-    for _ in range(15):
-        x, y = rng.uniform(-0.6, 0.6, 2) * 84
-        bodies.append(Cylinder(float(rng.uniform(2, 12)), 8.0, float(rng.uniform(-0.01, 0.015)), centre=(x, y, 0.0)))
-    sample, detector = Phantom.of(tuple(bodies)), Detector((1, COLS), 1.0, (COLS - 1) / 2, 0.0)
-    lines = np.stack([sample.line_integrals(angle, detector) for angle in ANGLES])[:, 0]
-    return (-np.log(rng.poisson(2e4 * np.exp(-lines)) / 2e4)).astype(np.float32)
-
-
 def _striped(clean: F32, kind: str, rng: np.random.Generator) -> F32:
     out = clean.copy()
     match kind:
@@ -71,7 +56,7 @@ def _striped(clean: F32, kind: str, rng: np.random.Generator) -> F32:
             out[:, 148:151] += np.float32(0.1)
         case "dead":  # one does not answer, one flickers
             out[:, 80] = 0.3
-            out[:, 60] += rng.normal(0, 0.3, VIEWS).astype(np.float32)
+            out[:, 60] += rng.normal(0, 0.3, len(ANGLES)).astype(np.float32)
     return out
 
 
@@ -79,7 +64,7 @@ def _striped(clean: F32, kind: str, rng: np.random.Generator) -> F32:
 def _pairs(kind: str) -> list[tuple[F32, F32]]:
     """Three samples without and with the stripes."""
     samples = [np.random.default_rng(seed) for seed in (1, 2, 3)]
-    return [(clean := _clean(rng), _striped(clean, kind, rng)) for rng in samples]
+    return [(clean := noisy_disc(rng), _striped(clean, kind, rng)) for rng in samples]
 
 
 def _judged(found: F32, clean: F32) -> tuple[float, float]:

@@ -79,14 +79,14 @@ def test_lanes_that_nobody_wants_read_within_32_neighbours() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("level", [V3.environment, {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}])
 def test_picks_need_no_avx512(level: Mapping[str, str]) -> None:
-    """A processor without it, as numba is told by its environment; cones' laws are those of their own tests."""
+    """A processor without it, as numba is told by its environment; the other laws are those of their own tests."""
     environment = {**os.environ, **level, "NUMBA_CACHE_DIR": os.devnull}
     root = Path(__file__).parents[4]
     tests = [
         __file__,
         str(root / "tests/recon/voxels/test_projector.py"),
         "-k",
-        "pick or lanes or transpose or chords or matrix",
+        "pick or lanes or tiles or steps_of_any_length or single_slice_is",
     ]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", *tests],

@@ -41,7 +41,7 @@ def test_steps_whose_lists_were_too_short_are_repeated() -> None:
     found = []
     for settled in (True, False):  # settled: each step has long enough lists before the next one is queued
         state, problem = _start()
-        for step in range(5):
+        for step in range(3):
             fit.step(state, problem, SETTINGS, 0.5)
             if step == 0:
                 fit.settle(state)

@@ -25,7 +25,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.geometry import Geometry
 from recon.features.calibration.joint import knowable
-from tests.recon.features.calibration.bodies import balls
+from tests.recon.bodies import balls
 
 N, SHAPE, PITCH, AXIS = 48, (24, 48), 0.5, 23.9
 JUMP = np.outer(np.arange(N) >= 20, (2.5, -1.5))

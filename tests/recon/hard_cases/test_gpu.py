@@ -1,28 +1,73 @@
-"""Difficult data and parameters on the Triton kernels: far too bright, masked, of any size; see `on_gpu`."""
+"""What is hard for the Triton kernels alone: tiles, tables of footprints, their losses and parameters."""
 
 from __future__ import annotations
 
 import importlib
+import math
 
 import numpy as np
 import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
+from recon.kernels.cpu.footprints import KV, K, W
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm
 from recon.kernels.reference import projection_loss
 from recon.splatting import optimise as fit
 from recon.splatting.backend import backend_for
+from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from tests.recon.hard_cases.measure import STEP
-from tests.recon.hard_cases.on_gpu import DEVICE, quiet, some
-from tests.recon.helpers import run_steps
+from recon.splatting.splat import project
+from tests.recon.hard_cases.measure import STEP, WHOLE, bound, gradient_bound
+from tests.recon.hard_cases.on import at, gpu
+from tests.recon.helpers import as_leaves, run_steps
+from tests.recon.kernels.gpu.on_gpu import DEVICE
 
-engine = importlib.import_module("recon.kernels.gpu.engine")
-parameters = importlib.import_module("recon.kernels.gpu.parameters")
-pytestmark = pytest.mark.slow  # where the interpreter stands in; tests/recon/kernels/gpu is quick
+engine, images, parameters, tiles, voxels = (
+    importlib.import_module(f"recon.kernels.gpu.{name}")
+    for name in ("engine", "images", "parameters", "tiles", "voxels")
+)
+# where the interpreter stands in, which is numpy and warns of an infinity; tests/recon/kernels/gpu is quick
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
+ON = gpu()
+
+
+def test_on_the_borders_of_images_and_tiles() -> None:
+    sigma = 0.4
+    cols, rows = (-1.0, -0.5, 0.0, 7.5, 8.0, 12.0, 12.5, 13.0), (-1.0, 0.0, 7.5, 8.0, 10.0, 11.0)
+    found = ON.compare(at([(u, 0.0, v) for u in cols for v in rows], sigma), ON.view)
+    assert found.value < bound(ON.far, 0.7 * sigma)
+    assert found.worst < gradient_bound(ON.far, 0.7 * sigma), found.gradients
+
+
+@pytest.mark.parametrize("sigma", [1e-15, 1e-12, 1e12, 1e15])
+def test_factors_of_the_quadratic_form_keep_their_digits_at_any_width(sigma: float) -> None:
+    # The product of three widths of 1e-15 is no float32 number, and neither is the square of its inverse.
+    g = as_leaves(Gaussians.from_physical([[2.0, 0.0, 1.0]], [sigma], [0.8 / sigma]), DEVICE)
+    raw = (g.means, g.log_scales, g.quaternions, g.raw_densities)
+    run = engine.GpuPass(*(t.detach() for t in raw), g.density_unit)
+    seen = run.view(Geometry.parallel([0.0], (5, 9), pixel_pitch=1.0), 0, 1e-6, 3.5, RayModel())
+    table = seen.footprints.table[0].tolist()
+    np.testing.assert_allclose([table[k] * sigma**2 for k in (K, KV)], 1, rtol=1e-5)
+    assert table[W] == pytest.approx(0.8 * math.sqrt(2 * math.pi), rel=1e-5)
+    placed = run.box(Grid((5, 5, 5)), 1e-6 / sigma, 3.5).placed.table[0].tolist()
+    np.testing.assert_allclose([placed[k.value] * sigma**2 for k in (voxels.KX, voxels.KY, voxels.KZ)], 1, rtol=1e-5)
+
+
+def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+    # All alike, of a weight whose last digits a sum of more than 128 rounds away, each time; in one share, as in an
+    # image of many tiles.
+    monkeypatch.setattr(tiles, "PROGRAMS", 1)
+    groups, weight = 200, 1 + 0.9 * 2.0**-17
+    one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
+    pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)
+    shown = project(pile, Geometry.parallel([0.0], (1, 1), pixel_pitch=1.0), truncation=WHOLE, implementation="gpu")
+    off = abs(float(shown.detach()) / (groups * images._GROUP * weight) - 1)
+    assert off < 16 * STEP  # of it the weight's own: a dozen roundings
+    one_by_one = np.cumsum(np.full(groups, weight, np.float32), dtype=np.float32)[-1]
+    assert abs(float(one_by_one) / (groups * weight) - 1) > 32 * STEP
 
 
 def losses_of(
@@ -54,7 +99,6 @@ def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.r
     assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
-@quiet
 @pytest.mark.parametrize("term", [None, DataTerm(L2, 0.05, 1.0), DataTerm(POISSON, 0.02, 3.0)])
 def test_what_stands_in_a_pixel_of_no_weight_changes_no_bit(rng: np.random.Generator, term: DataTerm | None) -> None:
     target = rng.random((14, 18)).astype(np.float32)
@@ -69,7 +113,6 @@ def test_what_stands_in_a_pixel_of_no_weight_changes_no_bit(rng: np.random.Gener
     np.testing.assert_array_equal(same, gradient)
 
 
-@quiet
 def test_any_finite_parameters_give_finite_ones_and_gradients(rng: np.random.Generator) -> None:
     n = 400
     values = rng.choice([-1.0, 1.0], (n, 8)) * 2.0 ** rng.uniform(-140, 100, (n, 8))
@@ -113,7 +156,7 @@ def test_detectors_of_one_row_or_column_with_a_pixel_missing_are_the_cpus(
     for device in ("cpu", "cuda"):
         backend = backend_for(device)
         problem = fit.problem_of(data, views, flat, 0.7, settings, backend)
-        state = run_steps(fit.init(some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
+        state = run_steps(fit.init(ON.some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
         states.append({name: backend.numpy(values) for name, values in state.parameters.items()})
     for name, expected in states[0].items():
         np.testing.assert_allclose(states[1][name], expected, atol=2e-5 * float(np.abs(expected).max()), err_msg=name)
