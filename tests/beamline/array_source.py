@@ -13,6 +13,19 @@ from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 
+def counted(
+    views: NDArray[Any],
+    angles: NDArray[np.float64],
+    dark: float = 100.0,
+    beam: float = 20_000.0,
+    dtype: Any = np.uint16,
+) -> ArraySource:
+    """A dark, a flat and these views."""
+    references = [np.full((1, *views.shape[1:]), level) for level in (dark, dark + beam)]
+    keys = [2, 1] + [0] * len(views)
+    return ArraySource(np.concatenate([*references, views]).astype(dtype), keys, np.r_[np.nan, np.nan, angles])
+
+
 class ArraySource:
     """A ScanSource over arrays that notes what is read of it."""
 

@@ -81,6 +81,7 @@ def schedule(
 
 
 FIT = R2(seconds=2.0, gaussians=200)
+BRIEF = R2(seconds=0.3, gaussians=100)  # where nobody looks at the voxels
 
 
 def options(tmp_path: Path, **changes: object) -> ReconOptions:

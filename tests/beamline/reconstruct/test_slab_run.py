@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -53,14 +52,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
     assert left(folder) == {"scan.h5", "whole.h5"}
     return folder
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current directory, with the scan in it."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copyfile(made / "scan.h5", tmp_path / "scan.h5")
-    return tmp_path
 
 
 def parts_and_whole(made: Path) -> tuple[ReconRecord, ReconRecord]:
