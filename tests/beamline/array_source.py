@@ -13,17 +13,19 @@ from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 
-def counted(
-    views: NDArray[Any],
-    angles: NDArray[np.float64],
-    dark: float = 100.0,
-    beam: float = 20_000.0,
-    dtype: Any = np.uint16,
+def scan_of(
+    darks: NDArray[Any], flats: NDArray[Any], views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16
 ) -> ArraySource:
-    """A dark, a flat and these views."""
-    references = [np.full((1, *views.shape[1:]), level) for level in (dark, dark + beam)]
-    keys = [2, 1] + [0] * len(views)
-    return ArraySource(np.concatenate([*references, views]).astype(dtype), keys, np.r_[np.nan, np.nan, angles])
+    """Darks, flats and views [frame, row, col], of which the views have angles."""
+    frames, before = np.concatenate([darks, flats, views]), len(darks) + len(flats)
+    keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
+    return ArraySource(frames.astype(dtype), keys, np.r_[np.full(before, np.nan), angles])
+
+
+def counted(views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16) -> ArraySource:
+    """A dark of 100 counts, a flat of 20,000 more and these views."""
+    dark = np.full((1, *views.shape[1:]), 100.0)
+    return scan_of(dark, dark + 20_000, views, angles, dtype)
 
 
 class ArraySource:

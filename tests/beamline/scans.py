@@ -85,6 +85,16 @@ def write_exchange(path: Path, scan: TwoCylinders, changes: Mapping[str, Any] | 
     return path
 
 
+def write_nxtomo(path: Path, frames: NDArray[Any], keys: Any, degrees: Any) -> Path:
+    """Frames of these image keys and angles as NXtomo, as other systems write it."""
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"], detector["image_key"] = frames, keys
+        file["entry/sample/rotation_angle"] = degrees
+        file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+    return path
+
+
 def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -> list[Frame]:
     """Two darks, two flats, then the views, as a camera would give them."""
     return frames_through(scan.counts(), scan.angles, time=time, period=period)

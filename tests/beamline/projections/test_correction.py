@@ -19,7 +19,7 @@ from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
 from recon.prep.correct import Correction, merge_and_empty
-from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
 
@@ -122,7 +122,7 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     frames = np.concatenate([np.full((1, 4, 40), DARK), flats, counts])
     stripes = np.exp(0.1 * np.sin(rng.normal(0, 2, (len(frames), 1, 1)) + 1.5 * rows))
     data = rng.poisson((frames - DARK) * stripes * 20) / 20 + DARK
-    source = ArraySource(data.astype(np.float32), [2] + [1] * 12 + [0] * 45, np.r_[[np.nan] * 13, SCAN.angles])
+    source = scan_of(data[:1], data[1:13], data[13:], SCAN.angles, np.float32)
     errors = []
     for way in ("groups", "dynamic"):
         correction = correction_of(source, Selection(steps=(Preparation(flat_fields=way),)))
@@ -130,7 +130,7 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
     assert "components of their changes" in correction.done["flats"].sentence
-    few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
+    few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
         correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
 
@@ -140,7 +140,7 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     current = np.r_[np.nan, 80.0, 90.0, np.linspace(200, 150, 45)]
     light = np.concatenate([np.zeros((1, 4, 40)), np.full((2, 4, 40), BEAM), SCAN.counts() - DARK])
     data = DARK + light * np.nan_to_num(current)[:, None, None] / 180
-    source = ArraySource(data.astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
+    source = scan_of(data[:1], data[1:3], data[3:], SCAN.angles, np.float32)
     used = PLAIN.with_steps(Preparation(ring_current="use"))
     with pytest.raises(ConfigError, match="no ring current"):
         correction_of(source, used)

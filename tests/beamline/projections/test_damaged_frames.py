@@ -35,8 +35,9 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
     return path
 
 
-@pytest.mark.parametrize("rows", [None, (1, 4)], ids=["whole frames", "most of their rows"])
-@pytest.mark.parametrize("on_disk", [False, True])
+@pytest.mark.parametrize(
+    ("rows", "on_disk"), [(None, False), ((1, 4), True)], ids=["whole frames", "most of their rows, on disk"]
+)
 def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, on_disk: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
     buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7) if on_disk else None

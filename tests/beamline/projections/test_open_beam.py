@@ -18,7 +18,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.budget import binned
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders
 
@@ -32,11 +32,8 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
     """Darks, flats and views with so many photons a pixel in the open beam."""
     rng, shape = np.random.default_rng(3), SCAN.shape
     light = [np.zeros((n_darks, *shape)), np.full((n_flats, *shape), photons), photons * np.exp(-EXACT)]
-    counts = np.concatenate([DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light])
-    keys = [2] * n_darks + [1] * n_flats + [0] * len(EXACT)
-    angles = np.full(len(keys), np.nan)
-    angles[n_darks + n_flats :] = SCAN.angles
-    return ArraySource(counts.astype(np.float32), keys, angles)
+    counts = (DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light)
+    return scan_of(*counts, SCAN.angles, np.float32)
 
 
 def correction_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrection:

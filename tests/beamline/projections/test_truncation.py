@@ -13,7 +13,7 @@ from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import FieldEdges
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 
 VIEWS, SHAPE, MU = 90, (4, 64), 0.004
@@ -31,9 +31,8 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
     rng = np.random.default_rng(2)
     open_beam = np.full((5, *SHAPE), 40_000.0)
     counts = [rng.poisson(0 * open_beam), rng.poisson(open_beam), rng.poisson(40_000 * light * np.exp(-lines))]
-    data = (np.concatenate(counts) + rng.integers(99, 102, (VIEWS + 10, *SHAPE))).clip(0, 65535)
-    keys, angles = [2] * 5 + [1] * 5 + [0] * VIEWS, np.concatenate([np.full(10, np.nan), ANGLES])
-    return ArraySource(data.astype(np.uint16), keys, angles)
+    read = ((each + rng.integers(99, 102, each.shape)).clip(0, 65535) for each in counts)
+    return scan_of(*read, ANGLES)
 
 
 @pytest.mark.parametrize("radius", [45.0, 90.0, 180.0])

@@ -35,7 +35,7 @@ def scan(unlit: list[int], value: float | None, scale: float = 1.0) -> ArraySour
     st.lists(st.integers(0, VIEWS - 1), min_size=1, max_size=VIEWS // 2, unique=True),
     st.sampled_from((None, 0.0, 65535.0, 100.0)),
 )
-@settings(deadline=None, max_examples=12)
+@settings(deadline=None, max_examples=8)
 def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | None) -> None:
     found, told = prepare(scan(unlit, value), SELECTION)
     lit = np.setdiff1d(np.arange(VIEWS), unlit)

@@ -43,6 +43,7 @@ from tests.beamline.reconstruct.growing_scan import (
     SCAN,
     ScanClock,
     StandingClock,
+    alarms,
     close,
     options,
     schedule,
@@ -152,7 +153,7 @@ def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: P
 
 def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
     clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms={12})
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(12))
     selection = Selection("every:2", axis_col=SCAN.axis_col)
     reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), [].append, clock)
     n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])

@@ -39,6 +39,7 @@ from tests.beamline.reconstruct.growing_scan import (
     SCAN,
     TICK,
     ScanClock,
+    alarms,
     close,
     options,
     schedule,
@@ -65,12 +66,12 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> list[PreparedProjections]:
 
 @pytest.mark.parametrize("use_flags", others_slow([True, False]))
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
-    clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
+    clock, events, bad = ScanClock(), list[Event](), range(11, 16)
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(*bad))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
     reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), events.append, clock)
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
-    assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
+    assert set(parameters["view_frames"]) == set(range(4, 34)) - set(bad if use_flags else ())  # type: ignore[arg-type]
     assert parameters["views_left_out"] == 5 * use_flags
     assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
@@ -82,7 +83,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     frames = frames_of(INTERLACED)
     frames.append(replace(frames[12], index=34, replaces=12, time=frames[33].time + 1))
     frames[12] = replace(frames[12], counts=frames[12].counts // 40)
-    schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
+    schedule(clock, tmp_path / "scan.h5", frames, flags=alarms(12))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
     metrics = reconstruct_file(options(tmp_path, selection=selection), events.append, clock).metrics
     record = read_reconstruction(tmp_path / "recon.h5")

@@ -75,9 +75,16 @@ def error(found: PreparedProjections, axes: np.ndarray = AXES) -> float:
     return float(np.linalg.norm(made - truth) / np.linalg.norm(truth))
 
 
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scan of these poses."""
+    return scan(tmp_path_factory.mktemp("posed"), posed())
+
+
 @pytest.mark.parametrize("by", others_slow(["view", "frame", "angle_deg"]))
-def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(tmp_path: Path, by: str) -> None:
-    path = scan(tmp_path, posed())
+def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(
+    path: Path, tmp_path: Path, by: str
+) -> None:
     found = prepared(path, every(tmp_path, by))
     plain, _ = prepare(path, Selection(axis_col=AXIS, steps=(Air("none"),)))
     for name in ("angles", "shifts", "roll", "tilt"):
@@ -115,9 +122,8 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     assert found.done["poses"].sentence == f"Vectors of 40 views from {text} state the geometry."
 
 
-def test_vectors_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
-    path, cone = scan(tmp_path, posed()), vectors_of(free(cone=True))
-    columns = f"view,{VECTOR_COLUMNS.format('src')}"
+def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
+    columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
     file = table(tmp_path, columns, np.arange(N), *cone.T)
     with pytest.raises(ConfigError, match=r"of a cone, and .* give --cone 10(\.\d+)?:15\."):
         prepared(path, file, axis_col=None)
@@ -193,16 +199,11 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
     assert found.axis_col == pytest.approx(AXIS, abs=0.15)
 
 
-def test_poses_of_all_views_are_not_needed_where_some_are_chosen(tmp_path: Path) -> None:
-    path = scan(tmp_path, posed())
-    some = table(tmp_path, f"view,{COLUMNS}", *(column[::2] for column in (np.arange(N), *SHIFTS.T, *TURNS.T)))
+def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
+    head, columns = f"view,{COLUMNS}", (np.arange(N), *SHIFTS.T, *TURNS.T)
     with pytest.raises(DataError, match=r"of 20 of.*frame 5, at 31.5 degrees.*--views"):
-        prepared(path, some)
-    found = prepared(
-        path,
-        table(tmp_path, f"view,{COLUMNS}", *(c[:30] for c in (np.arange(N), *SHIFTS.T, *TURNS.T))),
-        views="first:20",
-    )
+        prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
+    found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
     assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out[1].n_views <= 10
 
 
@@ -233,8 +234,8 @@ def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, 
         read_poses(str(tmp_path / "none.csv"))
 
 
-def test_poses_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
-    path, views = scan(tmp_path, posed()), np.arange(N)
+def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
+    views = np.arange(N)
     for head, columns, match in (
         ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
         ("view,shift_col_px", (views, np.full(N, 41.0)), "view 0 is displaced by 41 columns and 0 rows"),
