@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from beamline.core.durations import Phases
 from beamline.core.events import Event
-from beamline.core.phases import Phases
 from tests.clock import SteppedClock
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from beamline.simulate.labels import LabelledRun
+from beamline.simulate import LabelledRun
 
 
 def read_labels(path: Path) -> tuple[LabelledRun, ...]:

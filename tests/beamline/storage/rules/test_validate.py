@@ -18,8 +18,8 @@ from beamline.core.text import spans
 from beamline.features.files.validate import describe, source_findings, validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_spread, half_turn_unseen
-from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.scan import change_of_rows
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind

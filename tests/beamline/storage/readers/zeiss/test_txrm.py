@@ -20,7 +20,7 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
 from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, TwoCylinders
