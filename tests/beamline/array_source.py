@@ -13,6 +13,21 @@ from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 
+def scan_of(
+    darks: NDArray[Any], flats: NDArray[Any], views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16
+) -> ArraySource:
+    """Darks, flats and views [frame, row, col], of which the views have angles."""
+    frames, before = np.concatenate([darks, flats, views]), len(darks) + len(flats)
+    keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
+    return ArraySource(frames.astype(dtype), keys, np.r_[np.full(before, np.nan), angles])
+
+
+def counted(views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.uint16) -> ArraySource:
+    """A dark of 100 counts, a flat of 20,000 more and these views."""
+    dark = np.full((1, *views.shape[1:]), 100.0)
+    return scan_of(dark, dark + 20_000, views, angles, dtype)
+
+
 class ArraySource:
     """A ScanSource over arrays that notes what is read of it."""
 

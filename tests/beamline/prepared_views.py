@@ -1,15 +1,30 @@
-"""Prepared projections made of line integrals, for tests of what follows the correction."""
+"""Prepared projections: of a scan as a reconstruction prepares it, or made of line integrals."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from recon.prep.correct import Projections
+
+
+def prepare(
+    scan: Any, selection: Selection, buffer: DiskBuffer | None = None, **opened: Any
+) -> tuple[PreparedProjections, list[str]]:
+    """The views of a source, or of a file that is `opened` so; and what was told of them."""
+    told: list[str] = []
+    with ExitStack() as until:
+        source = until.enter_context(SourceOptions(scan, **opened).open()) if isinstance(scan, Path) else scan
+        return prepare_projections(source, selection, told.append, buffer), told
 
 
 def prepared_views(

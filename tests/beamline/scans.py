@@ -85,17 +85,34 @@ def write_exchange(path: Path, scan: TwoCylinders, changes: Mapping[str, Any] | 
     return path
 
 
+def write_nxtomo(path: Path, frames: NDArray[Any], keys: Any, degrees: Any) -> Path:
+    """Frames of these image keys and angles as NXtomo, as other systems write it."""
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"], detector["image_key"] = frames, keys
+        file["entry/sample/rotation_angle"] = degrees
+        file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+    return path
+
+
 def frames_of(scan: TwoCylinders, *, time: float = 1.8e9, period: float = 0.1) -> list[Frame]:
     """Two darks, two flats, then the views, as a camera would give them."""
-    last = np.zeros(scan.shape)
+    return frames_through(scan.counts(), scan.angles, time=time, period=period)
+
+
+def frames_through(
+    counts: NDArray[Any], angles: NDArray[np.float64], *, beam: float = BEAM, time: float = 1.8e9, period: float = 0.1
+) -> list[Frame]:
+    """Two darks, two flats, then these views [view, row, col]."""
+    last = np.zeros(counts.shape[1:])
     last[-1, -1] = 1.0  # no camera takes the same image twice
-    images = [np.full(scan.shape, level) + bump for level in (DARK, DARK + BEAM) for bump in (0.0, last)]
-    images += list(scan.counts())
-    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * scan.angles.size
-    angles = [np.nan] * 4 + scan.angles.tolist()
+    images = [np.full(last.shape, level) + bump for level in (DARK, DARK + beam) for bump in (0.0, last)]
+    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * len(counts)
     return [
-        Frame(image.astype(np.uint16), kind, i, i, i, angle, time + period * i, 0.05)
-        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True))
+        Frame(image.round().astype(np.uint16), kind, i, i, i, angle, time + period * i, 0.05)
+        for i, (image, kind, angle) in enumerate(
+            zip([*images, *counts], kinds, [np.nan] * 4 + angles.tolist(), strict=True)
+        )
     ]
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from drivers.base.frame import FrameKind
-from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp
 from tests.beamline.array_source import ArraySource
+from tests.beamline.prepared_views import prepare
 
 SHAPE, VIEWS, AXIS = (12, 48), 45, 23.5
 DARK, BEAM, READOUT = 100.0, 30_000.0, 2.0  # counts
@@ -79,11 +78,6 @@ class Blocks:
 
 def decibels(source: ArraySource, scale: float = 1.0) -> tuple[float, list[str]]:
     """Peak signal over error of FBP as a reconstruction makes it, and what was told."""
-    told: list[str] = []
-    found = prepare_projections(source, Selection(axis_col=AXIS), told.append)  # type: ignore[arg-type]
-    return decibels_of(found.projections.data, found.geometry, scale), told
-
-
-def decibels_of(lines: NDArray[np.float32], geometry: Geometry, scale: float = 1.0) -> float:
-    right = truth(scale)
-    return float(20 * np.log10(right.max() / np.sqrt(np.mean((fbp(lines, geometry, filter="hann") - right) ** 2))))
+    found, told = prepare(source, Selection(axis_col=AXIS))
+    right, made = truth(scale), fbp(found.projections.data, found.geometry, filter="hann")
+    return float(20 * np.log10(right.max() / np.sqrt(np.mean((made - right) ** 2)))), told

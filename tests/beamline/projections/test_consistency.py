@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from beamline.projections.consistency import warn_of_inconsistency
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import ArraySource
+from tests.beamline.prepared_views import prepare
 from tests.recon.prep.balls import Balls
 
 ANGLES, AXIS = np.linspace(0, np.pi, 45, endpoint=False), 36.8
@@ -24,8 +24,8 @@ VIEWS = Balls(ANGLES, (24, 72), AXIS).views() + np.random.default_rng(3).normal(
 def stretched() -> tuple[PreparedProjections, list[str]]:
     """The scan, stated at angles 1.06 times as large, as it is prepared, and what was told of it."""
     source = ArraySource(VIEWS.astype(np.float32), [0] * len(VIEWS), ANGLES * 1.06)
-    source.quantity, sentences = "line_integrals", list[str]()
-    return prepare_projections(source, Selection(axis_col=AXIS), sentences.append), sentences  # type: ignore[arg-type]
+    source.quantity = "line_integrals"
+    return prepare(source, Selection(axis_col=AXIS))
 
 
 def told(views: np.ndarray, axis_col: float = AXIS, angles: np.ndarray = ANGLES) -> list[str]:
@@ -37,16 +37,12 @@ def told(views: np.ndarray, axis_col: float = AXIS, angles: np.ndarray = ANGLES)
     return sentences
 
 
-def test_a_right_scan_is_not_told_of() -> None:
-    assert told(VIEWS) == []
+def test_a_right_scan_is_not_told_of_nor_one_whose_air_is_not_at_zero_and_has_moments_of_its_own() -> None:
+    assert told(VIEWS) == told(VIEWS - 0.5, angles=ANGLES * 1.06) == []
 
 
 def test_every_scan_is_looked_at() -> None:
     assert any("stated to turn by 186.6" in sentence for sentence in stretched()[1])
-
-
-def test_air_that_is_not_at_zero_has_moments_of_its_own() -> None:
-    assert told(VIEWS - 0.5, angles=ANGLES * 1.06) == []
 
 
 @pytest.mark.parametrize("scale", [0.95, 1.06])

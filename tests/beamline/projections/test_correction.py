@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,44 +19,40 @@ from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
 from recon.prep.correct import Correction, merge_and_empty
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
+PLAIN = Selection(steps=(Air("none"),))
+
+
+def correction_of(source: Any, selection: Selection, warn: Callable[[str], object] = pytest.fail) -> ScanCorrection:
+    return ScanCorrection(source, selection, warn)
 
 
 def test_only_what_was_asked_for_is_read() -> None:
-    counts = SCAN.counts()
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
-    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, steps=(Air("none"),))
-    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
-    correction.at_once(np.arange(2, 7))
+    source = counted(SCAN.counts(), SCAN.angles)
+    correction_of(source, replace(PLAIN, views="first:5", rows=(1, 3), axis_col=20.7)).at_once(np.arange(2, 7))
     assert max(len(frames) for frames, rows in source.was_read if rows == 4) == 1  # whole frames, to judge references
     assert [frames for frames, rows in source.was_read if min(frames) >= 2 and rows == 2] == [[2, 3, 4, 5, 6]]
 
 
 def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()])
-    source = ArraySource(data.astype(np.uint16), [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
     told: list[tuple[int, int]] = []
-    read, transmission = read_binned, Correction.transmission
     after = dict[str, int]()  # how many were told when a step had ended
 
-    def reading(*arguments: Any) -> Any:
-        found = read(*arguments)
-        after["reading"] = told[-1][0] if told else 0
-        return found
+    def noted(step: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        def done(*arguments: Any) -> Any:
+            found = work(*arguments)
+            after[step] = told[-1][0] if told else 0
+            return found
 
-    def dividing(*arguments: Any) -> Any:
-        found = transmission(*arguments)
-        after["dividing"] = told[-1][0] if told else 0
-        return found
+        return done
 
-    correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
-    monkeypatch.setattr(module, "read_binned", reading)
-    monkeypatch.setattr(Correction, "transmission", dividing)
+    correction = correction_of(counted(SCAN.counts(), SCAN.angles), Selection())
+    monkeypatch.setattr(module, "read_binned", noted("reading", read_binned))
+    monkeypatch.setattr(Correction, "transmission", noted("dividing", Correction.transmission))
     correction.at_once(np.arange(2, 47), progress=lambda n, of: told.append((n, of)))
     assert after == {"reading": 15, "dividing": 30} and told == sorted(told) and told[-1] == (45, 45)
 
@@ -63,11 +61,7 @@ def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pyt
 @pytest.mark.parametrize("sizes", others_slow([[45], [7, 20, 18], [1] * 45, [32, 13]], 2))
 @pytest.mark.parametrize("ended", ["with the last batch", "later"])
 def test_batches_are_the_views_at_once_also_where_the_end_comes_later(sizes: list[int], air: str, ended: str) -> None:
-    counts = SCAN.counts()
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
-    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    selection = Selection(steps=(Air(air),))
-    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    correction = correction_of(counted(SCAN.counts(), SCAN.angles), Selection(steps=(Air(air),)))
     ends = np.cumsum([2, *sizes])
     batches = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
     fed = [correction.feed(batch, last=ended != "later" and batch[-1] == 46) for batch in batches]
@@ -99,9 +93,8 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     data = rng.poisson(DARK + light[:, None, None] * np.ones((1, 20, 80))).astype(np.uint16)
     source, said = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size)), list[str]()
     source.part_starts = np.array([0, len(first)])
-    selection = Selection(steps=(Air("none"),))
     views = np.flatnonzero(keys == 0)
-    found = ScanCorrection(source, selection, said.append).at_once(views)  # type: ignore[arg-type]
+    found = correction_of(source, PLAIN, said.append).at_once(views)
     truth = np.full(views.size, 0.5)
     if flats == "the second without flats":
         truth[9:] *= left  # by the beam of the first
@@ -115,7 +108,7 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
 def test_line_integrals_need_no_neighbour() -> None:
     source = ArraySource(SCAN.counts().astype(np.float32), [0] * 45, SCAN.angles)
     source.quantity = "line_integrals"
-    correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
+    correction = correction_of(source, Selection())
     parts = [correction.feed(np.arange(0, 20), last=False), correction.feed(np.arange(20, 45), last=False)]
     assert correction.feed(np.arange(0), last=True) is None and not correction.outdated
     whole = merge_and_empty([part for part in parts if part is not None])
@@ -129,41 +122,38 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     frames = np.concatenate([np.full((1, 4, 40), DARK), flats, counts])
     stripes = np.exp(0.1 * np.sin(rng.normal(0, 2, (len(frames), 1, 1)) + 1.5 * rows))
     data = rng.poisson((frames - DARK) * stripes * 20) / 20 + DARK
-    source = ArraySource(data.astype(np.float32), [2] + [1] * 12 + [0] * 45, np.r_[[np.nan] * 13, SCAN.angles])
+    source = scan_of(data[:1], data[1:13], data[13:], SCAN.angles, np.float32)
     errors = []
     for way in ("groups", "dynamic"):
-        correction = ScanCorrection(source, Selection(steps=(Preparation(flat_fields=way),)), pytest.fail)  # type: ignore[arg-type]
+        correction = correction_of(source, Selection(steps=(Preparation(flat_fields=way),)))
         assert bool(correction.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
     assert "components of their changes" in correction.done["flats"].sentence
-    few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
+    few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
-        ScanCorrection(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)  # type: ignore[arg-type]
+        correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
 
 
 def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     """Without air columns; flats, which are dimmer by their own current, are scaled as well."""
     current = np.r_[np.nan, 80.0, 90.0, np.linspace(200, 150, 45)]
-    counts = SCAN.counts().astype(np.float64) - DARK
-    data = (
-        np.concatenate([np.zeros((1, 4, 40)), np.full((2, 4, 40), BEAM), counts])
-        * np.nan_to_num(current)[:, None, None]
-    )
-    source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
-    none = Selection(steps=(Air("none"),))
+    light = np.concatenate([np.zeros((1, 4, 40)), np.full((2, 4, 40), BEAM), SCAN.counts() - DARK])
+    data = DARK + light * np.nan_to_num(current)[:, None, None] / 180
+    source = scan_of(data[:1], data[1:3], data[3:], SCAN.angles, np.float32)
+    used = PLAIN.with_steps(Preparation(ring_current="use"))
     with pytest.raises(ConfigError, match="no ring current"):
-        ScanCorrection(source, none.with_steps(Preparation(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        correction_of(source, used)
     source.currents = current
     off = []
-    for selection in (none, none.with_steps(Preparation(ring_current="use"))):
-        correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    for selection in (PLAIN, used):
+        correction = correction_of(source, selection)
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
     assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="views or flats"):
-        ScanCorrection(source, none.with_steps(Preparation(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        correction_of(source, used)
 
 
 BIAS, GLOW = 100.0, 20_000.0  # counts, and counts a second of dark current
@@ -180,24 +170,19 @@ def _exposed(dark: list[float], flat: float, views: np.ndarray, glow: float = GL
 
 
 @pytest.mark.parametrize(
-    ("dark", "flat", "views"),
+    ("dark", "flat"),
     [
-        ([0.2, 0.05], 0.05, np.full(45, 0.2)),  # each has darks of its own exposure
-        ([0.4, 0.1], 0.05, np.full(45, 0.2)),  # two exposures tell that of any other
-        ([0.05, 0.1, 0.2], 0.1, np.full(45, 0.2)),
+        ([0.2, 0.05], 0.05),  # each has darks of its own exposure
+        ([0.4, 0.1], 0.05),  # two exposures tell that of any other
+        ([0.05, 0.1, 0.2], 0.1),
     ],
 )
-@pytest.mark.parametrize("way", ["at once", "in batches"])
-def test_darks_are_dealt_by_exposure(dark: list[float], flat: float, views: np.ndarray, way: str) -> None:
-    source = _exposed(dark, flat, views)
-    frames, none = np.flatnonzero(source.image_key == 0), Selection(steps=(Air("none"),))
-    correction = ScanCorrection(source, none, pytest.fail)  # type: ignore[arg-type]
-    if way == "in batches":
-        out = np.empty((45, 4, 40), np.float32)
-        found = correction.in_batches(frames, out, 7, lambda n, of: None).data
-    else:
-        found = correction.at_once(frames).data
-    np.testing.assert_allclose(found, SCAN.line_integrals(), atol=3e-3)
+def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
+    source = _exposed(dark, flat, np.full(45, 0.2))
+    frames, correction = np.flatnonzero(source.image_key == 0), correction_of(source, PLAIN)
+    batches = correction.in_batches(frames, np.empty((45, 4, 40), np.float32), 7, lambda n, of: None)
+    for found in (correction.at_once(frames), batches):
+        np.testing.assert_allclose(found.data, SCAN.line_integrals(), atol=3e-3)
     assert not list(references_usable(source))  # type: ignore[arg-type]
 
 
@@ -205,7 +190,7 @@ def test_darks_are_dealt_by_exposure(dark: list[float], flat: float, views: np.n
 def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     views = 0.2 + 0.1 * np.sin(2 * SCAN.angles)
     source = _exposed([0.2], flat, views, glow=0.0)
-    correction = ScanCorrection(source, Selection(steps=(Air("none"),)), pytest.fail)  # type: ignore[arg-type]
+    correction = correction_of(source, PLAIN)
     found = correction.at_once(np.flatnonzero(source.image_key == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
     assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -12,16 +12,17 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import DiskBuffer, prepare_projections
-from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import PrepStep
+from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
+IGNORE = SELECTION.with_steps(Preparation("ignore"))
 DARKS, FLATS, VIEWS = (0, 1), (2, 3), 4  # rows of the file
 
 
@@ -34,25 +35,13 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
     return path
 
 
-def prepare(
-    path: Path, *steps: PrepStep, buffer: DiskBuffer | None = None, **chosen: Any
-) -> tuple[PreparedProjections, list[str]]:
-    told: list[str] = []
-    selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"), *steps), **chosen)
-    with open_scan(path) as source:
-        return prepare_projections(source, selection, told.append, buffer), told
-
-
-def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
-    assert prepare(scan(tmp_path))[1] == []
-
-
-@pytest.mark.parametrize("rows", [None, (1, 4)], ids=["whole frames", "most of their rows"])
-@pytest.mark.parametrize("on_disk", [False, True])
+@pytest.mark.parametrize(
+    ("rows", "on_disk"), [(None, False), ((1, 4), True)], ids=["whole frames", "most of their rows, on disk"]
+)
 def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, on_disk: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
     buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7) if on_disk else None
-    prepared, told = prepare(path, buffer=buffer, rows=rows)
+    prepared, told = prepare(path, replace(SELECTION, rows=rows), buffer)
     np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
     said = " ".join(told)
     assert ("Frames 9 " in said and "Frames 20-21 " in said) if on_disk else "Frames 9, 20-21 " in said
@@ -60,15 +49,16 @@ def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, i
 
 
 def test_flags_ignore_uses_them_and_says_so(tmp_path: Path) -> None:
-    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), Preparation("ignore"))
+    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), IGNORE)
     assert prepared.projections.view_ids.size == 45
     assert "Frames 9 differ from their checksums" in said and "used as they are" in said
 
 
 def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
-    good, _ = prepare(scan(tmp_path))
+    good, told = prepare(scan(tmp_path), SELECTION)
+    assert told == []
     (tmp_path / "scan.h5").unlink()
-    spoilt, told = prepare(scan(tmp_path, 1, 3))
+    spoilt, told = prepare(scan(tmp_path, 1, 3), SELECTION)
     assert "Frames 1, 3 " in told[0] and "left out" in told[0]
     # One count is in the last pixel of the good second flat: 1/20000 of the light, half of it in the mean.
     np.testing.assert_allclose(spoilt.projections.data, good.projections.data, atol=1e-4)
@@ -78,8 +68,8 @@ def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
 def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple[int, int], kind: str) -> None:
     path = scan(tmp_path, *rows, bit=0)
     with pytest.raises(DataError, match=f"all {kind} are damaged"):
-        prepare(path)
-    assert prepare(path, Preparation("ignore"))[0].projections.view_ids.size == 45
+        prepare(path, SELECTION)
+    assert prepare(path, IGNORE)[0].projections.view_ids.size == 45
 
 
 def test_rows_count_on_behind_references_that_were_given(tmp_path: Path) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import scan_of
+from tests.beamline.prepared_views import prepare
 
 ROWS, COLS, VIEWS, AXIS = 8, 64, 60, 33.0
 
@@ -24,12 +24,11 @@ def told(selection: Selection, copies: tuple[int, ...] = ()) -> list[str]:
     for x, y, radius, mu in ((0, 0, 22, 0.01), (9, 5, 6, 0.04)):
         at = (x * np.cos(angles) + y * np.sin(angles))[:, None, None]
         depth += 2 * mu * np.sqrt((radius**2 - (col - at) ** 2 - row[:, None] ** 2).clip(0))
-    light = np.concatenate([np.zeros((3, ROWS, COLS)), np.ones((3, ROWS, COLS)), np.exp(-depth)])
-    frames = rng.poisson(3e4 * light + 100).astype(np.uint16)
+    light = np.zeros((3, ROWS, COLS)), np.ones((3, ROWS, COLS)), np.exp(-depth)
+    darks, flats, views = (rng.poisson(3e4 * each + 100) for each in light)
     for view in copies:
-        frames[6 + view] = frames[5 + view]
-    source, sentences = ArraySource(frames, [2] * 3 + [1] * 3 + [0] * VIEWS, np.r_[np.full(6, np.nan), angles]), []
-    prepare_projections(source, selection, sentences.append)  # type: ignore[arg-type]
+        views[view] = views[view - 1]
+    _, sentences = prepare(scan_of(darks, flats, views, angles), selection)
     return [sentence for sentence in sentences if "mirror images" in sentence or "view before" in sentence]
 
 

@@ -8,11 +8,8 @@ import pytest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
-from beamline.report.sheets import contact_sheet
 from beamline.storage.flag_legend import TODAY, FrameFlags, mark_of
 from tests.beamline.array_source import ArraySource
-
-pytestmark = pytest.mark.usefixtures("real_pictures")
 
 ONE, TWO = CHECKS[0].name, CHECKS[1].name
 REGION = (1, 3, 40, 90)
@@ -65,14 +62,6 @@ def test_a_view_that_was_taken_again_names_the_new_one() -> None:
 def test_nothing_is_shown_where_nothing_is_flagged() -> None:
     empty = FrameFlags.of_marks([mark_of(())] * 30)
     assert (reasons(empty), worst_frames(source(), empty)) == ([], [])  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("n", [1, 4, 5])
-def test_the_sheet_is_a_picture(n: int) -> None:
-    found = worst_frames(source(), flags(), n)  # type: ignore[arg-type]
-    assert len(found) == n
-    png = contact_sheet(found)
-    assert png.startswith(b"\x89PNG") and len(png) > 5000
 
 
 def test_means_of_darks_and_flats_and_how_the_beam_changed() -> None:

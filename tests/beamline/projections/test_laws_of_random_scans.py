@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.prepared_views import prepare
 from tests.recon.prep.balls import Balls
 from tests.slow_cases import others_slow
 
@@ -31,18 +31,14 @@ def random_scan(seed: int, angles_of: object = None, factor_of: object = None) -
     order = rng.permutation(n) if rng.random() < 0.2 else np.arange(n)
     beam, start = np.ones((8, *shape)), light[0]
     counts = [rng.poisson(0 * beam), rng.poisson(start * beam), rng.poisson(light * np.exp(-lines[order]))]
-    data = np.concatenate(counts) + rng.normal(100, 1.5, (n + 16, *shape))
-    keys = [2] * 8 + [1] * 8 + [0] * n
-    scan = ArraySource(
-        np.clip(np.round(data), 0, 65535).astype(np.uint16), keys, np.concatenate([np.full(16, np.nan), angles[order]])
-    )
+    read = (np.clip(np.round(each + rng.normal(100, 1.5, each.shape)), 0, 65535) for each in counts)
+    scan = scan_of(*read, angles[order])
     scan.axis_col = axis_col
     return scan
 
 
 def told(scan: ArraySource) -> list[str]:
-    sentences: list[str] = []
-    prepare_projections(scan, Selection(axis_col=scan.axis_col), sentences.append)  # type: ignore[arg-type]
+    _, sentences = prepare(scan, Selection(axis_col=scan.axis_col))
     return [sentence for sentence in sentences if any(law in sentence for law in LAWS)]
 
 

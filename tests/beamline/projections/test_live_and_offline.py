@@ -120,9 +120,7 @@ def record(scan: Troubled, path: Path, preview_bin: int, pauses: tuple[float, ..
             time.sleep(pauses[-frame.index % len(pauses)] if pauses else 0.0)
         recorder.finish()
     warnings = [event.message for event in events if isinstance(event, Warned)]
-    assert not [
-        text for text in warnings if "is being rehearsed" not in text
-    ]  # no check failed; a busy machine is slow
+    assert all("is being rehearsed" in text for text in warnings)  # no check failed; a busy machine is slow
     return found
 
 
@@ -132,10 +130,12 @@ def the_same(found: list[Flag], path: Path) -> None:
         judged = [each.flags for each in replay(source)]
         written, again = source.flags, FrameFlags.of_flags(judged)
     assert list(chain.from_iterable(judged)) == found
-    assert written is not None and written.scores is not None and written.regions is not None
-    np.testing.assert_array_equal(again.bits, written.bits)
-    np.testing.assert_array_equal(again.scores, written.scores)
-    np.testing.assert_array_equal(again.regions, written.regions)
+    assert_equal(again, written)
+
+
+def assert_equal(again: FrameFlags, written: FrameFlags | None) -> None:
+    for name in ("bits", "scores", "regions"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(written, name))
 
 
 @settings(max_examples=5, deadline=None)
@@ -163,17 +163,12 @@ def test_a_run_and_its_file_have_the_same_flags(
             assert preview.shape[1:] == (-(-rows // preview_bin), -(-cols // preview_bin))
 
 
-def test_the_troubled_scan_is_flagged_by_many_checks(tmp_path: Path) -> None:
+def test_the_many_flags_of_the_troubled_scan_do_not_depend_on_the_preview(tmp_path: Path) -> None:
     """Otherwise the test above compares nothing with nothing."""
-    found = record(Troubled((40, 160), 60, 3), tmp_path / "scan.h5", 8, ())
-    assert len({flag.check for flag in found}) >= 5
-    assert {"saturation", "stuck"} <= {flag.check for flag in found}
-
-
-def test_the_flags_do_not_depend_on_the_preview(tmp_path: Path) -> None:
-    scan = Troubled((40, 160), 45, 8)
-    kinds = [record(scan, tmp_path / f"{side}.h5", side, ()) for side in (4, 8, 32)]
-    assert kinds[0] == kinds[1] == kinds[2]
+    found, *others = (record(Troubled((40, 160), 60, 3), tmp_path / f"{side}.h5", side, ()) for side in (8, 4, 32))
+    checks = {flag.check for flag in found}
+    assert len(checks) >= 5 and {"saturation", "stuck"} <= checks
+    assert others == [found, found]
 
 
 def test_a_run_and_its_file_state_the_same_drift_of_the_light(tmp_path: Path) -> None:
@@ -206,8 +201,4 @@ def test_a_simulated_scan_and_its_file_have_the_same_flags(
     assert ran.exit_code == 0, ran.output
     (path,) = tmp_path.rglob("scan.h5")
     with open_scan(path) as source:
-        written, again = source.flags, judged_flags(source)
-    assert written is not None
-    np.testing.assert_array_equal(again.bits, written.bits)
-    np.testing.assert_array_equal(again.scores, written.scores)
-    np.testing.assert_array_equal(again.regions, written.regions)
+        assert_equal(judged_flags(source), source.flags)

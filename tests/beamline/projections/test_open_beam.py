@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.prepared import hold_out
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
 from beamline.reconstruct.budget import binned
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders(shape=(16, 64), axis_col=31.7)
@@ -30,20 +32,17 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
     """Darks, flats and views with so many photons a pixel in the open beam."""
     rng, shape = np.random.default_rng(3), SCAN.shape
     light = [np.zeros((n_darks, *shape)), np.full((n_flats, *shape), photons), photons * np.exp(-EXACT)]
-    counts = np.concatenate([DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light])
-    keys = [2] * n_darks + [1] * n_flats + [0] * len(EXACT)
-    angles = np.full(len(keys), np.nan)
-    angles[n_darks + n_flats :] = SCAN.angles
-    return ArraySource(counts.astype(np.float32), keys, angles)
+    counts = (DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light)
+    return scan_of(*counts, SCAN.angles, np.float32)
 
 
-def prepare(source: ArraySource, selection: Selection, said: list[str] | None = None) -> PreparedProjections:
-    return prepare_projections(source, selection, ([] if said is None else said).append)  # type: ignore[arg-type]
+def correction_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrection:
+    return ScanCorrection(source, replace(PLAIN, **chosen).with_steps(*steps), pytest.fail)
 
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:
     source = scan(20)
-    found = prepare(source, PLAIN.with_steps(Preparation(noise="counts", gain=GAIN))).projections
+    found = prepare(source, PLAIN.with_steps(Preparation(noise="counts", gain=GAIN)))[0].projections
     darks, flats, views = source.read(slice(10)), source.read(slice(10, 30)), source.read(slice(30, None))
     variance = float(np.median(darks.var(axis=0, ddof=1)))
     data, weights = line_integrals(Counts(views, flats.mean(axis=0), darks.mean(axis=0), GAIN, variance))
@@ -55,7 +54,7 @@ def test_line_integrals_and_weights_are_those_of_counts() -> None:
 def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     """The likelihood chosen by itself, with the gain that the flats show."""
     behind = 0.3 * EXACT.max() < EXACT
-    counted, logarithm = prepare(scan(10), PLAIN), prepare(scan(10), PLAIN.with_steps(Preparation(noise="log")))
+    counted, logarithm = (prepare(scan(10), PLAIN.with_steps(Preparation(noise=way)))[0] for way in ("auto", "log"))
     weights = counted.ray_weights()
     assert weights is not None and logarithm.ray_weights() is None
     assert abs(np.average((counted.projections.data - EXACT)[behind], weights=weights[behind])) < 0.03
@@ -67,37 +66,30 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     (30, "auto", True), (1000, "auto", False), (1000, "counts", True), (30, "log", False)
 ])  # fmt: skip
 def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, counted: bool) -> None:
-    found = ScanCorrection(scan(photons), PLAIN.with_steps(Preparation(noise=noise)), pytest.fail)  # type: ignore[arg-type]
+    found = correction_of(scan(photons), Preparation(noise=noise))
     assert (found.photons is not None) == counted
     if found.photons is not None:
         assert found.photons.gain == pytest.approx(GAIN, rel=0.1)
         assert found.photons.variance**0.5 == pytest.approx(READOUT, rel=0.1)
 
 
-def test_binned_pixels_have_the_photons_of_all() -> None:
+@pytest.mark.parametrize(("binning", "frames", "of"), [(2, 1, 4), (1, 5, 5)])
+@pytest.mark.parametrize("gain", [None, GAIN])
+def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
+    binning: int, frames: int, of: int, gain: float | None
+) -> None:
     """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
-    for gain in (None, GAIN):
-        selection = replace(PLAIN, binning=2).with_steps(Preparation(noise="counts", gain=gain))
-        found = ScanCorrection(scan(20), selection, pytest.fail)  # type: ignore[arg-type]
-        assert found.photons is not None
-        assert found.photons.gain == pytest.approx(GAIN / 4, rel=0.1)
-        assert found.photons.variance == pytest.approx(READOUT**2 / 4, rel=0.2)
-
-
-def test_the_mean_of_frames_has_the_photons_of_all() -> None:
-    for gain in (None, GAIN):
-        averaged = scan(20)
-        averaged.frames_per_view = 5  # type: ignore[misc]
-        found = ScanCorrection(averaged, PLAIN.with_steps(Preparation(noise="counts", gain=gain)), pytest.fail)  # type: ignore[arg-type]
-        assert found.photons is not None
-        assert found.photons.gain == pytest.approx(GAIN / 5, rel=0.1)
-        assert found.photons.variance == pytest.approx(READOUT**2 / 5, rel=0.2)
+    source = scan(20)
+    source.frames_per_view = frames  # type: ignore[misc]
+    found = correction_of(source, Preparation(noise="counts", gain=gain), binning=binning)
+    assert found.photons is not None
+    assert found.photons.gain == pytest.approx(GAIN / of, rel=0.1)
+    assert found.photons.variance == pytest.approx(READOUT**2 / of, rel=0.2)
 
 
 def test_batches_give_what_one_pass_gives() -> None:
-    selection = PLAIN.with_steps(Preparation(noise="counts"))
-    whole = ScanCorrection(scan(20), selection, pytest.fail).at_once(np.arange(30, 40))  # type: ignore[arg-type]
-    fed = ScanCorrection(scan(20), selection, pytest.fail)  # type: ignore[arg-type]
+    whole = correction_of(scan(20), Preparation(noise="counts")).at_once(np.arange(30, 40))
+    fed = correction_of(scan(20), Preparation(noise="counts"))
     parts = [fed.feed(np.arange(30, 34), last=False), fed.feed(np.arange(34, 40), last=True)]
     for name in ("data", "weights"):
         together = np.concatenate([getattr(part, name) for part in parts])
@@ -105,7 +97,7 @@ def test_batches_give_what_one_pass_gives() -> None:
 
 
 def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
-    prepared = prepare(scan(20), PLAIN.with_steps(Preparation(noise="counts")))
+    prepared, _ = prepare(scan(20), PLAIN.with_steps(Preparation(noise="counts")))
     held = hold_out(prepared, 9, advice="")
     weights = prepared.ray_weights()
     left = held.ray_weights(3)
@@ -128,7 +120,7 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:
-    assert prepare(scan(20, n_flats=1), PLAIN).done["noise"].sentence == ""
+    assert prepare(scan(20, n_flats=1), PLAIN)[0].done["noise"].sentence == ""
     with pytest.raises(ConfigError, match="--gain COUNTS"):
         prepare(scan(20, n_flats=1), PLAIN.with_steps(Preparation(noise="counts")))
 

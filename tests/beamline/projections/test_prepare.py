@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,30 +13,23 @@ import recon
 from beamline.core.errors import DataError
 from beamline.projections import axis as axis_module
 from beamline.projections.corrections.air import Air
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse
 from recon.base.views import spread_views
 from recon.prep.align import AxisError, AxisEstimate
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 SCAN = TwoCylinders()
-PLAIN = (Air("none"),)
-
-
-def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[PreparedProjections, list[str]]:
-    warnings: list[str] = []
-    with open_scan(SourceOptions(path, **said)) as source:
-        return prepare_projections(source, selection, warnings.append), warnings
+FOUND = Selection(steps=(Air("none"),))
+GIVEN = replace(FOUND, axis_col=20.7)
 
 
 def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
-    prepared, warnings = _prepare(path, Selection(steps=PLAIN))
+    prepared, warnings = prepare(path, FOUND)
     # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
     assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
@@ -49,9 +42,9 @@ def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> Non
 
 def test_frames_of_a_view_that_stand_far_apart_are_named(tmp_path: Path) -> None:
     """40 columns, views 4 degrees apart: two of them blur the edge by 1.4 columns, six by 7."""
-    path, selection = write_exchange(tmp_path / "scan.h5", SCAN), Selection(axis_col=SCAN.axis_col, steps=PLAIN)
+    path, selection = write_exchange(tmp_path / "scan.h5", SCAN), GIVEN
     for n, expected in ((2, []), (6, ["averages frames that are up to 20 degrees apart", "by 7 pixels"])):
-        _, warnings = _prepare(path, selection, frames_per_view=n)
+        _, warnings = prepare(path, selection, frames_per_view=n)
         told = [warning for warning in warnings if "--frames-per-view" in warning]
         assert len(told) == bool(expected) and all(words in told[0] for words in expected)
 
@@ -59,8 +52,8 @@ def test_frames_of_a_view_that_stand_far_apart_are_named(tmp_path: Path) -> None
 @pytest.mark.parametrize(("rows", "binning", "shape"), [((1, 4), 1, (3, 40)), (None, 2, (2, 20)), ((0, 4), 3, (1, 13))])
 def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: int, shape: tuple[int, int]) -> None:
     path = write_exchange(tmp_path / "scan.h5", replace(SCAN, pixel_size_mm=0.5))
-    selection = Selection(rows=rows, binning=binning, axis_col=20.7, steps=PLAIN)
-    prepared, _ = _prepare(path, selection)
+    selection = replace(GIVEN, rows=rows, binning=binning)
+    prepared, _ = prepare(path, selection)
     first, end = rows or (0, 4)
     expected = Geometry.parallel(SCAN.angles, (end - first, 40), pixel_pitch=0.5, axis_col=20.7).binned(binning)
     assert prepared.geometry.detector_shape == shape == expected.detector_shape
@@ -75,14 +68,14 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
 
 def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(2, 80), axis_col=40.7))
-    prepared, _ = _prepare(path, Selection(binning=2, steps=PLAIN))
+    prepared, _ = prepare(path, replace(FOUND, binning=2))
     assert prepared.axis_col == pytest.approx(40.7, abs=0.5)
     assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
 
 
 def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
-    prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, steps=PLAIN))
+    prepared, _ = prepare(path, replace(GIVEN, views="first:10"))
     assert prepared.geometry.n_views == 10
     assert prepared.n_projections == 45
     np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
@@ -99,7 +92,7 @@ def test_selected_views_of_a_whole_turn_spread_over_it_where_the_axis_is_off_the
 ) -> None:
     whole = replace(SCAN, angles=np.linspace(0, 2 * np.pi, 48, endpoint=False))
     path = write_exchange(tmp_path / "scan.h5", whole)
-    prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, steps=PLAIN))
+    prepared, _ = prepare(path, replace(FOUND, views="fixed:12", axis_col=axis_col))
     expected = np.linspace(0, 2 * np.pi * turned, 12, endpoint=False)
     np.testing.assert_allclose(prepared.geometry.angles, expected, atol=1e-5)
 
@@ -112,9 +105,9 @@ def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
     flats = [np.full((1, 4, 40), DARK + BEAM * b) for b in (beam[0], beam[-1])]
     data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
     angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
-    source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
-    prepared = prepare_projections(source, Selection(axis_col=20.7, steps=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared, told = prepare(ArraySource(data, [2, 1] + [0] * n + [1], angles), GIVEN)
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
+    assert told == []
 
 
 def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArraySource:
@@ -133,11 +126,11 @@ def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArrayS
 @pytest.mark.parametrize("binning", [1, 2])
 def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(flats: list[float], binning: int) -> None:
     """Without it every line integral would be off by log(flat exposure / view exposure)."""
-    selection = Selection(axis_col=20.7, steps=PLAIN, binning=binning)
-    prepared = prepare_projections(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
+    prepared, told = prepare(exposed(flats), replace(GIVEN, binning=binning))
     shape = (45, 4 // binning, binning, 40 // binning, binning)
     expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
     np.testing.assert_allclose(prepared.projections.data, expected, atol=1e-5)
+    assert told == []
 
 
 @pytest.mark.parametrize("unknown", ["flats", "views"])
@@ -146,23 +139,21 @@ def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
     source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
     source.exposures[source.image_key == 2] = np.nan
-    prepared = prepare_projections(source, Selection(axis_col=20.7, steps=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared, told = prepare(source, GIVEN)
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
+    assert told == []
 
 
 def test_darks_of_another_exposure_are_told() -> None:
-    warnings: list[str] = []
-    selection = Selection(axis_col=20.7, steps=PLAIN)
-    prepare_projections(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
-    assert len(warnings) == 1
-    assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
+    _, (warning,) = prepare(exposed([0.1], dark=0.025), GIVEN)
+    assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warning
 
 
 def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
     counts = SCAN.counts().astype(np.float32)
     counts[[3, 30]] = np.nan
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
-    prepared, warnings = _prepare(path, Selection(steps=PLAIN))
+    prepared, warnings = prepare(path, FOUND)
     assert prepared.geometry.n_views == 43
     np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
     np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
@@ -173,7 +164,7 @@ def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     data = SCAN.line_integrals().astype(np.float32)
     data[3, 1, 20] = np.nan
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": data, "data_white": None, "data_dark": None})
-    prepared, _ = _prepare(path, Selection(), quantity="line_integrals")
+    prepared, _ = prepare(path, Selection(), quantity="line_integrals")
     assert prepared.quantity == "line_integrals"
     left, right = data[3, 1, 19], data[3, 1, 21]
     assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
@@ -190,6 +181,7 @@ BAD_SCANS = {
     "one angle": ({"theta": np.zeros(45)}, "0 degrees"),
     "angles not known": ({"theta": np.full(45, np.nan)}, "--angles"),
     "all NaN": ({"data": np.full(_SHAPE, np.nan, np.float32)}, "finite"),
+    "unknown": ({"data_white": None, "data_dark": None}, "--quantity counts, --quantity"),
     "flat of another shape": ({"data_white": np.full((2, 4, 30), 9000, np.uint16)}, "shape"),
     "too few angles": ({"theta": np.zeros(3)}, "3 angles"),
 }
@@ -201,19 +193,13 @@ def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN, changes)
     quantity = "counts" if case in ("no flats", "no darks") else None
     with pytest.raises(DataError, match=said):
-        _prepare(path, Selection(), quantity=quantity)
-
-
-def test_unknown_quantity_names_the_option(tmp_path: Path) -> None:
-    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data_white": None, "data_dark": None})
-    with pytest.raises(DataError, match=r"--quantity counts, --quantity"):
-        _prepare(path, Selection())
+        prepare(path, Selection(), quantity=quantity)
 
 
 def test_empty_field_is_refused(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": np.full(_SHAPE, DARK + BEAM, np.uint16)})
     with pytest.raises(DataError):
-        _prepare(path, Selection(axis_col=20.0))
+        prepare(path, Selection(axis_col=20.0))
 
 
 def _estimate(value: float, confident: bool) -> AxisEstimate:
@@ -223,40 +209,28 @@ def _estimate(value: float, confident: bool) -> AxisEstimate:
 def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
     monkeypatch.setattr(axis_module, "axis_by_views", lambda data, geometry, lit: _estimate(17.0, False))
-    source, warnings = _two_cylinders(), list[str]()
-    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    source = counted(SCAN.counts(), SCAN.angles)
+    prepared, warnings = prepare(source, FOUND)
     assert prepared.axis_col == 18.0
     assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
     source.axis_col = 20.5
-    warnings.clear()
-    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared, warnings = prepare(source, FOUND)
     assert prepared.axis_col == 20.5
     assert any("the file's 20.50 is used" in text for text in warnings)
 
 
 def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
-    warnings: list[str] = []
-    prepared = prepare_projections(_two_cylinders(), Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared, warnings = prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
     assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.2)
     assert not any("axis" in text for text in warnings)
 
 
-def _two_cylinders() -> ArraySource:
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()])
-    return ArraySource(
-        data.astype(np.uint16), [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles])
-    )  # fmt: skip
-
-
-def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def find_axis(data: object, angles: object) -> AxisEstimate:
-        raise AxisError("the best axis, column 0, is at the edge")
-
-    monkeypatch.setattr(axis_module, "find_axis", find_axis)
-    path = write_exchange(tmp_path / "scan.h5", SCAN)
+def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_the_edge = Mock(side_effect=AxisError("the best axis, column 0, is at the edge"))
+    monkeypatch.setattr(axis_module, "find_axis", at_the_edge)
     with pytest.raises(DataError, match=r"at the edge.*--axis COLUMN"):
-        _prepare(path, Selection())
+        prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
 
 
 @pytest.mark.parametrize(
@@ -267,7 +241,7 @@ def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.Monke
     ],
 )
 def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:
-    prepared, _ = _prepare(shared_data / name, Selection())
+    prepared, _ = prepare(shared_data / name, Selection())
     assert prepared.axis_col == pytest.approx(expected, abs=tolerance)
     assert prepared.axis is not None
     assert prepared.axis.confident
@@ -285,12 +259,10 @@ def test_of_a_full_turn_the_axis_is_given_pairs_of_opposite_views(views: int) ->
 
 
 def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wall() -> None:
-    scan, warnings = TwoCylinders(shape=(6, 40)), list[str]()
+    scan = TwoCylinders(shape=(6, 40))
     counts = scan.counts().astype(np.float32)
     counts[:, :, :12] = DARK + np.random.default_rng(0).normal(0, 3, counts[:, :, :12].shape)
-    data = np.concatenate([np.full((1, 6, 40), DARK), np.full((1, 6, 40), DARK + BEAM), counts])
-    source = ArraySource(data, [2, 1] + [0] * len(counts), np.concatenate([[np.nan] * 2, scan.angles]))
-    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared, warnings = prepare(counted(counts, scan.angles, dtype=np.float32), FOUND)
     assert "35.0% of the detector got no beam, or is saturated: its rays count as not measured." in warnings
     assert prepared.measured is not None and not prepared.measured[:, :14].any() and prepared.measured[:, 14:].all()
     assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)

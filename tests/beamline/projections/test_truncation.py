@@ -9,12 +9,12 @@ import pytest
 
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import FieldEdges
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.prepared_views import prepare
 
 VIEWS, SHAPE, MU = 90, (4, 64), 0.004
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -31,17 +31,14 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
     rng = np.random.default_rng(2)
     open_beam = np.full((5, *SHAPE), 40_000.0)
     counts = [rng.poisson(0 * open_beam), rng.poisson(open_beam), rng.poisson(40_000 * light * np.exp(-lines))]
-    data = (np.concatenate(counts) + rng.integers(99, 102, (VIEWS + 10, *SHAPE))).clip(0, 65535)
-    keys, angles = [2] * 5 + [1] * 5 + [0] * VIEWS, np.concatenate([np.full(10, np.nan), ANGLES])
-    return ArraySource(data.astype(np.uint16), keys, angles)
+    read = ((each + rng.integers(99, 102, each.shape)).clip(0, 65535) for each in counts)
+    return scan_of(*read, ANGLES)
 
 
 @pytest.mark.parametrize("radius", [45.0, 90.0, 180.0])
 def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
-    told: list[str] = []
-    found = prepare_projections(scan(radius), SELECTION, told.append)  # type: ignore[arg-type]
+    found, (line,) = prepare(scan(radius), SELECTION)
     assert found.projections.air_columns == (0, 0)
-    (line,) = told
     assert line.startswith("The sample goes on beyond the left and right edge of the field (line integral ")
     volume = fbp(found.projections.data, found.geometry, filter="hann")[1]
     c = (np.arange(64) - 31.5)[None]
@@ -50,51 +47,41 @@ def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: fl
 
 
 def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_with_its_views() -> None:
-    told: list[str] = []
-    prepare_projections(scan(28.0, beside=15.0), SELECTION, told.append)  # type: ignore[arg-type]
+    _, told = prepare(scan(28.0, beside=15.0), SELECTION)
     (line,) = (line for line in told if "leaves the field" in line)  # a disc's views are mirror images, too
     views = re.search(r"leaves the field at the right edge in views (\d+) to (\d+) of 90", line)
     assert views is not None  # a line integral of 0.1 is at the edge at 25 and 155 degrees
     assert np.abs(np.array(views.groups(), float) - (13, 77)).max() <= 4
     for radius, beside in ((20.0, 8.0), (40.0, 3.0), (45.0, 0.0)):
-        told.clear()
-        prepare_projections(scan(radius, beside=beside), SELECTION, told.append)  # type: ignore[arg-type]
+        _, told = prepare(scan(radius, beside=beside), SELECTION)
         assert not any("leaves the field" in line for line in told), (radius, beside)
 
 
-@pytest.mark.parametrize(("ring_current", "told_of_current"), [("ignore", True), ("use", False)])
-def test_a_ring_current_that_nothing_corrects_is_told(ring_current: str, told_of_current: bool) -> None:
+@pytest.mark.parametrize(
+    ("radius", "ring_current", "of_current"),
+    [(90.0, "ignore", [True]), (90.0, "use", []), (20.0, "ignore", [])],
+    ids=["nothing corrects it", "corrected", "corrected by the air"],
+)
+def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_current: str, of_current: list[bool]) -> None:
     current = np.linspace(200, 150, VIEWS)
-    source, told = scan(90.0, current[:, None, None] / 200), list[str]()
+    source = scan(radius, current[:, None, None] / 200)
     source.currents = np.r_[np.full(10, 200.0), current]
-    selection = SELECTION.with_steps(Preparation(ring_current=ring_current))
-    prepare_projections(source, selection, told.append)  # type: ignore[arg-type]
-    assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == [
-        True
-    ] * told_of_current
-    source = scan(20.0, current[:, None, None] / 200)  # its air corrects it
-    source.currents = np.r_[np.full(10, 200.0), current]
-    prepare_projections(source, SELECTION, pytest.fail)  # type: ignore[arg-type]
+    _, told = prepare(source, SELECTION.with_steps(Preparation(ring_current=ring_current)))
+    assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
 
 
 def test_columns_that_are_said_to_be_air_are_air() -> None:
-    found = prepare_projections(scan(90.0), SELECTION.with_steps(Air("columns")), lambda _: None)  # type: ignore[arg-type]
+    found, _ = prepare(scan(90.0), SELECTION.with_steps(Air("columns")))
     assert min(found.projections.air_columns) > 0
 
 
-@pytest.mark.parametrize("end", [0.6, 0.8, 1.3])
-def test_a_beam_that_drifts_from_its_flats_is_levelled_by_its_air(end: float) -> None:
-    light = np.linspace(1, end, VIEWS)[:, None, None]
-    found = prepare_projections(scan(20.0, light), SELECTION, pytest.fail)  # type: ignore[arg-type]
-    assert min(found.projections.air_columns) > 0
-    assert abs(found.projections.data[:, :, :5].mean()) < 0.005
-
-
-@pytest.mark.parametrize("level", [0.68, 1.2])
-def test_a_beam_weaker_than_its_flats_is_levelled_by_its_air(level: float) -> None:
+@pytest.mark.parametrize(
+    "light", [0.68, 1.2, *(np.linspace(1, end, VIEWS)[:, None, None] for end in (0.6, 1.3))], ids=str
+)
+def test_a_beam_that_is_not_that_of_its_flats_is_levelled_by_its_air(light: np.ndarray | float) -> None:
     """As of Diamond's scan, whose one flat is brighter than the open beam; its air is no thinner at the edges."""
-    found = prepare_projections(scan(20.0, level), SELECTION, pytest.fail)  # type: ignore[arg-type]
-    assert min(found.projections.air_columns) > 0
+    found, told = prepare(scan(20.0, light), SELECTION)
+    assert told == [] and min(found.projections.air_columns) > 0
     assert abs(found.projections.data[:, :, :5].mean()) < 0.005
 
 

@@ -11,11 +11,12 @@ from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import DiskBuffer, prepare_projections
+from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
 from drivers.base.frame import FrameKind
-from tests.beamline.array_source import ArraySource
-from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, decibels_of, line_integrals
+from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.prepared_views import prepare
+from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, decibels, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 
 FIRST = 6  # row of the first view, behind three darks and three flats
@@ -34,11 +35,9 @@ def scan(unlit: list[int], value: float | None, scale: float = 1.0) -> ArraySour
     st.lists(st.integers(0, VIEWS - 1), min_size=1, max_size=VIEWS // 2, unique=True),
     st.sampled_from((None, 0.0, 65535.0, 100.0)),
 )
-@settings(deadline=None, max_examples=12)
+@settings(deadline=None, max_examples=8)
 def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | None) -> None:
-    told: list[str] = []
-    source = scan(unlit, value)
-    found = prepare_projections(source, SELECTION, told.append)  # type: ignore[arg-type]
+    found, told = prepare(scan(unlit, value), SELECTION)
     lit = np.setdiff1d(np.arange(VIEWS), unlit)
     np.testing.assert_array_equal(found.projections.view_ids, FIRST + lit)
     np.testing.assert_allclose(found.geometry.angles, ANGLES[lit])
@@ -46,34 +45,29 @@ def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | No
     np.testing.assert_allclose(found.projections.data, line_integrals()[lit], atol=0.12)
 
 
-@pytest.mark.parametrize("unlit", [[7], list(range(40, 45)), [0, 20, 44]])
-def test_few_of_them_cost_little(unlit: list[int]) -> None:
-    clean = prepare_projections(scan([], 0.0), SELECTION, pytest.fail)  # type: ignore[arg-type]
-    some = prepare_projections(scan(unlit, 0.0), SELECTION, lambda _: None)  # type: ignore[arg-type]
-    right, found = (decibels_of(each.projections.data, each.geometry) for each in (clean, some))
-    assert found > right - (0.5 if len(unlit) < 4 else 3)  # five in a row are a wedge of 20 degrees
+def test_few_of_them_cost_little() -> None:
+    """And five in a row no more than their wedge of 20 degrees."""
+    right = decibels(scan([], 0.0))[0]
+    for unlit, cost in (([7], 0.5), ([0, 20, 44], 0.5), (list(range(40, 45)), 3)):
+        assert decibels(scan(unlit, 0.0))[0] > right - cost
 
 
 def test_a_gap_is_told_and_flags_that_are_ignored_change_nothing() -> None:
-    told: list[str] = []
-    selection = SELECTION.with_steps(Preparation("ignore"))
-    prepare_projections(scan(list(range(10, 18)), None), selection, told.append)  # type: ignore[arg-type]
+    _, told = prepare(scan(list(range(10, 18)), None), SELECTION.with_steps(Preparation("ignore")))
     (line,) = (line for line in told if "no light" in line)
     assert "8 views of 45 (frames 16-23) have no light" in line and "leave 36° without a view" in line
 
 
 def test_more_than_half_of_the_views_are_refused() -> None:
     with pytest.raises(DataError, match="only 20 of 45"):
-        prepare_projections(scan(list(range(20, 45)), 0.0), SELECTION, lambda _: None)  # type: ignore[arg-type]
+        prepare(scan(list(range(20, 45)), 0.0), SELECTION)
 
 
 def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     unlit, frames = [3, 30, 31], FIRST + np.arange(VIEWS)
     source = scan(unlit, 0.0)
     at_once = ScanCorrection(source, SELECTION, lambda _: None).at_once(frames)  # type: ignore[arg-type]
-    spilt = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
-    told: list[str] = []
-    in_slabs = prepare_projections(source, SELECTION, told.append, spilt)  # type: ignore[arg-type]
+    in_slabs, told = prepare(source, SELECTION, DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7))
     np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)
     assert len([line for line in told if "3 views of 45 (frames 9, 36-37) have no light" in line]) == 1
     fed = ScanCorrection(source, SELECTION.with_steps(Air("none")), told.append)  # type: ignore[arg-type]
@@ -87,8 +81,7 @@ def test_line_integrals_that_were_never_written_are_left_out() -> None:
     lines[[5, 40]] = 0
     source = ArraySource(lines.astype(np.float32), [0] * VIEWS, ANGLES)
     source.quantity = "line_integrals"
-    told: list[str] = []
-    found = prepare_projections(source, SELECTION, told.append)  # type: ignore[arg-type]
+    found, told = prepare(source, SELECTION)
     assert found.geometry.n_views == VIEWS - 2 and "2 views of 45 (frames 5, 40) have no light" in told[0]
 
 
@@ -97,8 +90,6 @@ def test_a_band_in_which_the_sample_is_opaque_has_views_with_light() -> None:
     scene = TwoCylinders(shape=(8, 40))
     counts = scene.counts()
     counts[:, 4:] = DARK + 2
-    references = [np.full((1, *counts.shape[1:]), level, np.uint16) for level in (DARK, DARK + 20000)]
-    angles = np.concatenate([[np.nan] * 2, scene.angles])
-    source = ArraySource(np.concatenate([*references, counts]), [2, 1] + [0] * 45, angles)
     selection = Selection(rows=(4, 8), axis_col=scene.axis_col, steps=(Air("none"),))
-    assert ScanCorrection(source, selection, pytest.fail).at_once(np.arange(2, 47)).view_ids.size == 45  # type: ignore[arg-type]
+    correction = ScanCorrection(counted(counts, scene.angles), selection, pytest.fail)  # type: ignore[arg-type]
+    assert correction.at_once(np.arange(2, 47)).view_ids.size == 45

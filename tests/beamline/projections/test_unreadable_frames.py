@@ -14,21 +14,16 @@ from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import read_known
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.frame import FrameKind
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
-FRAMES = np.concatenate(
-    [
-        np.full((3, *SCAN.shape), DARK, np.uint16),
-        np.full((3, *SCAN.shape), DARK + BEAM, np.uint16),
-        SCAN.counts(),
-    ]
-)
+REFERENCES = [np.full((3, *SCAN.shape), level, np.uint16) for level in (DARK, DARK + BEAM)]
+FRAMES = np.concatenate([*REFERENCES, SCAN.counts()])
 KEYS = np.repeat([2, 1, 0], [3, 3, len(SCAN.angles)])
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
 
@@ -78,16 +73,14 @@ def _spoil(path: Path, places: list[int]) -> None:
             file.write(b"\xaa" * 16)
 
 
-@pytest.mark.parametrize("write", [nxtomo, exchange, series])
-@pytest.mark.parametrize("flags", ["use", "ignore"])
+@pytest.mark.parametrize(("write", "flags"), [(nxtomo, "use"), (exchange, "ignore"), (series, "use")])
 def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     tmp_path: Path, write: object, flags: str
 ) -> None:
     spoilt = [1, 4, 9, 20, 21]
     scan: SourceOptions = write(tmp_path, spoilt)  # type: ignore[operator]
-    told: list[str] = []
     with scan.open() as source:
-        prepared = prepare_projections(source, SELECTION.with_steps(Preparation(flags)), told.append)
+        prepared, told = prepare(source, SELECTION.with_steps(Preparation(flags)))
     views = np.setdiff1d(np.arange(6, len(FRAMES)), spoilt)
     assert prepared.projections.view_ids.tolist() == views.tolist()
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)
@@ -104,7 +97,7 @@ def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
 def test_a_scan_whose_frames_all_cannot_be_read_is_refused_with_the_reason(tmp_path: Path, write: object) -> None:
     scan: SourceOptions = write(tmp_path, list(range(6, len(FRAMES))))  # type: ignore[operator]
     with scan.open() as source, pytest.raises(DataError, match=r"Frame \d+ of .*cannot be read"):
-        prepare_projections(source, SELECTION, lambda _: None)
+        prepare(source, SELECTION)
 
 
 def test_what_is_read_of_them(tmp_path: Path) -> None:

@@ -12,13 +12,12 @@ from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_WEIGHT
-from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.treatment import FEWEST_VIEWS
 from drivers.base.frame import FrameKind
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
@@ -34,14 +33,8 @@ def scan(path: Path, levels: dict[int, Level] = LEVELS) -> Path:
     return write_flagged(path / "scan.h5", frames, levels)
 
 
-def prepared(path: Path, selection: Selection = SELECTION, **said: object) -> tuple[PreparedProjections, list[str]]:
-    told: list[str] = []
-    with SourceOptions(path, **said).open() as source:  # type: ignore[arg-type]
-        return prepare_projections(source, selection, told.append), told
-
-
 def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path) -> None:
-    found, told = prepared(scan(tmp_path))
+    found, told = prepare(scan(tmp_path), SELECTION)
     used = sorted(set(range(FIRST, FIRST + 30)) - set(ALARMS))
     np.testing.assert_array_equal(found.projections.view_ids, used)
     np.testing.assert_allclose(found.geometry.angles, SCAN.angles[np.array(used) - FIRST], atol=1e-9)
@@ -57,11 +50,11 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
 
 
 def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path) -> None:
-    found, _ = prepared(scan(tmp_path), replace(SELECTION, views="fixed:8"))
+    found, _ = prepare(scan(tmp_path), replace(SELECTION, views="fixed:8"))
     assert found.held_out is not None
     used = np.round(np.degrees(np.concatenate((found.geometry.angles, found.held_out[1].angles))) / 6).astype(int)
     assert not set(used + FIRST) & set(ALARMS)
-    everything, _ = prepared(tmp_path / "scan.h5")
+    everything, _ = prepare(tmp_path / "scan.h5", SELECTION)
     kept = hold_out(everything, 4, advice="")
     assert kept.view_weights is not None
     expected = [LEVELS.get(row) is Level.WARN for row in kept.projections.view_ids.tolist()]
@@ -69,13 +62,12 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
 
 
 def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
-    _, (line,) = prepared(scan(tmp_path, {FIRST + 9: Level.ALARM}))
-    assert line == ("Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore takes all alike.")
+    _, (line,) = prepare(scan(tmp_path, {FIRST + 9: Level.ALARM}), SELECTION)
+    assert line == "Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore takes all alike."
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
-    selection = SELECTION.with_steps(Preparation("ignore"))
-    found, told = prepared(scan(tmp_path), selection)
+    found, told = prepare(scan(tmp_path), SELECTION.with_steps(Preparation("ignore")))
     assert found.geometry.n_views == 30 and found.view_weights is None and found.ray_weights() is None
     assert told[0] == "--flags ignore: 6 views with an alarm and 2 with a warning are used as they are."
 
@@ -84,29 +76,29 @@ def test_flags_may_be_ignored(tmp_path: Path) -> None:
 def test_too_few_good_views_are_refused_with_figures(tmp_path: Path, n: int) -> None:
     path = scan(tmp_path, {FIRST + i: Level.ALARM for i in range(n, 30)})
     if n >= FEWEST_VIEWS:
-        assert prepared(path)[0].geometry.n_views == n
+        assert prepare(path, SELECTION)[0].geometry.n_views == n
         return
     with pytest.raises(DataError, match=f"{n} of 30.*--flags ignore"):
-        prepared(path)
+        prepare(path, SELECTION)
 
 
 def test_a_file_without_flags_is_judged_where_that_is_wanted(tmp_path: Path) -> None:
     frames = frames_of(SCAN)
     frames[9], frames[10] = (replace(frames[i], counts=frames[8].counts) for i in (9, 10))
     path = write_flagged(tmp_path / "s.h5", frames, {})
-    assert prepared(path)[0].geometry.n_views == 30
-    found, told = prepared(path, SELECTION.with_steps(Preparation("judge")))
+    assert prepare(path, SELECTION)[0].geometry.n_views == 30
+    found, told = prepare(path, SELECTION.with_steps(Preparation("judge")))
     assert found.geometry.n_views == 28 and "2 have an alarm and are left out (stuck 2 alarm)" in told[0]
 
 
 def test_flags_of_darks_and_flats_leave_the_views_alone(tmp_path: Path) -> None:
-    found, told = prepared(scan(tmp_path, {1: Level.WARN, 3: Level.WARN}))
+    found, told = prepare(scan(tmp_path, {1: Level.WARN, 3: Level.WARN}), SELECTION)
     assert found.geometry.n_views == 30 and told == [] and found.view_weights is None
 
 
 def test_references_of_the_caller_do_not_shift_the_flags(tmp_path: Path) -> None:
     frames = frames_of(SCAN)
     flats = np.stack([f.counts for f in frames if f.kind is FrameKind.FLAT])
-    found, _ = prepared(scan(tmp_path), flats=flats)
+    found, _ = prepare(scan(tmp_path), SELECTION, flats=flats)
     assert found.geometry.n_views == 24
     np.testing.assert_allclose(found.geometry.angles, np.delete(SCAN.angles, range(10, 16)), atol=1e-9)

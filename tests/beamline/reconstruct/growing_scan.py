@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -53,11 +54,11 @@ def schedule(
     status: str | None = "complete",
     axis_col: float | None = None,
     pause: float = 0.0,
-    alarms: Set[int] = frozenset(),
+    flags: Mapping[int, Flag] = MappingProxyType({}),
     plan: str = "",
 ) -> None:
     """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
-    last one; status None never finishes it."""
+    last one; status None never finishes it. `flags` come with the row that they are named by."""
     writers: list[NXtomoWriter] = []
     info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, plan=plan)
 
@@ -65,8 +66,8 @@ def schedule(
         writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
 
     def append(frame: Frame) -> Callable[[], None]:
-        flags = [Flag(CHECKS[0].name, Level.ALARM, frame.index, 1.0, 0.0, "")] if frame.index in alarms else []
-        return lambda: writers[0].append(frame, digest(frame.counts), flags)
+        said = [flags[frame.index]] if frame.index in flags else []
+        return lambda: writers[0].append(frame, digest(frame.counts), said)
 
     start = clock.time + begin
     clock.due.append((start, create))
@@ -80,7 +81,12 @@ def schedule(
         clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
 
 
+def alarms(*frames: int) -> dict[int, Flag]:
+    return {frame: Flag(CHECKS[0].name, Level.ALARM, frame, 1.0, 0.0, "") for frame in frames}
+
+
 FIT = R2(seconds=2.0, gaussians=200)
+BRIEF = R2(seconds=0.3, gaussians=100)  # where nobody looks at the voxels
 
 
 def options(tmp_path: Path, **changes: object) -> ReconOptions:

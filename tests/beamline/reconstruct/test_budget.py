@@ -12,7 +12,6 @@ import pytest
 
 import recon
 from beamline.core.events import Event
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
@@ -34,6 +33,7 @@ from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
 from tests.slow_cases import others_slow
@@ -45,10 +45,8 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
-    path = tmp_path_factory.mktemp("prepared") / "scan.h5"
-    write_exchange(path, SCAN)
-    with SourceOptions(path).open() as source:
-        return prepare_projections(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
+    path = write_exchange(tmp_path_factory.mktemp("prepared") / "scan.h5", SCAN)
+    return prepare(path, Selection(views="fixed:24", axis_col=SCAN.axis_col))[0]
 
 
 def _spend(
@@ -96,16 +94,6 @@ def test_iterations_on_voxels_take_no_sample_that_is_wider_than_the_field(
     for data, taken in ((prepared, True), (narrow, False)):
         done = within(4.0, data, methods, 0, RunControl(now=SteppedClock(100.0, 0.01)), lambda said: None, 1)[0]
         assert ("fista-tv" in done.settings["chosen_because"]) is taken and done.settings["chosen_binning"] == 1
-
-
-def test_a_slow_machine_takes_fbp_of_binned_pixels(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(prepared, 5.0, SteppedClock(100.0, 0.01))
-    assert done.settings["chosen_method"] == "fbp" and done.settings["chosen_binning"] == 2
-    assert done.volume.grid.shape == (3, 20, 20)
-    assert "binned 2 x 2" in done.chosen and done.chosen.startswith("fbp")
 
 
 @pytest.mark.slow
@@ -194,14 +182,8 @@ def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_res
         begin = clock.time
         done = _spend(high, 20.0, clock, methods=(costly, Fbp()))
         assert done.method == expected
-        assert (
-            done.settings["chosen_because"].startswith("trials on rows ")
-            and "os-sirt-tv " in done.settings["chosen_because"]
-        )
-        assert (
-            done.settings["chosen_because"] in done.chosen
-            and done.settings["chosen_because"] == done.settings["chosen_because"]
-        )
+        because = done.settings["chosen_because"]
+        assert because.startswith("trials on rows ") and "os-sirt-tv " in because and because in done.chosen
         (rows, tried), *final = costly.ran
         assert rows == 32
         assert clock.time - begin == pytest.approx(done.seconds) and done.seconds <= 20.0
@@ -281,17 +263,17 @@ def test_a_cone_is_placed_as_its_parallel_likeness_is(
     assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
 
 
-def test_a_slow_machine_takes_fdk_of_a_cones_binned_pixels(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("views", ["parallel", "of a cone", "that lean"])
+def test_a_slow_machine_takes_the_direct_method_of_binned_pixels(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, views: str
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(_cone(prepared, 2 * np.pi), 5.0, SteppedClock(100.0, 0.01))
-    assert done.chosen.startswith("fbp") and done.volume.grid.shape == (3, 20, 20)
-
-
-def test_views_that_lean_have_a_direct_method(prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch) -> None:
-    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    assert _spend(_cone(prepared, 2 * np.pi, tilt=0.02), 5.0, SteppedClock(100.0, 0.01)).method == "fbp"
+    cone = {"of a cone": 0.0, "that lean": 0.02}
+    seen = _cone(prepared, 2 * np.pi, tilt=cone[views]) if views in cone else prepared
+    done = _spend(seen, 5.0, SteppedClock(100.0, 0.01))
+    assert (done.method, done.settings["chosen_method"], done.settings["chosen_binning"]) == ("fbp", "fbp", 2)
+    assert done.volume.grid.shape == (3, 20, 20)
+    assert "binned 2 x 2" in done.chosen and done.chosen.startswith("fbp")
 
 
 def test_views_without_a_direct_method_get_the_shortest_fit(
@@ -319,9 +301,7 @@ def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr(module, "plans", lambda *_: [Choice("r2", "steps", 2, 1.0, 100, 1.0, 0.5)])
-    with SourceOptions(tmp_path / "scan.h5").open() as source:
-        grid = Grid.matching(prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None).geometry)
-    np.save(tmp_path / "truth.npy", SCAN.truth(grid))
+    np.save(tmp_path / "truth.npy", SCAN.truth(Grid(SCAN.shape[:1] + 2 * SCAN.shape[1:], 1.0)))
     options = ReconOptions(
         SourceOptions(tmp_path / "scan.h5"), OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
         Selection(axis_col=SCAN.axis_col), budget=1.0, truth=str(tmp_path / "truth.npy"),
@@ -353,14 +333,9 @@ def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert record.parameters["steps"] == preview.steps
     count = round(preview.share * 2000)  # a small volume: the least that a fit starts from by itself
     assert events[-1].data["chosen"].startswith(f"preview: {preview.steps} steps from {count} Gaussians")
-    assert "chosen" not in run_plain(options, tmp_path)
-
-
-def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
-    events: list[Event] = []
     plain = replace(options, quality=None, method=R2(steps=5), target=OutputPaths(tmp_path / "plain.h5", None))
     reconstruct_file(plain, events.append, SystemClock())
-    return dict(events[-1].data)
+    assert "chosen" not in events[-1].data
 
 
 @pytest.mark.slow

@@ -11,17 +11,16 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, origin_of
-from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import Checkpoint, write_checkpoint
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
@@ -32,10 +31,8 @@ OTHER = next(kernel for kernel in Kernel if kernel is not SETTINGS.kernel)
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
-    path = tmp_path_factory.mktemp("prepared") / "scan.h5"
-    write_exchange(path, SCAN)
-    with SourceOptions(path).open() as source:
-        return prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None)
+    path = write_exchange(tmp_path_factory.mktemp("prepared") / "scan.h5", SCAN)
+    return prepare(path, Selection(axis_col=SCAN.axis_col))[0]
 
 
 def _flipped(prepared: PreparedProjections) -> PreparedProjections:
@@ -136,19 +133,13 @@ def test_a_plan_without_steps_is_told(
         ({"scalars": np.array([np.nan, 0.1, 0.1])}, "density unit"),
         ({"first.means": np.full((5, 3), np.nan, np.float32)}, "first.means"),
         ({"generator": np.zeros(3, np.uint64)}, "generator"),
+        ({"second.raw": None}, r"second\.raw"),
     ],
 )
 def test_a_damaged_checkpoint_is_to_blame_before_any_work(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
-    write_checkpoint(tmp_path / "fit.h5", Checkpoint(_state(**changes), {}, 100))
-    with pytest.raises(DataError, match=rf"checkpoint .*fit\.h5 is damaged: .*{said}"):
-        CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
-
-
-def test_a_checkpoint_that_lacks_arrays_is_to_blame(tmp_path: Path) -> None:
-    state = _state()
-    del state["second.raw"]
+    state = {name: value for name, value in _state(**changes).items() if value is not None}
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, {}, 100))
-    with pytest.raises(DataError, match=r"fit\.h5 is damaged: .*second\.raw"):
+    with pytest.raises(DataError, match=rf"checkpoint .*fit\.h5 is damaged: .*{said}"):
         CheckpointOptions(None, tmp_path / "fit.h5").refuse_existing()
 
 

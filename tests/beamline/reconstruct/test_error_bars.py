@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -18,19 +17,8 @@ from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.slow_cases import others_slow
 
-FISTA = (
-    "recon",
-    "scan.h5",
-    "--uncertainty",
-    "--no-report",
-    "-m",
-    "fista-tv",
-    "--iterations",
-    "5",
-    "--tv-weight",
-    "0.002",
-)
 FBP = ("recon", "scan.h5", "--uncertainty", "--no-report", "-m", "fbp")
+FISTA = (*FBP[:-1], "fista-tv", "--iterations", "5", "--tv-weight", "0.002")
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +33,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             result = beamline(*options, "-o", name)
             assert result.exit_code == 0, result.output
     return folder
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current directory, with the scan in it."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copyfile(made / "scan.h5", tmp_path / "scan.h5")
-    return tmp_path
 
 
 def deviation(*options: str) -> np.ndarray:
@@ -93,15 +73,9 @@ def test_about_two_of_three_voxels_of_the_truth_are_within(made: Path) -> None:
     assert 0.5 < within.mean() < 0.9
 
 
-@pytest.mark.parametrize(
-    ("options", "name", "memory"),
-    [(FISTA, "fista-tv.h5", "6.5M"), (FBP, "fbp.h5", "4.1M")],
-    ids=["fista-tv", "fbp"],
-)
-def test_in_slabs_it_is_the_same(made: Path, folder: Path, options: tuple[str, ...], name: str, memory: str) -> None:
-    whole = read_reconstruction(made / name).deviation
+def test_in_slabs_it_is_the_same(made: Path, folder: Path) -> None:
+    whole, slabs = read_reconstruction(made / "fbp.h5").deviation, deviation(*FBP, "--memory", "4.1M")
     assert whole is not None
-    slabs = deviation(*options, "--memory", memory)
     assert np.abs(slabs - whole).mean() < 0.1 * whole.mean()
     assert left(folder) == {"scan.h5"}
 
@@ -146,18 +120,17 @@ def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (("-m", "sirt"), "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
-        (("-m", "sirt", "--dry-run"), "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
-        (("-m", "fbp", "-o", "out.tif"), "give -o out.h5"),
-        (("-m", "r2", "--finish", "0"), "--finish 0"),
-        (("-m", "fbp", "--views", "fixed:6"), "at least 8 views are needed, got 6"),
-        (("-m", "r2", "--seconds", "5"), "--uncertainty does not go with"),
-        (("-m", "r2", "--follow"), "--uncertainty does not go with"),
+        ("sirt", "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
+        ("sirt --dry-run", "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
+        ("fbp -o out.tif", "give -o out.h5"),
+        ("r2 --finish 0", "--finish 0"),
+        ("fbp --views fixed:6", "at least 8 views are needed, got 6"),
+        ("r2 --seconds 5", "--uncertainty does not go with"),
+        ("r2 --follow", "--uncertainty does not go with"),
     ],
-    ids=["sirt", "dry", "tif", "finish", "views", "seconds", "follow"],
 )
-def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: tuple[str, ...], why: str) -> None:
-    result = beamline("recon", "scan.h5", "--uncertainty", *options)
+def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: str, why: str) -> None:
+    result = beamline("recon", "scan.h5", "--uncertainty", "-m", *options.split())
     assert result.exit_code == 2, result.output
     assert why in " ".join(result.stderr.split())
     assert left(folder) == {"scan.h5"}

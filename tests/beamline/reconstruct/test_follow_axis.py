@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.prep.align import AxisEstimate
-from tests.beamline.reconstruct.growing_scan import FIT, INTERLACED, SCAN, ScanClock, options, schedule
+from tests.beamline.reconstruct.growing_scan import BRIEF, FIT, INTERLACED, SCAN, ScanClock, options, schedule
 from tests.beamline.scans import frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -25,35 +26,32 @@ def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -
     schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), begin=0.0, period=0.0, axis_col=20.25)
     clock.sleep(1.0)
     events: list[Event] = []
-    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
+    reconstruct_file(options(tmp_path, selection=Selection(), method=BRIEF), events.append, clock)
     assert events[-1].data["axis_col"] == 20.25
 
 
 def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
+    reconstruct_file(options(tmp_path, selection=Selection(), method=BRIEF), events.append, clock)
     started = [event.data for event in events if event.event == "recon_started"]
     assert started[0]["n_views"] < 30
     assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
 
 
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locate(
-        source: object, corrector: object, frames: np.ndarray, warn: object, all_there: bool
-    ) -> tuple[float, AxisEstimate]:
+    def locate(source: object, corrector: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         value = 18.0 if frames.size < 20 else 20.7
         return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    metrics = reconstruct_file(
-        options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0)), events.append, clock
-    ).metrics
-    assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
+    wanted = options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0))
+    metrics = reconstruct_file(wanted, events.append, clock).metrics
+    begun = [event.data for event in events if event.event == "recon_started"]
+    assert [(each["axis_col"], each["again"]) for each in begun] == [(18.0, False), (20.7, True)]
     assert events[-1].data["axis_col"] == 20.7
-    assert [e.data["again"] for e in events if e.event == "recon_started"] == [False, True]
     history = read_reconstruction(tmp_path / "recon.h5").history
     assert history["n_views"][-1] == 30
     assert np.all(np.diff(history["seconds"]) > 0)  # one time, though the second fit began later

@@ -32,12 +32,14 @@ from recon.prep.correct import Correction, Projections, Transmission
 from recon.splatting.stream import StreamingFit
 from recon.voxels.enough_views import Goal
 from tests.beamline.reconstruct.growing_scan import (
+    BRIEF,
     EPOCH,
     INTERLACED,
     RHYTHM,
     SCAN,
     TICK,
     ScanClock,
+    alarms,
     close,
     options,
     schedule,
@@ -48,14 +50,28 @@ from tests.slow_cases import others_slow
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.fixture
+def judged(monkeypatch: pytest.MonkeyPatch) -> list[PreparedProjections]:
+    """The views that volumes are judged by."""
+    seen: list[PreparedProjections] = []
+    write = pipeline.write_result
+
+    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
+        seen.append(prepared)
+        return write(outcome, prepared, *rest)
+
+    monkeypatch.setattr(pipeline, "write_result", write_and_keep)
+    return seen
+
+
 @pytest.mark.parametrize("use_flags", others_slow([True, False]))
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
-    clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
+    clock, events, bad = ScanClock(), list[Event](), range(11, 16)
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(*bad))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
-    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
+    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), events.append, clock)
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
-    assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
+    assert set(parameters["view_frames"]) == set(range(4, 34)) - set(bad if use_flags else ())  # type: ignore[arg-type]
     assert parameters["views_left_out"] == 5 * use_flags
     assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
@@ -67,7 +83,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     frames = frames_of(INTERLACED)
     frames.append(replace(frames[12], index=34, replaces=12, time=frames[33].time + 1))
     frames[12] = replace(frames[12], counts=frames[12].counts // 40)
-    schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
+    schedule(clock, tmp_path / "scan.h5", frames, flags=alarms(12))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
     metrics = reconstruct_file(options(tmp_path, selection=selection), events.append, clock).metrics
     record = read_reconstruction(tmp_path / "recon.h5")
@@ -129,29 +145,27 @@ _EACH = {("auto", 1.3, 2.0), ("none", None, 2.0), ("3,3", 1.3, 0.0)}
     ],
 )
 def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to_the_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float | None, air: str, pause: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    judged: list[PreparedProjections],
+    gain: float | None,
+    air: str,
+    pause: float,
 ) -> None:
     """Also where flats at the end (of a brighter beam) change every view that the model has learnt from."""
     fits: list[StreamingFit] = []
     finish = StreamingFit.finish
-    judged: list[PreparedProjections] = []
-    write = pipeline.write_result
 
     def finish_and_keep(self: StreamingFit, *rest: Any) -> Progress:
         fits.append(self)
         return finish(self, *rest)
 
-    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
-        judged.append(prepared)
-        return write(outcome, prepared, *rest)
-
     monkeypatch.setattr(StreamingFit, "finish", finish_and_keep)
-    monkeypatch.setattr(pipeline, "write_result", write_and_keep)
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
     schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain), pause=pause)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air(air),))
-    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
+    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), events.append, clock)
 
     with open_scan(tmp_path / "scan.h5") as source:
         whole = prepare_projections(source, selection, pytest.fail)  # type: ignore[arg-type]
@@ -174,7 +188,7 @@ def _brighter(frame: Frame, index: int) -> Frame:
 
 
 def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: list[PreparedProjections]
 ) -> None:
     """The beam changed in between: views are corrected by the flats of their own part, already while they come."""
     frames, clock, events = frames_of(INTERLACED), ScanClock(), list[Event]()
@@ -186,23 +200,17 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     schedule(clock, tmp_path / "rest.h5", later, plan=json.dumps(plan))
 
     live: list[Projections] = []
-    judged: list[PreparedProjections] = []
-    again, write = ScanFollower.correct_again, pipeline.write_result
+    again = ScanFollower.correct_again
 
     def as_it_was(self: ScanFollower, usable: UsableViews, why: str) -> None:
         live.append(self._joined())
         again(self, usable, why)
 
-    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
-        judged.append(prepared)
-        return write(outcome, prepared, *rest)
-
     monkeypatch.setattr(ScanFollower, "correct_again", as_it_was)
-    monkeypatch.setattr(pipeline, "write_result", write_and_keep)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
     source = SourceOptions(tmp_path / "rest.h5", earlier=(tmp_path / "scan.h5",))
-    goal = Goal(psnr_loss=0.01)
-    reconstruct_file(options(tmp_path, source=source, selection=selection, enough=goal), events.append, clock)
+    wanted = options(tmp_path, source=source, selection=selection, enough=Goal(psnr_loss=0.01), method=BRIEF)
+    reconstruct_file(wanted, events.append, clock)
 
     join([tmp_path / "scan.h5", tmp_path / "rest.h5"], tmp_path / "joined.h5")
     with open_scan(tmp_path / "joined.h5") as joined:
@@ -214,10 +222,8 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     assert [part.view_ids.size for part in live] == [12, 30]
     np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
     states = [event.data for event in events if event.event == "state" and event.data["state"] == "correcting"]
-    messages = [data["message"] for data in states]
-    assert len(messages) == 2
-    assert "next part of the run begin" in messages[0]
-    assert "The run has several parts" in messages[1]
+    begins, has_parts = [data["message"] for data in states]
+    assert "next part of the run begin" in begins and "The run has several parts" in has_parts
     first = next(event for event in events if event.event == "snapshot")
     assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
     warned = [event.data["message"] for event in events if event.event == "warning"]
@@ -241,7 +247,7 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("3,3"),))
-    reconstruct_file(options(tmp_path, selection=selection), lambda event: None, clock)
+    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), lambda event: None, clock)
     assert len(corrected) == 30 and len(set(corrected)) == 30
 
 

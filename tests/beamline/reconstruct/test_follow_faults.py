@@ -16,10 +16,8 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.features.files.ingest import ingest
-from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import CHECKS
+from beamline.monitor.check import Flag
 from beamline.monitor.digest import digest
-from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
@@ -28,8 +26,17 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
-from recon.splatting.r2 import R2
-from tests.beamline.reconstruct.growing_scan import INTERLACED, RHYTHM, SCAN, ScanClock, StandingClock
+from tests.beamline.reconstruct.growing_scan import (
+    FIT,
+    INTERLACED,
+    RHYTHM,
+    SCAN,
+    ScanClock,
+    StandingClock,
+    alarms,
+    options,
+    schedule,
+)  # fmt: skip
 from tests.beamline.scans import frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -39,46 +46,25 @@ ALLOWED = 0.3  # dB
 
 
 def _options(file: Path) -> ReconOptions:
-    return ReconOptions(
-        source=SourceOptions(file),
-        target=OutputPaths(file.with_name(f"{file.stem}_recon.h5"), None),
-        selection=Selection(axis_col=SCAN.axis_col),
-        method=R2(seconds=4.0, gaussians=200),
-        follow=RHYTHM,
-        command="beamline recon scan.h5 --follow",
-    )
-
-
-def _take(clock: ScanClock, path: Path, frames: list[Frame], period: float, flags: Mapping[int, Flag]) -> None:
-    """The scan: a frame every `period` s; `flags` come with the row that they are named by."""
-    writer = NXtomoWriter(path, INFO, frames[0].counts.shape, clock=StandingClock())
-    for k, frame in enumerate(frames):
-        said = [flags[k]] if k in flags else []
-        clock.due.append(
-            (clock.time + period * k, lambda f=frame, s=said: writer.append(f, digest(f.counts), s))  # type: ignore[misc]
-        )
-    clock.due.append((clock.time + period * len(frames), lambda: writer.close("complete")))
+    target = OutputPaths(file.with_name(f"{file.stem}_recon.h5"), None)
+    return options(file.parent, source=SourceOptions(file), target=target, method=replace(FIT, seconds=4.0))
 
 
 def _numbered(frames: list[Frame]) -> list[Frame]:
     return [replace(frame, index=k) for k, frame in enumerate(frames)]
 
 
-def _alarm(frame: int, first: int | None = None) -> Flag:
-    return Flag(CHECKS[0].name, Level.ALARM, frame, 1.0, 0.0, "", first=first)
-
-
 def _quality(file: Path, clock: Clock, events: list[Event] | None = None) -> float:
     """PSNR in dB of what is made of a file that is followed."""
-    options = _options(file)
-    reconstruct_file(options, ([] if events is None else events).append, clock)
-    volume = read_reconstruction(options.target.output).volume
+    wanted = _options(file)
+    reconstruct_file(wanted, ([] if events is None else events).append, clock)
+    volume = read_reconstruction(wanted.target.output).volume
     return psnr(SCAN.truth(volume.grid), volume.data)
 
 
 def _followed(path: Path, frames: list[Frame], period: float, flags: Mapping[int, Flag], events: list[Event]) -> float:
     clock = ScanClock()
-    _take(clock, path, frames, period, flags)
+    schedule(clock, path, frames, begin=0.0, period=period, flags=flags)
     return _quality(path, clock, events)
 
 
@@ -91,8 +77,7 @@ def test_half_of_the_views_with_an_alarm(tmp_path: Path) -> None:
     frames, bad = frames_of(INTERLACED), set(range(4, 34, 2))
     good = _numbered([frame for frame in frames if frame.index not in bad])
     undisturbed = _followed(tmp_path / "good.h5", good, 0.2, {}, [])
-    flags = {k: _alarm(k) for k in bad}
-    assert _followed(tmp_path / "half.h5", _spoiled(frames, bad), 0.1, flags, []) > undisturbed - ALLOWED
+    assert _followed(tmp_path / "half.h5", _spoiled(frames, bad), 0.1, alarms(*bad), []) > undisturbed - ALLOWED
 
 
 def test_views_that_are_flagged_after_the_model_has_learnt_them(tmp_path: Path) -> None:
@@ -101,7 +86,8 @@ def test_views_that_are_flagged_after_the_model_has_learnt_them(tmp_path: Path) 
     undisturbed = _followed(tmp_path / "good.h5", good, 0.1, {}, [])
     events = list[Event]()
     # A later check: its finding comes with row 30, and holds for the rows 18 to 22 before it.
-    late = _followed(tmp_path / "late.h5", _spoiled(frames, bad), 0.1, {30: _alarm(22, first=18)}, events)
+    found = {30: replace(alarms(22)[22], first=18)}
+    late = _followed(tmp_path / "late.h5", _spoiled(frames, bad), 0.1, found, events)
     assert any("5 views turned out bad" in str(event.data.get("message")) for event in events)
     assert late > undisturbed - ALLOWED
 

@@ -84,11 +84,7 @@ def _views_and_as_seen(prepared: PreparedProjections, grid: Grid) -> tuple[np.nd
     return views, at_voxel_resolution(views, ViewResolution.of(prepared.geometry.select(some), grid))
 
 
-def _ball() -> Volume:
-    return _ball_in((12, 24, 24))
-
-
-def _ball_in(shape: tuple[int, int, int]) -> Volume:
+def _ball(shape: tuple[int, int, int] = (12, 24, 24)) -> Volume:
     grid = Grid(shape, 1.0)
     z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
     return Volume((z**2 + y**2 + x**2 < 25).astype(np.float32), grid)
@@ -119,7 +115,7 @@ def test_without_a_truth_the_background_tells(rng: np.random.Generator) -> None:
 
 def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
     """What is measured in four bands of sixteen of 200 rows, each slice alike, is what all rows give."""
-    ball = _ball_in((200, 24, 24))
+    ball = _ball((200, 24, 24))
     flat = Volume(
         np.repeat(ball.data[100:101], 200, axis=0) * rng.normal(1, 0.1, (24, 24)).astype(np.float32), ball.grid
     )
@@ -135,7 +131,7 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
 def test_bands_lie_where_the_matter_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few rows of a large detector show a sample: a residual is of these, at its ends as well."""
     monkeypatch.setattr(module, "RESIDUAL_RAYS", 4 * 16 * 24)
-    ball = _ball_in((200, 24, 24))
+    ball = _ball((200, 24, 24))
     thin = Volume(np.where(np.isin(np.arange(200), (0, 1, 63, 199))[:, None, None], ball.data[100], 0), ball.grid)
     wrong = Volume(0.8 * thin.data, ball.grid)
     prepared = _prepared(thin)

@@ -16,20 +16,20 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct import checkpoints, job
+from beamline.reconstruct import budget, checkpoints, job
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.recon_file import read_checkpoint, read_reconstruction
+from beamline.storage.writers.recon_file import ReconRecord, read_checkpoint, read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
+from recon.assess.time_model import Speeds
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.methods import build, by_name
-from recon.splatting.problem import Loss
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
@@ -39,6 +39,8 @@ from tests.clock import SteppedClock
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCAN = TwoCylinders(shape=(2, 40), pixel_size_mm=0.5)
+R2_FIT = R2(steps=80, gaussians=300)
+FIT = {"method": R2_FIT, "selection": Selection(axis_col=SCAN.axis_col)}
 
 
 def _options(tmp_path: Path, **changes: object) -> ReconOptions:
@@ -52,6 +54,11 @@ def _options(tmp_path: Path, **changes: object) -> ReconOptions:
         command="beamline recon scan.h5 -m fbp",
     )
     return replace(options, **changes)  # type: ignore[arg-type]
+
+
+def _made(options: ReconOptions) -> ReconRecord:
+    reconstruct_file(options, lambda event: None, SystemClock())
+    return read_reconstruction(options.target.output)
 
 
 def _names(folder: Path) -> set[str]:
@@ -135,8 +142,9 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
         asked.append({"method": method or R2(), "geometry": geometry})
 
     monkeypatch.setattr(job, "warm_up", compiled)
+    monkeypatch.setattr(budget, "speeds_of", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1, 0.01))
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
-    reconstruct_file(_options(tmp_path, selection=selection, **changes), lambda event: None, SystemClock())
+    _made(_options(tmp_path, selection=selection, **changes))
     assert len(asked) == 1
     geometry = asked[0].pop("geometry")
     assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
@@ -147,8 +155,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
 
 def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     selection = Selection(views="first:20", rows=(0, 2), binning=2, axis_col=20.7, seed=3)
-    reconstruct_file(_options(tmp_path, selection=selection, seed=3), lambda e: None, SystemClock())
-    record = read_reconstruction(tmp_path / "out.h5")
+    record = _made(_options(tmp_path, selection=selection, seed=3))
     said = {
         "method": "fbp",
         "axis_col": 20.7,
@@ -174,19 +181,16 @@ def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     assert Path(record.raw_file) == (tmp_path / "scan.h5").resolve()
 
 
-def test_scale_unknown_means_pixels(tmp_path: Path) -> None:
+def test_scale_unknown_means_pixels_and_a_given_one_wins(tmp_path: Path) -> None:
     with h5py.File(write_exchange(tmp_path / "scan.h5", SCAN), "r+") as file:
         del file.attrs["pixel_size_mm"]
-    reconstruct_file(_options(tmp_path), lambda e: None, SystemClock())
-    record = read_reconstruction(tmp_path / "out.h5")
-    assert record.length_unit == "px"
-    assert record.volume.grid.voxel_size == 1.0
+    record = _made(_options(tmp_path))
+    assert (record.length_unit, record.volume.grid.voxel_size) == ("px", 1.0)
     assert record.volume.data[:, 20:24, 23:27].max() == pytest.approx(0.07, rel=0.25)  # 1 / px
-
-
-def test_a_given_pixel_size_wins(tmp_path: Path) -> None:
-    reconstruct_file(_options(tmp_path, selection=Selection(pixel_size_mm=0.25)), lambda e: None, SystemClock())
-    assert read_reconstruction(tmp_path / "out.h5").volume.grid.voxel_size == pytest.approx(0.25)
+    given = _made(
+        _options(tmp_path, selection=Selection(pixel_size_mm=0.25), target=OutputPaths(tmp_path / "b.h5", None))
+    )
+    assert (given.length_unit, given.volume.grid.voxel_size) == ("mm", 0.25)
 
 
 @pytest.mark.parametrize(
@@ -196,21 +200,21 @@ def test_a_given_pixel_size_wins(tmp_path: Path) -> None:
         ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
         ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
         ({"target": OutputPaths(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
+        ({"quality": "best"}, ConfigError, "r2, r2-published"),  # which FBP would ignore
+        ({**FIT, "device": "abacus"}, ConfigError, "--device abacus"),
     ],
 )
 def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], error: type[Exception], said: str) -> None:
-    options = _options(tmp_path, **changes)
     with pytest.raises(error, match=said):
-        reconstruct_file(options, lambda e: None, SystemClock())
+        _made(_options(tmp_path, **changes))
     assert _names(tmp_path) == {"scan.h5"}
 
 
 @pytest.mark.parametrize("existing", ["out.h5", "out.html"])
 def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> None:
     (tmp_path / existing).write_text("precious")
-    options = _options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"))
     with pytest.raises(DataError, match="never overwritten"):
-        reconstruct_file(options, lambda e: None, SystemClock())
+        _made(_options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")))
     assert (tmp_path / existing).read_text() == "precious"
     assert _names(tmp_path) == {"scan.h5", existing}
 
@@ -220,56 +224,29 @@ def test_a_report_that_fails_takes_the_volume_with_it(tmp_path: Path, monkeypatc
         raise DataError("no space left")
 
     monkeypatch.setattr("beamline.report.html.write_report", full)
-    options = _options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"))
     with pytest.raises(DataError, match="no space"):
-        reconstruct_file(options, lambda e: None, SystemClock())
+        _made(_options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")))
     assert _names(tmp_path) == {"scan.h5"}
 
 
 def test_a_scan_still_being_written_is_not_taken_for_a_finished_one(tmp_path: Path) -> None:
     writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), (4, 8), clock=SystemClock())
     with pytest.raises(DataError):
-        reconstruct_file(_options(tmp_path), lambda e: None, SystemClock())
+        _made(_options(tmp_path))
     writer.close()
     assert _names(tmp_path) == {"scan.h5"}
 
 
 def test_what_a_dead_scan_left_is_reconstructed_when_asked_for(tmp_path: Path) -> None:
     """The writer never closes its file, as when its process was killed."""
-    warnings: list[str] = []
-
-    def listen(event: Event) -> None:
-        if event.event == "warning":
-            warnings.append(event.data["message"])
-
+    events: list[Event] = []
     writer = NXtomoWriter(tmp_path / "scan.h5", ScanInfo(sample="s"), SCAN.shape, clock=SystemClock())
     for frame in frames_of(SCAN)[:-5]:
         writer.append(frame, digest(frame.counts))
-    options = _options(tmp_path, unfinished=True)
-    reconstruct_file(options, listen, SystemClock())
+    reconstruct_file(_options(tmp_path, unfinished=True), events.append, SystemClock())
     writer.close("failed")
-    record = read_reconstruction(options.target.output)
-    assert record.parameters["n_views"] == SCAN.angles.size - 5
-    assert any("was not closed: 44 frames" in said for said in warnings)
-
-
-def test_the_same_seed_gives_the_same_volume(tmp_path: Path) -> None:
-    volumes = []
-    for name in ("a.h5", "b.h5"):
-        options = _options(
-            tmp_path, method=R2(steps=20, gaussians=200), seed=5, target=OutputPaths(tmp_path / name, None)
-        )
-        reconstruct_file(options, lambda e: None, SystemClock())
-        volumes.append(read_reconstruction(tmp_path / name).volume.data)
-    np.testing.assert_allclose(volumes[0], volumes[1], atol=1e-4 * np.abs(volumes[0]).max())
-
-
-R2_FIT = R2(steps=80, gaussians=300)
-FIT = {"method": R2_FIT, "selection": Selection(axis_col=SCAN.axis_col)}
-
-
-def _volume(path: Path) -> np.ndarray:
-    return read_reconstruction(path).volume.data
+    assert read_reconstruction(tmp_path / "out.h5").parameters["n_views"] == SCAN.angles.size - 5
+    assert any(e.event == "warning" and "was not closed: 44 frames" in e.data["message"] for e in events)
 
 
 @pytest.mark.slow
@@ -277,7 +254,7 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     """Ended after some steps, begun again from its file: the same volume to the bit, with views held out as well."""
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
     whole = _options(tmp_path, **{**FIT, "selection": selection})
-    reconstruct_file(whole, lambda e: None, SystemClock())
+    uninterrupted = _made(whole).volume.data
     asked: list[int] = []
 
     @contextmanager
@@ -287,18 +264,13 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     kept = tmp_path / "fit.checkpoint.h5"
     part = replace(whole, target=OutputPaths(tmp_path / "part.h5", None), checkpoints=CheckpointOptions(kept))
     reconstruct_file(part, lambda e: None, SystemClock(), after_30_steps)
-    assert read_reconstruction(tmp_path / "part.h5").parameters["ended_early"]
+    begun = read_reconstruction(tmp_path / "part.h5")
+    assert begun.parameters["ended_early"] and np.abs(begun.volume.data - uninterrupted).max() > 0
     assert read_checkpoint(kept).state["counts"][1] == len(asked) + 1 < 80
-    rest = replace(
-        whole,
-        target=OutputPaths(tmp_path / "rest.h5", tmp_path / "rest.html"),
-        checkpoints=CheckpointOptions(None, kept),
-    )
-    reconstruct_file(rest, lambda e: None, SystemClock())
-    np.testing.assert_array_equal(_volume(tmp_path / "rest.h5"), _volume(tmp_path / "out.h5"))
-    assert np.abs(_volume(tmp_path / "part.h5") - _volume(tmp_path / "out.h5")).max() > 0
-    parameters = read_reconstruction(tmp_path / "rest.h5").parameters
-    assert parameters["resumed_from"] == str(kept) and parameters["steps"] == 80
+    target = OutputPaths(tmp_path / "rest.h5", tmp_path / "rest.html")
+    rest = _made(replace(whole, target=target, checkpoints=CheckpointOptions(None, kept)))
+    np.testing.assert_array_equal(rest.volume.data, uninterrupted)
+    assert rest.parameters["resumed_from"] == str(kept) and rest.parameters["steps"] == 80
     page = (tmp_path / "rest.html").read_text(encoding="utf-8")
     assert "since the fit was resumed" in page and " more would " not in page
 
@@ -317,28 +289,20 @@ def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: 
 
 
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
-    kept = tmp_path / "fit.checkpoint.h5"
-    reconstruct_file(_options(tmp_path, **FIT, checkpoints=CheckpointOptions(kept)), lambda e: None, SystemClock())
-    squares = replace(R2_FIT, fit=FitSettings(loss="l2"))
-    other = _options(
-        tmp_path,
-        **{**FIT, "method": squares},
-        seed=4,
-        checkpoints=CheckpointOptions(None, kept),
-        target=OutputPaths(tmp_path / "b.h5", None),
-    )
+    kept, fit = tmp_path / "fit.checkpoint.h5", R2(steps=5, gaussians=100)
+    first = _options(tmp_path, **{**FIT, "method": fit}, checkpoints=CheckpointOptions(kept))
+    _made(first)
+    other = replace(first, checkpoints=CheckpointOptions(None, kept), target=OutputPaths(tmp_path / "b.h5", None))
     with pytest.raises(DataError, match=r"\(l2, l1"):
-        reconstruct_file(other, lambda e: None, SystemClock())
+        _made(replace(other, method=replace(fit, fit=FitSettings(loss="l2")), seed=4))
     with pytest.raises(DataError, match="axis_col"):
-        reconstruct_file(
-            replace(other, method=R2_FIT, seed=0, selection=Selection(axis_col=20.0)), lambda e: None, SystemClock()
-        )
+        _made(replace(other, selection=Selection(axis_col=20.0)))
     assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
 
 
 def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
     events: list[Event] = []
-    options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, steps=120, early_stop=True)})
+    options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, early_stop=True)})
     metrics = reconstruct_file(options, events.append, SystemClock()).metrics
     said = [event.data["message"] for event in events if event.event == "state"]
     assert said == ["4 of 45 views are held out to say when to stop"]
@@ -348,17 +312,15 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
     assert np.isfinite(record.history["held_out"][-1])
 
 
-@pytest.mark.parametrize(("loss", "kernel"), [("l2", Kernel.GAUSSIAN), ("poisson", Kernel.COMPACT)])
-def test_every_loss_and_kernel_is_fitted_and_kept(tmp_path: Path, loss: Loss, kernel: Kernel) -> None:
-    method = replace(R2_FIT, start="tv", fit=FitSettings(loss=loss, kernel=kernel))
-    metrics = reconstruct_file(_options(tmp_path, **{**FIT, "method": method}), lambda e: None, SystemClock()).metrics
-    parameters = read_reconstruction(tmp_path / "out.h5").parameters
-    assert (parameters["loss"], parameters["start"], parameters["device"]) == (loss, "tv", "cpu")
-    assert parameters["kernel"] == kernel.value
-    assert metrics["residual"] < 0.2
+def test_loss_kernel_and_start_are_those_that_were_asked_for_and_kept(tmp_path: Path) -> None:
+    method = replace(R2_FIT, start="tv", fit=FitSettings(loss="poisson", kernel=Kernel.COMPACT))
+    record = _made(_options(tmp_path, **{**FIT, "method": method}))
+    kept = {name: record.parameters[name] for name in ("loss", "kernel", "start", "device")}
+    assert kept == {"loss": "poisson", "kernel": Kernel.COMPACT.value, "start": "tv", "device": "cpu"}
+    assert record.metrics["residual"] < 0.2
 
 
-@pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
+@pytest.mark.parametrize("method", ["cgls", "os-sirt-tv"])
 def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str) -> None:
     events: list[Event] = []
     options = _options(
@@ -376,28 +338,16 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
     assert by_name(method).label in (tmp_path / "out.html").read_text(encoding="utf-8")
 
 
-def test_an_option_that_the_method_would_ignore_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="r2, r2-published"):
-        reconstruct_file(_options(tmp_path, quality="best"), lambda e: None, SystemClock())
-    assert _names(tmp_path) == {"scan.h5"}
-
-
-def test_a_device_that_is_not_there_is_told_before_the_work(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--device abacus"):
-        reconstruct_file(_options(tmp_path, **FIT, device="abacus"), lambda e: None, SystemClock())
-    assert _names(tmp_path) == {"scan.h5"}
-
-
 @pytest.mark.slow
 def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Path) -> None:
-    """Measured data (Meaney 2022): R² from 60 of 240 views beats FBP of the same views by more than 1 dB."""
+    """Measured data (Meaney 2022), 16 rows: R² from 60 of 240 views beats FBP of these views by more than 1 dB."""
     events: list[Event] = []
     options = _options(
         tmp_path,
         source=SourceOptions(shared_data / "walnut_parallel_rebinned_240x96x256.h5", quantity="line_integrals"),
         method=R2(steps=400),
-        selection=Selection(views="fixed:60"),
-        truth=f"{shared_data / 'walnut_fdk_256.npz'}:70:166",
+        selection=Selection(views="fixed:60", rows=(40, 56)),
+        truth=f"{shared_data / 'walnut_fdk_256.npz'}:110:126",
         target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
     )
     metrics = reconstruct_file(options, events.append, SystemClock()).metrics

@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths
@@ -31,94 +31,78 @@ from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(12, 40))
 
 
-def _scan(folder: Path, turn: float) -> tuple[PreparedProjections, ReportContext]:
-    """A file's context, with a cone's views of the same sample (magnified five times) in place of its own."""
-    write_exchange(folder / "scan.h5", SCAN)
-    with SourceOptions(folder / "scan.h5").open() as source:
-        facts = facts_of(source)
-        selection = Selection(axis_col=SCAN.axis_col)
-        prepared = prepare_projections(source, selection, lambda said: None)
+Scan = tuple[PreparedProjections, ReportContext]
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    path, selection = tmp_path_factory.mktemp("scan") / "scan.h5", Selection(axis_col=SCAN.axis_col)
+    with SourceOptions(write_exchange(path, SCAN)).open() as source:
+        context = ReportContext(facts_of(source), selection, "beamline recon scan.h5", 0)
+    return prepare(path, selection)[0], context
+
+
+def _written(made: Reconstruction, scan: Scan, output: Path) -> tuple[Any, list[str]]:
+    """The volume beside a report: the last event's data, and all messages."""
+    events: list[Event] = []
+    target = OutputPaths(output, output.with_suffix(".html"))
+    write_result(made, scan[0], None, target, scan[1], events.append, SystemClock())
+    assert target.report is not None and target.report.exists()
+    return events[-1].data, [str(event.data.get("message")) for event in events]
+
+
+@pytest.mark.parametrize(("turn", "compared"), [(3.6, True), (2.8, False)])
+def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(
+    scan: Scan, tmp_path: Path, turn: float, compared: bool
+) -> None:
+    """Views of the same sample, magnified five times."""
     angles = np.linspace(0, turn, 30, endpoint=False)
     cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, axis_col=SCAN.axis_col)
     grid = Grid.matching(cone)
     data = Projector(cone, grid).forward(SCAN.truth(grid))
-    views = replace(prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None)
-    return views, ReportContext(facts, selection, "beamline recon scan.h5", 0)
-
-
-@pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, True), (2.8, False)])
-def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
-    prepared, context = _scan(tmp_path, turn)
-    result = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.OsSirtTv(iterations=3))
-    events: list[Event] = []
-    write_result(
-        result,
-        prepared,
-        None,
-        OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
-        context,
-        events.append,
-        SystemClock(),
-    )
-    done = events[-1].data
+    prepared = replace(scan[0], projections=replace(scan[0].projections, data=data), geometry=cone, held_out=None)
+    made = recon.reconstruct(data, cone, recon.OsSirtTv(iterations=3))
+    done, _ = _written(made, (prepared, scan[1]), tmp_path / "out.h5")
     assert ("fbp" in done) is compared
-    if compared:
-        assert done["fbp"]["residual"] < 0.3
-    assert (tmp_path / "out.html").exists()
+    assert not compared or done["fbp"]["residual"] < 0.3
 
 
 @pytest.mark.parametrize("doubtful", [True, False])
-def test_fbp_is_kept_beside_a_volume_that_hides_something(tmp_path: Path, doubtful: bool) -> None:
-    scan = replace(SCAN, shape=(12, 40))
-    write_exchange(tmp_path / "scan.h5", scan)
-    with SourceOptions(tmp_path / "scan.h5").open() as source:
-        facts, selection = facts_of(source), Selection(axis_col=SCAN.axis_col)
-        prepared = prepare_projections(source, selection, lambda said: None)
-    volume = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.FistaTv(iterations=15)).volume
+def test_fbp_is_kept_beside_a_volume_that_hides_something(scan: Scan, tmp_path: Path, doubtful: bool) -> None:
+    views, output = scan[0], tmp_path / "out.h5"
+    volume = recon.reconstruct(views.projections.data, views.geometry, recon.FistaTv(iterations=15)).volume
     if doubtful:
         volume = replace(volume, data=gaussian_filter(volume.data, (0, 2, 2)))
-    events: list[Event] = []
-    target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
-    made = Reconstruction(volume, {}, method="fista-tv", seconds=1.0)
-    context = ReportContext(facts, selection, "beamline recon scan.h5", 0)
-    write_result(made, prepared, None, target, context, events.append, SystemClock())
-    record = read_reconstruction(target.output)
+    _, said = _written(Reconstruction(volume, {}, method="fista-tv", seconds=1.0), scan, output)
+    record = read_reconstruction(output)
     np.testing.assert_array_equal(record.volume.data, volume.data)
-    said = [str(event.data.get("message")) for event in events]
     assert any("`beamline view out.h5` shows both" in each for each in said) is doubtful
-    with closing(ShownVolume(target.output)) as shown:
+    with closing(ShownVolume(output)) as shown:
         assert shown.has_fbp is doubtful is (record.fbp is not None)
     if record.fbp is None:
         with pytest.raises(DataError, match="keeps no FBP"):
-            ShownVolume(target.output, fbp=True)
+            ShownVolume(output, fbp=True)
         return
-    expected = direct(prepared.projections.data, prepared.geometry, volume.grid, "hann")
+    expected = direct(views.projections.data, views.geometry, volume.grid, "hann")
     np.testing.assert_allclose(record.fbp, expected, atol=1e-6)
-    with closing(ShownVolume(target.output, fbp=True)) as fbp:
+    with closing(ShownVolume(output, fbp=True)) as fbp:
         assert fbp.facts()["name"] == "out.h5, FBP"
         np.testing.assert_array_equal(fbp.cut(0, 5, TileRegion(0, 40, 0, 40)).values, record.fbp[5])
 
 
-def test_fbp_that_another_format_cannot_keep_is_told(tmp_path: Path) -> None:
-    write_exchange(tmp_path / "scan.h5", replace(SCAN, shape=(12, 40)))
-    with SourceOptions(tmp_path / "scan.h5").open() as source:
-        facts, selection = facts_of(source), Selection(axis_col=SCAN.axis_col)
-        prepared = prepare_projections(source, selection, lambda said: None)
-    grid = Grid.matching(prepared.geometry)
-    sharp = direct(prepared.projections.data, prepared.geometry, grid, "hann")
+def test_fbp_that_another_format_cannot_keep_is_told(scan: Scan, tmp_path: Path) -> None:
+    grid = Grid.matching(scan[0].geometry)
+    sharp = direct(scan[0].projections.data, scan[0].geometry, grid, "hann")
     made = Reconstruction(Volume(gaussian_filter(sharp, (0, 2, 2)), grid), {}, method="fista-tv", seconds=1.0)
-    events: list[Event] = []
-    target = OutputPaths(tmp_path / "out.npy", tmp_path / "out.html")
-    context = ReportContext(facts, selection, "beamline recon scan.h5", 0)
-    write_result(made, prepared, None, target, context, events.append, SystemClock())
-    said = [str(event.data.get("message")) for event in events]
+    _, said = _written(made, scan, tmp_path / "out.npy")
     assert any("may hide" in each for each in said)
     assert any("FBP of the same views is not kept" in each and "--method fbp" in each for each in said)
 

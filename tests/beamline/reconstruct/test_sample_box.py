@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import box_around_sample
-from drivers.base.frame import FrameKind
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, AXIS, BEAM, DARK = 24, 96, 50.0, 3000.0, 100
 ANGLES = np.radians(np.arange(0, 180, 3.0))
@@ -32,16 +31,13 @@ def cylinders(*bodies: tuple[float, float, float, float, slice]) -> NDArray[np.f
 
 def scan(depth: NDArray[np.float64], cone: tuple[float, float] | None = None) -> ArraySource:
     rng = np.random.default_rng(4)
-    light = [np.zeros((3, ROWS, COLS)), np.full((9, ROWS, COLS), BEAM), BEAM * np.exp(-depth)]
-    kinds = [FrameKind.DARK] * 3 + [FrameKind.FLAT] * 9 + [FrameKind.PROJECTION] * len(depth)
-    frames = (DARK + rng.poisson(np.concatenate(light))).astype(np.uint16)
-    source = ArraySource(frames, [int(kind) for kind in kinds], np.concatenate([np.zeros(12), ANGLES]))
+    light = np.zeros((3, ROWS, COLS)), np.full((9, ROWS, COLS), BEAM), BEAM * np.exp(-depth)
+    source = scan_of(*(DARK + rng.poisson(each) for each in light), ANGLES)
     source.cone = cone
     return source
 
 
-@pytest.mark.parametrize("faint", [0.3, 0.012])
-@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize(("faint", "binning"), [(0.3, 2), (0.012, 1)])
 def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> None:
     """A dense body, and one in other rows that absorbs as much or a twentieth of it."""
     bodies = (10.0, -12.0, 8.0, 0.1, slice(6, 15)), (-14.0, 5.0, 6.0, faint, slice(12, 18))

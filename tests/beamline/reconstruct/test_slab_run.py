@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 
 from beamline.projections.selection import Selection
-from beamline.reconstruct import estimate, result
+from beamline.reconstruct import estimate
 from beamline.reconstruct import memory as module
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import _as_they_come
@@ -37,14 +38,27 @@ FISTA = ("recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight
 FISTA += ("--memory", "4.1M")
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> Path:
-    """A noisy scan of 96 rows, scan.h5, that takes several slabs."""
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A noisy scan of 96 rows, scan.h5, and its volume, whole.h5, of three slabs that became the output where they lay,
+    beside what a killed call had left there."""
+    folder = tmp_path_factory.mktemp("made")
     scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(96, 32), axis_col=15.7)
-    counts = 100 + rng.poisson(scan.counts().astype(float) - 100)
-    write_exchange(Path("scan.h5"), scan, {"data": counts.astype(np.uint16)})
-    return tmp_path
+    counts = 100 + np.random.default_rng(20261120).poisson(scan.counts().astype(float) - 100)
+    write_exchange(folder / "scan.h5", scan, {"data": counts.astype(np.uint16)})
+    (folder / ".whole.partial.h5.structure").write_bytes(bytes(100))
+    with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("beamline.reconstruct.result.write_volume", None)
+        assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
+    assert left(folder) == {"scan.h5", "whole.h5"}
+    return folder
+
+
+def parts_and_whole(made: Path) -> tuple[ReconRecord, ReconRecord]:
+    """Of a run that was resumed and one that was not, with the same voxels."""
+    parts, whole = read_reconstruction(Path("parts.h5")), read_reconstruction(made / "whole.h5")
+    np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
+    return parts, whole
 
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool = False) -> None:
@@ -65,43 +79,39 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool =
     monkeypatch.setattr(PartialVolume, "add", adding)
 
 
-def test_resumed_is_uninterrupted_to_the_bit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resumed_is_uninterrupted_to_the_bit(made: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped within the second slab, resumed, stopped after another one, resumed."""
-    assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
     resume = ("-o", "parts.h5", "--resume", "parts.partial.h5")
     for slabs, half, more in ((1, True, resume[:2]), (1, False, resume)):
         with monkeypatch.context() as patch:
             interrupt_after(patch, slabs, half=half)
             stopped = beamline(*FISTA, *more)
         assert stopped.exit_code == 4 and "--resume parts.partial.h5" in stopped.stderr, stopped.output
-        assert left(folder) == {"scan.h5", "whole.h5", "parts.partial.h5"}
+        assert left(folder) == {"scan.h5", "parts.partial.h5"}
     said, found = beamline("info", "parts.partial.h5"), beamline("validate", "parts.partial.h5")
     assert said.exit_code == 0 and "64 of 96 slices" in said.stdout
     assert found.exit_code == 5 and "64 of 96 slices are there" in found.output
 
     resumed = beamline(*FISTA, *resume)
     assert resumed.exit_code == 0 and "64 of 96 slices are there." in resumed.stderr, resumed.output
-    whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
-    np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
-    assert parts.metrics["residual"] == whole.metrics["residual"]
+    parts, whole = parts_and_whole(made)
+    assert parts.metrics["residual"] == whole.metrics["residual"] > 0
     assert parts.parameters["resumed_from"] == "parts.partial.h5"
     assert "--resume" not in str(parts.parameters["command"])  # the file is gone
-    assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
+    assert left(folder) == {"scan.h5", "parts.h5"}
 
 
-def test_the_partial_volume_becomes_the_output_where_it_lies(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(result, "write_volume", None)
-    assert beamline(*FISTA, "-o", "out.h5").exit_code == 0
-    assert left(folder) == {"scan.h5", "out.h5"} and beamline("validate", "out.h5").exit_code == 0
-    found = read_reconstruction(Path("out.h5"))
-    assert found.metrics["residual"] > 0 and found.parameters["slabs"] == 3 and "partial" not in found.parameters
-    assert Path("out.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
+def test_a_volume_that_lay_where_its_slabs_did_is_as_any_other(made: Path) -> None:
+    assert beamline("validate", str(made / "whole.h5")).exit_code == 0
+    found = read_reconstruction(made / "whole.h5")
+    assert found.parameters["slabs"] == 3 and "partial" not in found.parameters
+    assert (made / "whole.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [OSError("the disk is full"), KeyboardInterrupt()])
 def test_a_volume_that_could_not_be_completed_is_resumed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    made: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     """After KeyboardInterrupt the file is as after a kill."""
 
@@ -111,7 +121,6 @@ def test_a_volume_that_could_not_be_completed_is_resumed(
             file["entry/filled"] = np.ones(1000)
         raise error
 
-    assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
     with monkeypatch.context() as patch:
         patch.setattr(partial_volume, "rewrite_facts", fail)
         failed = beamline(*FISTA, "-o", "parts.h5")
@@ -121,15 +130,8 @@ def test_a_volume_that_could_not_be_completed_is_resumed(
     assert said.exit_code == 5 and told in said.output and isinstance(said.exception, SystemExit)
     resumed = beamline(*FISTA, "-o", "parts.h5", "--resume", "parts.partial.h5")
     assert resumed.exit_code == 0 and "96 of 96 slices are there." in resumed.stderr, resumed.output
-    assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
-    whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
-    np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
-
-
-def test_what_a_killed_call_left_beside_its_output_is_in_nobodys_way(folder: Path) -> None:
-    Path(".out.partial.h5.structure").write_bytes(bytes(100))  # its partial volume had become the output
-    assert beamline(*FISTA, "-o", "out.h5").exit_code == 0
-    assert left(folder) == {"scan.h5", "out.h5"} and beamline("validate", "out.h5").exit_code == 0
+    assert left(folder) == {"scan.h5", "parts.h5"}
+    parts_and_whole(made)
 
 
 @pytest.mark.slow

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -58,19 +59,46 @@ def scan_frames(rng: np.random.Generator, n_darks: int = 2, n_flats: int = 3, n_
     return frames
 
 
-@pytest.fixture
-def frames(rng: np.random.Generator) -> list[Frame]:
-    return scan_frames(rng)
+def written(path: Path, frames: Iterable[Frame], info: ScanInfo = INFO) -> Path:
+    """A complete scan of these frames."""
+    with NXtomoWriter(path, info, SHAPE, clock=SteppedClock(EPOCH)) as writer:
+        append(writer, *frames)
+    return path
+
+
+def append(writer: NXtomoWriter, *frames: Frame) -> None:
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
 
 
 @pytest.fixture
-def write(tmp_path: Path, clock: SteppedClock) -> Callable[[list[Frame]], Path]:
+def writer(tmp_path: Path, clock: SteppedClock) -> NXtomoWriter:
+    """Of a new scan, s.h5."""
+    return NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+
+
+@pytest.fixture
+def frames() -> list[Frame]:
+    return scan_frames(np.random.default_rng(20261120))
+
+
+@pytest.fixture(scope="session")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of `frames`, of which tests have copies."""
+    return written(tmp_path_factory.mktemp("good") / "scan.h5", scan_frames(np.random.default_rng(20261120)))
+
+
+@pytest.fixture
+def path(good: Path, tmp_path: Path) -> Path:
+    """The file of `frames`."""
+    return Path(shutil.copyfile(good, tmp_path / "scan.h5"))
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[list[Frame]], Path]:
     """Write frames to a new, complete scan and give its path."""
 
     def write(frames: list[Frame], name: str = "scan.h5") -> Path:
-        with NXtomoWriter(tmp_path / name, INFO, SHAPE, clock=clock) as writer:
-            for frame in frames:
-                writer.append(frame, digest(frame.counts))
-        return tmp_path / name
+        return written(tmp_path / name, frames)
 
     return write

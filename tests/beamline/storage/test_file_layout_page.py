@@ -17,7 +17,6 @@ from beamline.cli.main import main
 from beamline.core.events import KINDS
 from beamline.features.files.ingest import ingest
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS
-from beamline.monitor.digest import digest
 from beamline.simulate import LabelledRun, write_labels
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -28,7 +27,7 @@ from recon.base.volume import VolumeSeries
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
-from tests.beamline.storage.conftest import EPOCH
+from tests.beamline.storage.conftest import EPOCH, append
 from tests.beamline.storage.file_layout import PAGE, names, paths, rows, unmatched
 from tests.clock import SteppedClock
 
@@ -53,8 +52,7 @@ def whole_scan(tmp_path: Path) -> list[Path]:
     frames = frames_of(SCAN)
     frames.append(replace(frames[-1], index=len(frames), kind=FrameKind.ALIGNMENT))
     writer = NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=SteppedClock(EPOCH))
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames)
     writer.close(beam=[BeamReading(1.0, "A", 1.8e9)])
     assert writer.remarks == []
     ingested = ingest(write_exchange(tmp_path / "exchange.h5", SCAN), tmp_path / "ingested.h5", no_data=0.0)
@@ -90,8 +88,7 @@ def test_the_flags() -> None:
 def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with NXtomoWriter(path, ScanInfo("s", pixel_size_mm=0.5), SCAN.shape, clock=SteppedClock(EPOCH)) as writer:
-        for frame in frames_of(SCAN):
-            writer.append(frame, digest(frame.counts))
+        append(writer, *frames_of(SCAN))
         writer.close("stopped", reason="Enough.")
     events: list[dict[str, object]] = []
     fit = ["--method", "r2", "--steps", "20", "--gaussians", "300", "--checkpoint", str(tmp_path / "checkpoint.h5")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -33,12 +32,17 @@ REGION = {"mass": (1, 3, 0, 6)}
 def path(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A scan of 4 views: beam flagged in views 1 and 2 (an alarm), mass in view 2."""
     found = [[], [("beam", Level.WARN)], [("beam", Level.ALARM), ("mass", Level.WARN)], [("dark", Level.INFO)]]
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
-        frame = Frame(rng.integers(0, 99, (4, 6)).astype(np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
-        for row, pairs in enumerate(found):
-            flags = [Flag(name, level, row, 1.5 * row, 0.0, "", REGION.get(name)) for name, level in pairs]
-            writer.append(replace(frame, index=row), digest(frame.counts), flags)
-    return writer.path
+    flags = [[Flag(*each, row, 1.5 * row, 0.0, "", REGION.get(each[0])) for each in f] for row, f in enumerate(found)]
+    return _written(tmp_path / "s.h5", rng.integers(0, 99, (4, 6)).astype(np.uint16), flags)
+
+
+def _written(path: Path, counts: np.ndarray, flags: list[list[Flag]]) -> Path:
+    """A scan of views alike, with these flags."""
+    with NXtomoWriter(path, ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
+        for row, found in enumerate(flags):
+            frame = Frame(counts, FrameKind.PROJECTION, row, 0, 0, 0.0, 1.8e9, 0.1)
+            writer.append(frame, digest(counts), found)
+    return path
 
 
 def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> None:
@@ -47,20 +51,16 @@ def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> N
         assert list(legend["name"].asstr()[()]) == NAMES
         assert list(legend["unit"].asstr()[()]) == [check.unit for check in CHECKS]
         assert list(legend["meaning"].asstr()[()]) == [check.meaning for check in CHECKS]
-        assert [2 ** int(bit) for bit in legend["bit"][()]] == [
-            bitmask([Flag(n, Level.WARN, 0, 1, 0, "")]) for n in NAMES
-        ]
+        bits = [bitmask([Flag(name, Level.WARN, 0, 1, 0, "")]) for name in NAMES]
+        assert [2 ** int(bit) for bit in legend["bit"][()]] == bits
         np.testing.assert_array_equal(legend["alarm_bit"][()] - legend["bit"][()], ALARM_SHIFT)
 
 
-def test_info_counts_by_check_and_level(path: Path) -> None:
+def test_info_counts_by_the_legend_of_the_file_and_not_the_checks_of_this_program(path: Path) -> None:
     expected = {"beam": {"warn": 1, "alarm": 1}, "mass": {"warn": 1}}
     facts = describe(path)
     assert (facts["flags"], facts["flagged_frames"], facts["alarmed_frames"]) == (expected, 2, 1)
     assert counted(facts["flags"]) == "beam 1 warn 1 alarm, mass 1 warn"
-
-
-def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: Path) -> None:
     with h5py.File(path, "r+", libver=("v110", "v110")) as file:
         names = file[f"{LEGEND}/name"]
         names[0] = "a check of a later version"
@@ -107,11 +107,7 @@ def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_me
     flags = FrameFlags.of_flags(found)
     assert flags.flagged.nonzero()[0].tolist() == [*range(2, 10)] and flags.alarmed.nonzero()[0].tolist() == [5, 6]
     assert flags.counts() == {"floater": {"warn": 8}, "ghost": {"alarm": 2}}
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
-        frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
-        for row, each in enumerate(found):
-            writer.append(replace(frame, index=row), digest(frame.counts), each)
-    with h5py.File(writer.path) as file:
+    with h5py.File(_written(tmp_path / "s.h5", np.zeros((4, 6), np.uint16), found)) as file:
         log, at = file["entry/frame_log"], NAMES.index("floater")
         np.testing.assert_array_equal(log["flags"], flags.bits)
         np.testing.assert_array_equal(log["frame_valid"], ~flags.alarmed)

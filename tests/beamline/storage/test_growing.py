@@ -13,12 +13,11 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
-from beamline.monitor.digest import digest
 from beamline.storage.readers.open import NotReadyError, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
-from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+from tests.beamline.storage.conftest import INFO, SHAPE, append, scan_frames
 from tests.clock import SteppedClock
 
 
@@ -27,7 +26,7 @@ def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: Stepp
     with open_scan(tmp_path / "s.h5", follow=True) as source:
         seen = []
         for frame in frames[:8]:
-            writer.append(frame, digest(frame.counts))
+            append(writer, frame)
             seen.append(source.refresh())
         assert seen == [0, 0, 3, 3, 3, 6, 6, 6]
         assert writer.committed == 6
@@ -64,8 +63,7 @@ def test_a_follower_in_another_process_gets_every_frame(
     follower = spawn.Process(target=follow_to_the_end, args=(tmp_path / "s.h5", opened, result))
     follower.start()
     assert opened.wait(60)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames)
     writer.close()
     assert writer.remarks == []
     assert result.get() == [*(int(frame.counts.sum()) for frame in frames), len(frames)]
@@ -76,8 +74,7 @@ def test_a_follower_in_another_process_gets_every_frame(
 def write_and_wait(path: Path, written: Event) -> None:
     """In another process: seven frames, the last two not flushed, then wait to be killed."""
     writer = NXtomoWriter(path, INFO, SHAPE, clock=SystemClock(), flush_every=5)
-    for frame in scan_frames(np.random.default_rng(5))[:7]:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *scan_frames(np.random.default_rng(5))[:7])
     written.set()
     multiprocessing.get_context("spawn").Event().wait()
 
@@ -116,7 +113,7 @@ def test_another_programs_lock_costs_nothing(tmp_path: Path, clock: SteppedClock
     spawn = multiprocessing.get_context("spawn")
     opened, released = spawn.Event(), spawn.Event()
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
+    append(writer, frames[0])
     viewer = spawn.Process(target=hold_open, args=(tmp_path / "s.h5", opened, released))
     viewer.start()
     assert opened.wait(60)
@@ -137,8 +134,7 @@ def test_a_file_that_is_cut_off_is_refused_at_once(
 ) -> None:
     """Under SWMR, which opens a file whose writer died, HDF5 would wait for the missing bytes for hours."""
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        for frame in frames:
-            writer.append(frame, digest(frame.counts))
+        append(writer, *frames)
         if not closed:
             (tmp_path / "cut.h5").write_bytes((tmp_path / "s.h5").read_bytes()[:-missing])
     if closed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +12,18 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.features.files.validate import describe
-from beamline.scan.resume import open_for_resume, recover_run
-from beamline.scan.run import run_scan
+from beamline.scan.resume import recover_run
 from beamline.storage.interrupted import next_step, scan_file, volume_file
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
-from tests.beamline.scan.test_resume import ENDS
+from tests.beamline.scan.test_resume import ENDS, _go_on
 
 AT = 10  # frames: in the views
 
 
 def beamline(*words: Any) -> Result:
     return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def _go_on(run: Path) -> None:
-    instrument = FakeInstrument()
-    instrument.clock.sleep(1000)
-    with open_for_resume(run) as series:
-        run_scan(series.config, series, instrument=instrument.connected())
 
 
 def _both(run: Path) -> str:
@@ -41,22 +33,54 @@ def _both(run: Path) -> str:
     )
 
 
-def test_a_scan_that_died_can_be_resumed_or_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = ENDS["killed"](tmp_path, monkeypatch, at=AT)
-    scan = run / "scan.h5"
-    assert next_step(scan) == f"Its scan has died: {_both(run)}"
+@pytest.fixture(scope="module")
+def died(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run whose program was killed."""
+    with pytest.MonkeyPatch.context() as patch:
+        return ENDS["killed"](tmp_path_factory.mktemp("died"), patch, at=AT)
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that is whole."""
+    run = Ran(tmp_path_factory.mktemp("ended"), FakeInstrument()).folder
+    assert run is not None
+    return run
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("recon",), ("info",), ("validate",), ("monitor",), ("view",), ("runs",), ("export", "-o", "a.tif"),
+        ("segment",), ("surface", "-o", "a.ply"),
+    ],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_all_commands_say_the_same_of_a_scan_that_died(
+    died: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    log = died / "events.jsonl"
+    log.write_text("".join(line for line in log.read_text().splitlines(True) if '"run_started"' in line))
+    monkeypatch.chdir(tmp_path)
+    command, *options = words
+    result = beamline(command, died.parent if command == "runs" else died, *options)
+    assert f"Its scan has died: {_both(died)}" in result.output
+
+
+def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_recovered(
+    died: Path, tmp_path: Path
+) -> None:
+    scan, alone = died / "scan.h5", tmp_path / "alone.h5"
+    assert next_step(scan) == f"Its scan has died: {_both(died)}"
+    shutil.copy2(scan, alone)
+    said = f"Its scan has died: `beamline recover {alone}` makes an ordinary file of the frames that are there."
+    assert next_step(alone) == said
     os.utime(scan)  # perhaps on a disk without locks
     assert next_step(scan).startswith("Its scan has died, unless the program that wrote to it 0 s ago still runs: ")
     lock = WriterLock(scan)
-    assert next_step(scan).startswith(f"Its scan still runs: `beamline watch {run}`")
+    assert next_step(scan).startswith(f"Its scan still runs: `beamline watch {died}`")
     assert "recover" not in next_step(scan)
     lock.release()
-
-
-def test_a_file_alone_can_only_be_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scan = (ENDS["killed"](tmp_path, monkeypatch, at=AT) / "scan.h5").rename(tmp_path / "alone.h5")
-    said = f"Its scan has died: `beamline recover {scan}` makes an ordinary file of the frames that are there."
-    assert next_step(scan) == said
 
 
 @pytest.mark.parametrize("end", ["stopped", "aborted"])
@@ -74,13 +98,6 @@ def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(
     assert "--resume" not in beamline("validate", run / "scan.h5").output
 
 
-def test_of_a_whole_run_nothing_is_said(tmp_path: Path) -> None:
-    run = Ran(tmp_path, FakeInstrument()).folder
-    assert run is not None and scan_file(run) == run / "scan.h5"
-    assert next_step(run / "scan.h5") == ""
-    assert not [said for said in describe(run / "scan.h5")["findings"] if "--resume" in said]
-
-
 def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = ENDS["killed"](tmp_path, monkeypatch, at=AT)
     _go_on(run)
@@ -91,54 +108,30 @@ def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path, mo
     assert scan_file(run) == run / "joined.h5"
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("recon",), ("info",), ("validate",), ("monitor",), ("view",), ("runs",), ("export", "-o", "a.tif"),
-        ("segment",), ("surface", "-o", "a.ply"),
-    ],
-    ids=lambda words: words[0],
-)  # fmt: skip
-def test_all_commands_say_the_same_of_a_scan_that_died(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
-) -> None:
-    run = ENDS["killed"](tmp_path / "runs", monkeypatch, at=AT)
-    log = run / "events.jsonl"
-    log.write_text("".join(line for line in log.read_text().splitlines(True) if '"run_started"' in line))
-    monkeypatch.chdir(tmp_path)
-    command, *options = words
-    result = beamline(command, run.parent if command == "runs" else run, *options)
-    assert f"Its scan has died: {_both(run)}" in result.output
+def test_of_a_whole_run_nothing_is_said_and_its_folder_is_its_scan(ended: Path) -> None:
+    assert scan_file(ended) == ended / "scan.h5" and next_step(ended / "scan.h5") == ""
+    for command in ("info", "validate", "monitor"):
+        of_run, of_file = beamline(command, ended), beamline(command, ended / "scan.h5")
+        assert (of_run.exit_code, of_run.stdout) == (of_file.exit_code, of_file.stdout)
+        assert str(ended / "scan.h5") in of_run.output and "--resume" not in of_run.output
 
 
-@pytest.mark.parametrize("command", ["info", "validate", "monitor"])
-def test_the_folder_of_a_run_is_its_scan(tmp_path: Path, command: str) -> None:
-    run = Ran(tmp_path, FakeInstrument()).folder
-    assert run is not None
-    of_run, of_file = beamline(command, run), beamline(command, run / "scan.h5")
-    assert (of_run.exit_code, of_run.stdout) == (of_file.exit_code, of_file.stdout)
-    assert str(run / "scan.h5") in of_run.output
-
-
-def test_the_folder_of_a_run_is_its_volume(tmp_path: Path) -> None:
-    run = Ran(tmp_path, FakeInstrument()).folder
-    assert run is not None
+def test_the_folder_of_a_run_is_its_volume(ended: Path) -> None:
     with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes one"):
-        volume_file(run)
-    (run / "recon.h5").touch()
-    assert volume_file(run) == run / "recon.h5"
+        volume_file(ended)
+    (ended / "recon.h5").touch()
+    assert volume_file(ended) == ended / "recon.h5"
 
 
-def test_other_folders_and_files_are_what_they_are(tmp_path: Path) -> None:
-    run = Ran(tmp_path / "runs", FakeInstrument()).folder
-    assert run is not None
-    with pytest.raises(DataError, match=f"as {run}"):
-        scan_file(tmp_path / "runs")
+def test_other_folders_and_files_are_what_they_are(ended: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=f"as {ended}"):
+        scan_file(ended.parent)
     with pytest.raises(DataError, match="is a folder of runs"):
-        volume_file(tmp_path / "runs")
+        volume_file(ended.parent)
     (tmp_path / "slices").mkdir()
     for path in (tmp_path / "slices", tmp_path / "missing.h5"):
         assert scan_file(path) == volume_file(path) == path
-    (run / "scan.h5").unlink()
+    (ended / "scan.h5").rename(tmp_path / "scan.h5")
     with pytest.raises(DataError, match="its first frame"):
-        scan_file(run)
+        scan_file(ended)
+    (tmp_path / "scan.h5").rename(ended / "scan.h5")

@@ -34,8 +34,7 @@ def _flip(path: Path, column: str, row: int, bit: int) -> None:
 
 
 @pytest.mark.parametrize("column", [*layout.RECORDED, layout.RECORD_CHECKSUM])
-def test_one_flipped_bit_is_found_and_its_frame_is_left_out(write: Write, frames: list[Frame], column: str) -> None:
-    path = write(frames)
+def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: list[Frame], column: str) -> None:
     _flip(path, column, ROW, 8 * np.dtype(layout.COLUMNS[column][0]).itemsize - 3)
     with open_scan(path) as source:
         assert source.altered == {ROW}
@@ -49,8 +48,7 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(write: Write, frames
         ingest(path, path.with_name("copy.h5"))
 
 
-def test_recover_and_archive_say_it(write: Write, frames: list[Frame]) -> None:
-    path = write(frames)
+def test_recover_and_archive_say_it(path: Path, frames: list[Frame]) -> None:
     _flip(path, layout.ANGLE, ROW, 3)
     before, small = path.read_bytes(), path.with_name("small.h5")
     done = recover(path)
@@ -77,8 +75,7 @@ def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: li
         assert source.altered == {ROW}
 
 
-def test_rows_that_replace_each_other_in_a_circle_are_refused(write: Write, frames: list[Frame]) -> None:
-    path = write(frames)
+def test_rows_that_replace_each_other_in_a_circle_are_refused(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file[layout.REPLACES][ROW] = ROW
         seal(file)  # as if it had been written so

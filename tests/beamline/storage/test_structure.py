@@ -41,13 +41,8 @@ def _raw(file: h5py.File, name: str) -> None:
 @pytest.mark.parametrize("draw", [_external, _virtual, _raw])
 @pytest.mark.parametrize("by_another_file", [False, True])
 def test_a_scan_that_draws_on_a_pipe(
-    tmp_path: Path,
-    write: Callable[[list[Frame]], Path],
-    frames: list[Frame],
-    draw: Callable[[h5py.File, str], None],
-    by_another_file: bool,
+    tmp_path: Path, path: Path, draw: Callable[[h5py.File, str], None], by_another_file: bool
 ) -> None:
-    path = write(frames)
     os.mkfifo(tmp_path / "pipe")
     with h5py.File(path, "r+") as file, h5py.File(tmp_path / "other.h5", "w") as other:
         if by_another_file:
@@ -59,10 +54,7 @@ def test_a_scan_that_draws_on_a_pipe(
         open_scan(path)
 
 
-def test_links_to_nothing_to_folders_to_itself_and_in_circles_do_no_harm(
-    tmp_path: Path, write: Callable[[list[Frame]], Path], frames: list[Frame]
-) -> None:
-    path = write(frames)
+def test_links_to_nothing_to_folders_to_itself_and_in_circles_do_no_harm(path: Path, frames: list[Frame]) -> None:
     with h5py.File(path, "r+") as file:
         for n, name in enumerate(("missing.h5", ".", path.name, "a\0b")):
             file[f"entry/l{n}"] = h5py.ExternalLink(name.partition("\0")[0], "/")
@@ -95,10 +87,7 @@ def test_a_dataset_that_claims_an_impossible_size(tmp_path: Path) -> None:
         open_hdf5(tmp_path / "a.h5")
 
 
-def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(
-    write: Callable[[list[Frame]], Path], frames: list[Frame]
-) -> None:
-    path = write(frames)
+def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[content.index(b"OHDR") + 20] ^= 1
     path.write_bytes(content)

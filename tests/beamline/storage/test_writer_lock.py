@@ -12,11 +12,13 @@ import pytest
 from beamline.storage.writer_lock import QUIET, WriterLock, WriterWatch, abandoned, held
 
 
-def test_a_file_is_held_until_its_lock_is_released(tmp_path: Path) -> None:
+def test_a_file_is_held_until_its_lock_is_released_and_an_exclusive_one_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "a").touch()
     assert not held(tmp_path / "a")
     lock = WriterLock(tmp_path / "a")
     assert held(tmp_path / "a")
+    with pytest.raises(OSError):
+        WriterLock(tmp_path / "a", exclusive=True)
     lock.release()
     assert not held(tmp_path / "a") and not held(tmp_path / "none")
 
@@ -30,14 +32,6 @@ def test_a_writer_gets_its_lock_though_somebody_asks_whether_it_is_held(tmp_path
     assert held(tmp_path / "a")
     lock.release()
     assert not held(tmp_path / "a")
-
-
-def test_an_exclusive_lock_is_refused_at_once(tmp_path: Path) -> None:
-    (tmp_path / "a").touch()
-    lock = WriterLock(tmp_path / "a")
-    with pytest.raises(OSError):
-        WriterLock(tmp_path / "a", exclusive=True)
-    lock.release()
 
 
 def test_a_writer_that_gives_up_its_lock_is_gone_at_once_unless_it_finished(tmp_path: Path) -> None:

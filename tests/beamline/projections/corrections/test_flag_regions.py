@@ -12,13 +12,12 @@ from scipy import ndimage
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.corrections.air import Air
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_SHARE, regions_of
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.readers.open import SourceOptions
 from recon.prep.resample import Resampling
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 NAME, OTHER = CHECKS[0].name, CHECKS[1].name
@@ -92,10 +91,7 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     data = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
     alarm, half = (flag(row, (0, 4, 10, 12), level) for row, level in ((8, Level.ALARM), (9, Level.WARN)))
     path = write_flagged(tmp_path / "scan.h5", frames_of(data), {}, flags=[alarm, half])
-    selection = Selection(axis_col=data.axis_col, steps=(Air("none"),))
-    told: list[str] = []
-    with SourceOptions(path).open() as source:
-        prepared: PreparedProjections = prepare_projections(source, selection, told.append)
+    prepared, told = prepare(path, Selection(axis_col=data.axis_col, steps=(Air("none"),)))
     assert prepared.geometry.n_views == 30 and prepared.left_out == 0 and prepared.view_weights is None
     rays = prepared.ray_weights(2)
     assert rays is not None and rays.shape == (32, 4, 40)

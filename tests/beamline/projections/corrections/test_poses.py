@@ -11,23 +11,19 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.monitor.digest import digest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.storage.pose_table import read_poses
-from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.base.clock import SystemClock
-from drivers.base.frame import Frame, FrameKind
 from recon.base.geometry import Geometry
 from recon.base.vectors import vectors_of
 from recon.base.volume import Grid
 from recon.voxels.direct import direct
 from recon.voxels.projector import seen_rays
+from tests.beamline.prepared_views import prepare
+from tests.beamline.scans import DARK, frames_through, write_flagged
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 from tests.slow_cases import others_slow
 
@@ -41,27 +37,16 @@ COLUMNS = "shift_col_px,shift_row_px,roll_deg,tilt_deg"
 
 
 def posed(turns: np.ndarray = TURNS) -> Geometry:
+    roll, tilt = np.radians(turns.T)
     return Geometry.parallel(
-        np.radians(DEGREES),
-        SHAPE,
-        pixel_pitch=PITCH,
-        axis_col=AXIS,
-        shifts=SHIFTS,
-        roll=np.radians(turns[:, 0]),
-        tilt=np.radians(turns[:, 1]),
+        np.radians(DEGREES), SHAPE, pixel_pitch=PITCH, axis_col=AXIS, shifts=SHIFTS, roll=roll, tilt=tilt
     )
 
 
 def scan(folder: Path, geometry: Geometry, axes: np.ndarray = AXES) -> Path:
-    counts, shape = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE)), geometry.detector_shape
-    images = [np.full(shape, level) + np.eye(*shape) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
-    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
-    angles = [np.nan] * 4 + geometry.angles.tolist()
-    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), shape, clock=SystemClock()) as writer:
-        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
-            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
-            writer.append(frame, digest(frame.counts), [])
-    return folder / "scan.h5"
+    counts = DARK + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE))
+    frames = frames_through(counts, geometry.angles, beam=40_000)
+    return write_flagged(folder / "scan.h5", frames, {}, pixel_size_mm=PITCH)
 
 
 def table(folder: Path, head: str, *columns: np.ndarray, name: str = "poses.csv") -> Path:
@@ -79,41 +64,34 @@ def every(folder: Path, by: str = "view") -> Path:
 def prepared(path: Path, poses: Path | str, **selected: object) -> PreparedProjections:
     steps = (Air("none"), PosesOfFile(read_poses(str(poses))))
     asked: dict[str, Any] = {"axis_col": AXIS, "steps": steps, **selected}
-    selection = Selection(**asked)
-    with SourceOptions(path).open() as source:
-        return prepare_projections(source, selection, lambda _: None)
+    return prepare(path, Selection(**asked))[0]
 
 
 def error(found: PreparedProjections, axes: np.ndarray = AXES) -> float:
     """Of FBP, relative, in the frame of the whole detector."""
     grid = Grid.matching(found.geometry)
     truth = smooth_ball(grid, axes, CENTRE)
-    return float(
-        np.linalg.norm(direct(found.projections.data, found.geometry, grid, "hann") - truth) / np.linalg.norm(truth)
-    )
+    made = direct(found.projections.data, found.geometry, grid, "hann")
+    return float(np.linalg.norm(made - truth) / np.linalg.norm(truth))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scan of these poses."""
+    return scan(tmp_path_factory.mktemp("posed"), posed())
 
 
 @pytest.mark.parametrize("by", others_slow(["view", "frame", "angle_deg"]))
-def test_poses_are_those_of_the_file_in_any_order(tmp_path: Path, by: str) -> None:
-    found = prepared(scan(tmp_path, posed()), every(tmp_path, by))
+def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(
+    path: Path, tmp_path: Path, by: str
+) -> None:
+    found = prepared(path, every(tmp_path, by))
+    plain, _ = prepare(path, Selection(axis_col=AXIS, steps=(Air("none"),)))
     for name in ("angles", "shifts", "roll", "tilt"):
         np.testing.assert_allclose(getattr(found.geometry, name), getattr(posed(), name), atol=1e-12)
-    assert (
-        error(found)
-        < 0.2
-        < 0.5
-        * error(
-            replace(found, geometry=Geometry.parallel(np.radians(DEGREES), SHAPE, pixel_pitch=PITCH, axis_col=AXIS))
-        )
-    )
+    assert error(found) < 0.2 < 0.5 * error(plain)
+    np.testing.assert_array_equal(found.projections.data, plain.projections.data)
     assert found.done["poses"].sentence.startswith("40 poses from")
-
-
-def test_no_pixel_is_resampled(tmp_path: Path) -> None:
-    path = scan(tmp_path, posed())
-    with SourceOptions(path).open() as source:
-        plain = prepare_projections(source, Selection(axis_col=AXIS, steps=(Air("none"),)), lambda _: None)
-    np.testing.assert_array_equal(prepared(path, every(tmp_path)).projections.data, plain.projections.data)
 
 
 VECTOR_COLUMNS = "{0}_x,{0}_y,{0}_z,d_x,d_y,d_z,u_x,u_y,u_z,v_x,v_y,v_z"
@@ -144,9 +122,8 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     assert found.done["poses"].sentence == f"Vectors of 40 views from {text} state the geometry."
 
 
-def test_vectors_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
-    path, cone = scan(tmp_path, posed()), vectors_of(free(cone=True))
-    columns = f"view,{VECTOR_COLUMNS.format('src')}"
+def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
+    columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
     file = table(tmp_path, columns, np.arange(N), *cone.T)
     with pytest.raises(ConfigError, match=r"of a cone, and .* give --cone 10(\.\d+)?:15\."):
         prepared(path, file, axis_col=None)
@@ -222,16 +199,11 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
     assert found.axis_col == pytest.approx(AXIS, abs=0.15)
 
 
-def test_poses_of_all_views_are_not_needed_where_some_are_chosen(tmp_path: Path) -> None:
-    path = scan(tmp_path, posed())
-    some = table(tmp_path, f"view,{COLUMNS}", *(column[::2] for column in (np.arange(N), *SHIFTS.T, *TURNS.T)))
+def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
+    head, columns = f"view,{COLUMNS}", (np.arange(N), *SHIFTS.T, *TURNS.T)
     with pytest.raises(DataError, match=r"of 20 of.*frame 5, at 31.5 degrees.*--views"):
-        prepared(path, some)
-    found = prepared(
-        path,
-        table(tmp_path, f"view,{COLUMNS}", *(c[:30] for c in (np.arange(N), *SHIFTS.T, *TURNS.T))),
-        views="first:20",
-    )
+        prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
+    found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
     assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out[1].n_views <= 10
 
 
@@ -262,20 +234,12 @@ def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, 
         read_poses(str(tmp_path / "none.csv"))
 
 
-def test_poses_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
-    path, views = scan(tmp_path, posed()), np.arange(N)
+def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
+    views = np.arange(N)
     for head, columns, match in (
         ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
-        (
-            "view,shift_col_px",
-            (views, np.full(N, 41.0)),
-            "view 0 is displaced by 41 columns and 0 rows on a detector of 40 x",
-        ),
-        (
-            "view,shift_row_px",
-            (views, np.full(N, 25.0)),
-            "view 0 is displaced by 0 columns and 25 rows on a detector",
-        ),
+        ("view,shift_col_px", (views, np.full(N, 41.0)), "view 0 is displaced by 41 columns and 0 rows"),
+        ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
         ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),
     ):
@@ -322,17 +286,8 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
 def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> None:
     roll, tilt = np.radians(TURNS.T)
     angles, shift = 2 * np.radians(DEGREES), 6 * np.linspace(-1, 1, N)
-    geometry = Geometry.cone(
-        angles,
-        SHAPE,
-        1.5 * PITCH,
-        10.0,
-        15.0,
-        axis_col=AXIS,
-        shifts=np.stack((shift, SHIFTS[:, 1]), axis=1),
-        roll=roll,
-        tilt=tilt,
-    )
+    shifts = np.stack((shift, SHIFTS[:, 1]), axis=1)
+    geometry = Geometry.cone(angles, SHAPE, 1.5 * PITCH, 10.0, 15.0, axis_col=AXIS, shifts=shifts, roll=roll, tilt=tilt)
     poses = table(tmp_path, f"view,{COLUMNS}", np.arange(N), shift, SHIFTS[:, 1], *TURNS.T)
     found = prepared(
         scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)

@@ -12,11 +12,11 @@ from beamline.features.files.validate import source_findings
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
@@ -54,16 +54,13 @@ def source(
     ],
 )
 def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str) -> None:
-    told: list[str] = []
-    prepared = prepare_projections(source(end=end), SELECTION, told.append)  # type: ignore[arg-type]
+    prepared, (line,) = prepare(source(end=end), SELECTION)
     # A mean of three flats with noise of 1 % is right to 0.6 %; a bad group would be off by far more.
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=0.03)
-    (line,) = told
-    assert line.startswith(said)
-    assert line.endswith(f"The other {said.split()[1]} are used instead.")
-    spoilt = prepare_projections(source(end=end), ACCEPT, told.append)  # type: ignore[arg-type]
+    assert line.startswith(said) and line.endswith(f"The other {said.split()[1]} are used instead.")
+    spoilt, told = prepare(source(end=end), ACCEPT)
     assert np.abs(spoilt.projections.data - SCAN.line_integrals()).max() > 0.1
-    assert told[1].startswith("--references accept: ")
+    assert told[0].startswith("--references accept: ")
 
 
 @pytest.mark.parametrize(
@@ -77,13 +74,13 @@ def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str)
 def test_a_scan_without_a_good_group_is_refused_and_an_option_overrides(levels: tuple[float, float], said: str) -> None:
     scan = source(levels, levels)
     with pytest.raises(DataError, match=f"reconstructed. {said}.*--references accept"):
-        prepare_projections(scan, SELECTION, pytest.fail)  # type: ignore[arg-type]
+        prepare(scan, SELECTION)
     errors = [f for f in source_findings(scan) if f.severity == "error"]  # type: ignore[arg-type]
     n = 1 if "54" in said else 2  # the figures of two groups differ but where all of the pixels are at their end
     rules = [finding.rule for finding in errors if finding.rule != "light"]  # which tells of darks above the views, too
     assert rules == ["bad-references"] * n
-    told: list[str] = []
-    assert prepare_projections(scan, ACCEPT, told.append).geometry.n_views == SCAN.angles.size  # type: ignore[arg-type]
+    found, told = prepare(scan, ACCEPT)
+    assert found.geometry.n_views == SCAN.angles.size
     assert len([line for line in told if line.startswith("--references accept")]) == n
 
 
@@ -91,12 +88,13 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     """Flats with 2 % of the light, and nothing wrong with them beside one another: alone, or beside the views."""
     dim = (DARK, DARK + 0.02 * BEAM)
     with pytest.raises(DataError, match=r"flats 3-5, 54-56:.*.limit 50%"):
-        prepare_projections(source(dim, dim, 0.05), SELECTION, pytest.fail)  # type: ignore[arg-type]
-    warnings: list[str] = []
-    assert prepare_projections(source(dim, dim), SELECTION, warnings.append).geometry.n_views == 45  # type: ignore[arg-type]
+        prepare(source(dim, dim, 0.05), SELECTION)
+    found, warnings = prepare(source(dim, dim), SELECTION)
+    assert found.geometry.n_views == 45
     assert any(re.search(r"times as bright as the flats.*No exposure is stated", each) for each in warnings)
     fine = source(exposure=0.05)
-    assert prepare_projections(fine, SELECTION, pytest.fail).geometry.n_views == 45  # type: ignore[arg-type]
+    found, warnings = prepare(fine, SELECTION)
+    assert (found.geometry.n_views, warnings) == (45, [])
     fine.exposures[np.array(fine.image_key) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
     assert list(references_usable(fine)) == []  # type: ignore[arg-type]
 

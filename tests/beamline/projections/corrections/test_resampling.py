@@ -24,7 +24,8 @@ from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion
 from recon.voxels.fbp import fbp
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.balls import Balls
 
@@ -35,15 +36,7 @@ STRAIGHT = Balls(np.radians(np.arange(0, 180, 3.0)), seed=3)
 @cache
 def _source(balls_tilt: float) -> ArraySource:
     balls = replace(STRAIGHT, tilt_deg=balls_tilt)
-    counts = DARK + np.random.default_rng(7).poisson(BEAM * np.exp(-balls.views()))
-    frames = np.concatenate([np.full((1, *balls.shape), DARK), np.full((1, *balls.shape), DARK + BEAM), counts])
-    angles = np.concatenate([[np.nan] * 2, balls.angles])
-    return ArraySource(frames.astype(np.uint16), [2, 1] + [0] * balls.angles.size, angles)
-
-
-def _prepared(source: ArraySource, selection: Selection) -> tuple[PreparedProjections, list[str]]:
-    said: list[str] = []
-    return prepare_projections(source, selection, said.append), said  # type: ignore[arg-type]
+    return counted(DARK + np.random.default_rng(7).poisson(BEAM * np.exp(-balls.views())), balls.angles)
 
 
 @cache
@@ -66,21 +59,20 @@ def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
 
 
 def test_a_tilt_is_warned_of() -> None:
-    as_it_is, warned = _prepared(_source(1.5), SELECTION)
+    as_it_is, warned = prepare(_source(1.5), SELECTION)
     assert [text for text in warned if "seems to lean by 1." in text and "--tilt auto" in text]
     assert _tilt(as_it_is) == ("", 0)
 
 
 @pytest.mark.slow
 def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> None:
-    straight, said = _prepared(_source(0.0), SELECTION)
+    straight, said = prepare(_source(0.0), SELECTION)
     assert not said and _tilt(straight) == ("", 0)
-    as_it_is, _ = _prepared(_source(1.5), SELECTION)
-    levelled, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens("auto")))
-    assert (
-        not said and _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
-    )
-    given, _ = _prepared(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
+    as_it_is, _ = prepare(_source(1.5), SELECTION)
+    levelled, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens("auto")))
+    assert not said
+    assert _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
+    given, _ = prepare(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
     for found in (levelled, given):
         assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)
         assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
@@ -102,16 +94,16 @@ def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> Non
 
 
 def test_no_tilt_changes_nothing() -> None:
-    plain, _ = _prepared(_source(1.5), SELECTION)
-    zero, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
+    plain, _ = prepare(_source(1.5), SELECTION)
+    zero, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
     assert not said and _tilt(zero)[0] == "" and zero.measured is None
     np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
-    found, said = _prepared(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
+    found, said = prepare(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
     assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
 
 
 def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
-    prepared, _ = _prepared(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
+    prepared, _ = prepare(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
     assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
     assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
     weights = prepared.ray_weights()
@@ -137,9 +129,9 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
 def test_what_cannot_be_levelled_is_refused() -> None:
     source = _source(0.0)
     with pytest.raises(ConfigError, match="--tilt"):
-        _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
+        prepare(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion"):
-        _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), Preparation(noise="counts")))
+        prepare(source, SELECTION.with_steps(TiltAndLens(1.0), Preparation(noise="counts")))
     few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
     with pytest.raises(DataError, match="was not found"):
-        _prepared(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))
+        prepare(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

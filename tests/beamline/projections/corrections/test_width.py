@@ -116,22 +116,11 @@ def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: st
     assert _rays(Width(), _source(), Selection().with_steps(Calibrate(("axis", "shifts"))))[1].skew > 0
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        {"spread": "wide"},
-        {"spread": "-1"},
-        {"spread": "500"},
-        {"arc": "-1"},
-        {"arc": "1:2:3"},
-        {"arc": "x"},
-        {"arc": "720"},
-    ],
-)
-def test_other_words_are_refused(words: dict[str, str]) -> None:
-    (field, text), options = *words.items(), options_of(Width)
-    with pytest.raises(ValueError, match="is neither"):
-        options[field].parse(text)
+@pytest.mark.parametrize(("field", "words"), [("spread", ("wide", "-1", "500")), ("arc", ("-1", "1:2:3", "x", "720"))])
+def test_other_words_are_refused(field: str, words: tuple[str, ...]) -> None:
+    for text in words:
+        with pytest.raises(ValueError, match="is neither"):
+            options_of(Width)[field].parse(text)
 
 
 def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.scan import scan_findings
+from tests.beamline.scans import write_nxtomo
 
 SHAPE, FLATS, VIEWS = (24, 40), 5, 20
 MASK = np.zeros(SHAPE, np.uint32)
@@ -31,14 +32,11 @@ def _scan(
     frames = np.round(rng.poisson(light) * gain + offset).astype(np.int64)
     if mark is not None:
         frames[:, MASK > 0] = mark
-    with h5py.File(path, "w") as file:
-        entry = file.create_group("entry")
-        entry["instrument/detector/data"] = frames.astype(dtype)
-        entry["instrument/detector/image_key"] = np.repeat([1, 0], [FLATS, VIEWS])
-        entry["sample/rotation_angle"] = np.arange(FLATS + VIEWS) * 9.0
-        entry["sample/rotation_angle"].attrs["units"] = "deg"
-        if mask is not None:
-            entry["instrument/detector/pixel_mask"] = mask
+    keys = np.repeat([1, 0], [FLATS, VIEWS])
+    write_nxtomo(path, frames.astype(dtype), keys, np.arange(FLATS + VIEWS) * 9.0)
+    if mask is not None:
+        with h5py.File(path, "r+") as file:
+            file["entry/instrument/detector/pixel_mask"] = mask
     return path
 
 

@@ -11,6 +11,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.open import SourceOptions, open_scan
+from tests.beamline.scans import write_nxtomo
 
 N, SHAPE = 5, (4, 6)
 KEYS = np.array([2, 1, 0, 0, 0])
@@ -54,27 +55,18 @@ def _exchange(file: h5py.File) -> None:
 
 
 def _broken(path: Path, where: str, link: object) -> Path:
-    with h5py.File(path, "w") as file:
+    if where.startswith("entry"):
+        write_nxtomo(path, frames(1), KEYS, ANGLES)
+    with h5py.File(path, "a") as file:
         if where.startswith("exchange"):
             _exchange(file)
-        else:
-            detector = file.create_group("entry/instrument/detector")
-            detector["data"], detector["image_key"] = frames(1), KEYS
-            file["entry/sample/rotation_angle"] = ANGLES
-            file["entry/sample/rotation_angle"].attrs["units"] = "deg"
         if where in file:
             del file[where]
         file[where] = link
     return path
 
 
-@pytest.mark.parametrize(
-    ("link", "to"),
-    [
-        (h5py.ExternalLink("gone.h5", "/raw/data"), r"gone\.h5::/raw/data"),
-        (h5py.SoftLink("/nowhere"), "/nowhere"),
-    ],
-)
+@pytest.mark.parametrize("link", [h5py.ExternalLink("gone.h5", "/raw/data"), h5py.SoftLink("/nowhere")])
 @pytest.mark.parametrize(
     "where",
     [
@@ -82,7 +74,7 @@ def _broken(path: Path, where: str, link: object) -> Path:
         "entry/instrument/detector/data", "entry/instrument/detector/image_key",
     ],
 )  # fmt: skip
-def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, where: str, link: object, to: str) -> None:
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, where: str, link: object) -> None:
     path = _broken(tmp_path / "s.h5", where, link)
     with pytest.raises(DataError, match=rf"/{where} is"):
         open_scan(path)
@@ -106,9 +98,7 @@ def test_a_disk_without_locks_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
 
     def without_locks(*args: object, locking: object = None, **rest: object) -> h5py.File:
         if locking is not False:
-            raise OSError(
-                f"Unable to synchronously open file (unable to lock file, errno = {number}, error message = 'x')"
-            )
+            raise OSError(f"Unable to open file (unable to lock file, errno = {number}, error message = 'x')")
         return real(*args, locking=locking, **rest)
 
     monkeypatch.setattr(h5py, "File", without_locks)

@@ -43,9 +43,7 @@ def nxtomo(path: Path, *changes: tuple[str, Any, str | None], also: Callable[[h5
         put(entry, f"{DETECTOR}/y_pixel_size", 1e-6, "m")
         put(entry, "sample/rotation_angle", np.r_[0, 0, np.arange(VIEWS) * 36.0], "degree")
         for where, value, units in changes:
-            put(
-                entry, where.replace("detector/", f"{DETECTOR}/", 1) if where.startswith("det") else where, value, units
-            )
+            put(entry, f"instrument/{where}" if where.startswith("detector/") else where, value, units)
         if also is not None:
             also(entry)
     return path
@@ -139,6 +137,7 @@ def _turned(vertical: str, **turns: float) -> Callable[[h5py.Group], None]:
     return add
 
 
+PLACES = ("detector", "sample")
 WAVELENGTH = 12.39841984 / 25
 USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource], object], Any]] = {
     "definition": ([("definition", "NXtomo", None)], lambda s: s.format, "nxtomo"),
@@ -148,18 +147,18 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
         [("detector/image_key_control", np.r_[2, 1, -1, [0] * 4], None)], lambda s: s.image_key[2], -1,
     ),
     "detector/count_time": ([("detector/count_time", np.full(7, 20.0), "ms")], lambda s: s.exposures[0], 0.02),
-    "detector/x_pixel_size": ([("detector/x_pixel_size", 2.0, "um")], lambda s: s.pixel_size_mm, 2e-3),
-    "detector/y_pixel_size": ([("detector/y_pixel_size", 2.0, "um")], lambda s: s.row_pitch_mm, 2e-3),
-    "sample/x_pixel_size": ([("sample/x_pixel_size", 3.0, "um")], lambda s: s.pixel_size_mm, 3e-3),
-    "sample/y_pixel_size": ([("sample/y_pixel_size", 3.0, "um")], lambda s: s.row_pitch_mm, 3e-3),
+    **{f"{of}/x_pixel_size": ([(f"{of}/x_pixel_size", 2.0, "um")], lambda s: s.pixel_size_mm, 2e-3) for of in PLACES},
+    **{f"{of}/y_pixel_size": ([(f"{of}/y_pixel_size", 2.0, "um")], lambda s: s.row_pitch_mm, 2e-3) for of in PLACES},
     "detector/distance": ([("detector/distance", 0.2, "m")], lambda s: s.attributes["distance_mm"], 200),
     "instrument/source/distance": (list(CONE), lambda s: s.cone, (10, 20)),
     "sample/rotation_angle": ([], lambda s: np.degrees(s.angles[-1]), 144),
-    "sample/name": ([("sample/name", "tooth", None)], lambda s: s.attributes["sample"], "tooth"),
-    "title": ([("title", "a tooth", None)], lambda s: s.attributes["title"], "a tooth"),
-    "start_time": ([("start_time", "2026", None)], lambda s: s.attributes["start_time"], "2026"),
-    "end_time": ([("end_time", "2026", None)], lambda s: s.attributes["end_time"], "2026"),
-    "instrument/name": ([("instrument/name", "bm05", None)], lambda s: s.attributes["instrument"], "bm05"),
+    **{
+        where: ([(where, "said", None)], lambda s, name=name: s.attributes[name], "said")
+        for where, name in (
+            ("sample/name", "sample"), ("title", "title"), ("start_time", "start_time"), ("end_time", "end_time"),
+            ("instrument/name", "instrument"),
+        )
+    },
     "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: s.currents.tolist()[6], 7),
     **{
         f"{where}/incident_energy": ([(f"{where}/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25)
@@ -180,14 +179,14 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
         lambda s: np.flatnonzero(s.read([0])[0] == 0).tolist(),
         np.flatnonzero(np.eye(ROWS, COLS)).tolist(),
     ),
-    "detector/x_flipped": (
-        [("detector/x_flipped", True, None)], lambda s: s.attributes["flipped"].split(":")[0], "left to right",
-    ),
-    "detector/y_flipped": (
-        [("detector/y_flipped", True, None)], lambda s: s.attributes["flipped"].split(":")[0], "upside down",
-    ),
+    **{
+        f"detector/{way}_flipped": (
+            [(f"detector/{way}_flipped", True, None)], lambda s: s.attributes["flipped"].split(":")[0], said,
+        )
+        for way, said in (("x", "left to right"), ("y", "upside down"))
+    },
 }  # fmt: skip
-ENERGY = "measurement/instrument/monochromator/energy"
+ENERGY, SAMPLE = "measurement/instrument/monochromator/energy", "measurement/sample/name"
 PIXEL = "measurement/instrument/detector"
 USED_EXCHANGE: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource], object], Any]] = {
     "implements": ([], lambda s: s.format, "data_exchange"),
@@ -196,9 +195,7 @@ USED_EXCHANGE: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[Scan
     "exchange/data_dark": ([], lambda s: int((s.image_key == 2).sum()), 1),
     "exchange/theta": ([], lambda s: np.degrees(s.angles[-1]), 144),
     "exchange/title": ([("exchange/title", "a tooth", None)], lambda s: s.attributes["title"], "a tooth"),
-    "measurement/sample/name": (
-        [("measurement/sample/name", "tooth", None)], lambda s: s.attributes["sample"], "tooth",
-    ),
+    SAMPLE: ([(SAMPLE, "tooth", None)], lambda s: s.attributes["sample"], "tooth"),
     ENERGY: ([(ENERGY, 25.0, "keV")], lambda s: s.energy_kev, 25),
     f"{PIXEL}/x_pixel_size": ([(f"{PIXEL}/x_pixel_size", 6.5, "um")], lambda s: s.pixel_size_mm, 6.5e-3),
     f"{PIXEL}/y_pixel_size": ([(f"{PIXEL}/y_pixel_size", 6.5, "um")], lambda s: s.row_pitch_mm, 6.5e-3),
@@ -260,12 +257,12 @@ def test_what_is_used_has_its_value(tmp_path: Path, where: str) -> None:
 
 
 @pytest.mark.parametrize("field", [field for field in NXTOMO if field.units is not None], ids=lambda f: f.where)
-@pytest.mark.parametrize("units", [None, "furlong"])
-def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Entry, units: str | None) -> None:
-    path = nxtomo(tmp_path / "s.nx", (field.where, np.full(7, 2.0) if "time" in field.where else 2.0, units))
-    (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
-    assert hit.severity == "warning"
-    assert (f"its units '{units}' are" if units else "it has no attribute `units`") in hit.message
+def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Entry) -> None:
+    value = np.full(7, 2.0) if "time" in field.where else 2.0
+    for units, said in ((None, "it has no attribute `units`"), ("furlong", "its units 'furlong' are")):
+        path = nxtomo(tmp_path / "s.nx", (field.where, value, units))
+        (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
+        assert hit.severity == "warning" and said in hit.message
 
 
 @pytest.mark.parametrize(
@@ -415,9 +412,8 @@ def test_the_page_lists_every_field() -> None:
         assert f"| `{field.where}` | {use} |\n" in page, field.where
 
 
-UNKNOWN: dict[
-    str, tuple[Any, bool | None]
-] = {  # values under names that nobody reads, and whether they may change a number
+# Values under names that nobody reads, and whether they may change a number.
+UNKNOWN: dict[str, tuple[Any, bool | None]] = {
     "instrument/pco/exposure_of_frame": (np.r_[0, 0, np.arange(VIEWS)] * 0.1, True),
     "instrument/pco/exposure_of_view": (np.arange(VIEWS) * 0.1, True),
     "instrument/machine/current": (np.r_[1, 2, [200.0] * VIEWS], False),  # the same in all views
@@ -431,10 +427,9 @@ UNKNOWN: dict[
 @pytest.mark.parametrize("where", UNKNOWN)
 def test_what_is_stated_of_each_frame_under_another_name_is_named(tmp_path: Path, where: str) -> None:
     value, doubt = UNKNOWN[where]
-    hits = [hit for hit in validate(nxtomo(tmp_path / "s.nx", (where, value, None))) if where in hit.message]
-    assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
-    hits = [hit for hit in validate(exchange(tmp_path / "s.h5", (where, value, None))) if where in hit.message]
-    assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
+    for store in (nxtomo, exchange):
+        hits = [hit for hit in validate(store(tmp_path / "s.h5", (where, value, None))) if where in hit.message]
+        assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
 
 
 def test_info_shows_what_is_used(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -12,6 +11,7 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import FrameKind
+from tests.beamline.scans import write_nxtomo
 
 DARK, FLAT, VIEW, NONE = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION, FrameKind.INVALID
 SHAPE = (4, 6)
@@ -60,15 +60,9 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
     """Darks, flats and two halves of the views in files of their own, as Diamond and others write them."""
     paths = []
     for name, key, first in (("d", [2, 2], 0), ("f", [1, 1, 1], 2), ("a", [0, 0], 5), ("b", [0, 0, 0], 7)):
-        paths.append(tmp_path / f"{name}.nxs")
-        with h5py.File(paths[-1], "w") as file:
-            entry = file.create_group("entry")
-            entry["instrument/detector/data"] = np.arange(first, first + len(key), dtype=np.uint16)[
-                :, None, None
-            ] * np.ones(SHAPE, np.uint16)
-            entry["instrument/detector/image_key"] = key
-            entry["sample/rotation_angle"] = 10.0 * np.arange(first, first + len(key))
-            entry["sample/rotation_angle"].attrs["units"] = "deg"
+        numbers = np.arange(first, first + len(key), dtype=np.uint16)
+        frames = numbers[:, None, None] * np.ones(SHAPE, np.uint16)
+        paths.append(write_nxtomo(tmp_path / f"{name}.nxs", frames, key, 10.0 * numbers))
     with open_scan(SourceOptions(paths[0], then=tuple(paths[1:]))) as source:
         assert source.path == paths[0]
         assert source.image_key.tolist() == [2, 2, 1, 1, 1, *[0] * 5]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -16,7 +15,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.supplied import load_images
 from beamline.storage.readers.wrapped import type_wrapped
 from drivers.base.frame import FrameKind
-from tests.beamline.scans import TwoCylinders
+from tests.beamline.scans import TwoCylinders, write_exchange, write_nxtomo
 
 SCAN = TwoCylinders()
 
@@ -60,17 +59,12 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         options = SourceOptions(path, angles=SCAN.angles, darks=darks, flats=tmp_path / "f.tif")
         np.testing.assert_array_equal(load_images(tmp_path / "f.tif", FrameKind.FLAT), flats)
     else:
-        with h5py.File(path, "w") as file:
-            if kind == "exchange":
-                for name, images in (("data", counts), ("data_white", flats), ("data_dark", darks)):
-                    file[f"exchange/{name}"] = images.view(np.int16)
-                file["exchange/theta"] = np.degrees(SCAN.angles)
-            else:
-                detector = file.create_group("entry/instrument/detector")
-                detector["data"] = np.concatenate([darks, flats, counts]).view(np.int16)
-                detector["image_key"] = np.repeat([2, 1, 0], [2, 2, len(counts)])
-                file["entry/sample/rotation_angle"] = np.degrees(np.concatenate([np.zeros(4), SCAN.angles]))
-                file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+        if kind == "exchange":
+            images = {"data": counts, "data_white": flats, "data_dark": darks}
+            write_exchange(path, SCAN, {name: counted.view(np.int16) for name, counted in images.items()})
+        else:
+            frames, keys = np.concatenate([darks, flats, counts]), np.repeat([2, 1, 0], [2, 2, len(counts)])
+            write_nxtomo(path, frames.view(np.int16), keys, np.degrees(np.r_[np.zeros(4), SCAN.angles]))
         options = SourceOptions(path)
     with open_scan(options) as source:
         assert source.dtype == np.uint16 and source.quantity == "counts"
@@ -85,11 +79,8 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
     counts = SCAN.counts(40_000)
     flats = np.full((2, *SCAN.shape), 40_100, np.uint16)
     flats[:, 0, 0] += 5
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        file["exchange/data"], file["exchange/data_white"] = counts.view(np.int16), flats.view(flats_as)
-        file["exchange/data_dark"] = np.full((2, *SCAN.shape), 100, np.uint16)
-        file["exchange/theta"] = np.degrees(SCAN.angles)
-    with open_scan(tmp_path / "s.h5") as source:
+    changes = {"data": counts.view(np.int16), "data_white": flats.view(flats_as)}
+    with open_scan(write_exchange(tmp_path / "s.h5", SCAN, changes)) as source:
         assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION)), counts)
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.FLAT)), flats)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_seen, coarse_views
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
 Balls = list[tuple[float, float, float, float]]  # x, y, radius in px, and attenuation a px
@@ -32,10 +32,8 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
         at = (x * np.cos(angles) + y * np.sin(angles))[:, None, None]
         depth += 2 * mu * np.sqrt((radius**2 - (col - at) ** 2 - (row[:, None] + y / 8) ** 2).clip(0))
     beam = LIGHT * np.exp(-0.3 * np.linspace(-1, 1, COLS) ** 2)
-    counts = np.concatenate([np.zeros((4, ROWS, COLS)), np.tile(beam, (4, ROWS, 1)), beam * np.exp(-depth)])
-    keys = [2] * 4 + [1] * 4 + [0] * true.size
-    frames = rng.poisson(counts + DARK).astype(np.uint16)
-    return ArraySource(frames, keys, np.r_[np.full(8, np.nan), np.radians(stated)])
+    light = np.zeros((4, ROWS, COLS)), np.tile(beam, (4, ROWS, 1)), beam * np.exp(-depth)
+    return scan_of(*(rng.poisson(each + DARK) for each in light), np.radians(stated))
 
 
 def told(source: ArraySource) -> list[Finding]:

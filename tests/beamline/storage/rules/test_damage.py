@@ -33,9 +33,8 @@ def flip(path: Path, at: int, bit: int) -> None:
 
 
 def test_a_flipped_bit_of_any_pixel_is_found_in_its_frame(
-    write: Write, frames: list[Frame], rng: np.random.Generator
+    path: Path, frames: list[Frame], rng: np.random.Generator
 ) -> None:
-    path = write(frames)
     rows = 0, 4, 13  # a dark, a flat, a view
     with h5py.File(path) as file:
         offsets = {row: file[f"{DETECTOR}/data"].id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in rows}
@@ -74,8 +73,7 @@ def test_frames_of_big_endian_files_are_as_written_when_ingested(tmp_path: Path)
     assert differ() == []
 
 
-def test_a_damaged_scan_is_not_ingested(write: Write, frames: list[Frame], tmp_path: Path) -> None:
-    path = write(frames)
+def test_a_damaged_scan_is_not_ingested(path: Path, tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file[f"{DETECTOR}/data"][6, 0, 0] ^= 8
     with pytest.raises(DataError, match=r"Frame 6 of .* checksum differs"):
@@ -105,10 +103,8 @@ PLACES = (
 
 
 @pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["each once", "all"])
-def test_altered_files_are_described_or_refused_in_words(
-    write: Write, frames: list[Frame], quick: bool, tmp_path: Path
-) -> None:
-    whole, each_once = write(frames), list(zip(ALTERATIONS, PLACES * 2, strict=False))
+def test_altered_files_are_described_or_refused_in_words(path: Path, quick: bool, tmp_path: Path) -> None:
+    whole, each_once = path, list(zip(ALTERATIONS, PLACES * 2, strict=False))
     for what, where in each_once if quick else product(ALTERATIONS, PLACES):
         value = ALTERATIONS[what]
         path = tmp_path / f"{what}.h5"

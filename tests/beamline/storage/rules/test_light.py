@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.rules.light import BRIGHTER, WARN, views_scaled
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.prepared_views import prepare
 
 ANGLES, SHAPE, LIGHT = np.linspace(0, np.pi, 45, endpoint=False), (24, 64), 3000.0
 
@@ -32,18 +32,13 @@ def counts(radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray, exposures: np.ndarray | None = None) -> str:
     """All sentences of a scan, or of its refusal."""
-    frames = np.concatenate([np.clip(np.round(each), 0, 65535).astype(np.uint16) for each in (darks, flats, views)])
-    keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
-    angles = np.concatenate([np.full(len(darks) + len(flats), np.nan), ANGLES])
-    sentences: list[str] = []
-    source = ArraySource(frames, keys, angles)
+    source = scan_of(*(np.clip(np.round(each), 0, 65535) for each in (darks, flats, views)), ANGLES)
     if exposures is not None:
         source.exposures = exposures
     try:
-        prepare_projections(source, Selection(axis_col=31.5), sentences.append)  # type: ignore[arg-type]
+        return " ".join(prepare(source, Selection(axis_col=31.5))[1])
     except DataError as error:
         return f"refused: {error}"
-    return " ".join(sentences)
 
 
 @pytest.mark.parametrize("radius", [20.0, 60.0])
@@ -51,7 +46,7 @@ def test_references_of_the_light_of_the_views_are_not_told_of(radius: float) -> 
     assert "flats" not in told(*counts(radius)).replace("weaker than its flats", "")
 
 
-@pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 10.0])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_flats_that_were_multiplied(factor: float) -> None:
     darks, flats, views = counts(20.0)
     said = told(darks, 100 + (flats - 100) * factor, views)
@@ -65,8 +60,7 @@ def test_sums_of_frames() -> None:
     assert "sums of 4 frames" in told(4 * darks, flats + 3 * flats[::-1].mean(), views)
 
 
-@pytest.mark.parametrize("bits", [2, 4])
-@pytest.mark.parametrize("radius", [20.0, 60.0])
+@pytest.mark.parametrize(("bits", "radius"), [(4, 20.0), (2, 60.0)])
 def test_counts_shifted_by_bits(bits: int, radius: float) -> None:
     darks, flats, views = counts(radius)
     said = told(darks, flats, views * 2**bits)
@@ -111,8 +105,7 @@ def test_flats_that_end_at_one_count_everywhere() -> None:
     assert "every pixel of them holds 2500, though" in told(darks, np.minimum(flats, 2500), np.minimum(views, 2500))
 
 
-@pytest.mark.parametrize("radius", [20.0, 31.0])
-@pytest.mark.parametrize("dark", [0.0, 100.0])
+@pytest.mark.parametrize(("radius", "dark"), [(31.0, 0.0), (20.0, 100.0)])
 def test_flats_and_views_that_end_at_one_count_beside_darks_of_one_number(radius: float, dark: float) -> None:
     _, flats, views = counts(radius)
     said = told(np.full_like(flats, dark), np.minimum(flats, 2800), np.minimum(views, 2800))
@@ -120,7 +113,7 @@ def test_flats_and_views_that_end_at_one_count_beside_darks_of_one_number(radius
     assert "counts end there" in said
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+@pytest.mark.parametrize("noise", [0.0, 0.03])
 def test_transmission_in_whole_numbers_that_is_clipped_at_all_light_does_not_end(noise: float) -> None:
     full, through = np.full((1, *SHAPE), 65535.0), np.exp(-lines(20.0))
     through += noise * np.sqrt(through) * np.random.default_rng(3).standard_normal(through.shape)
@@ -130,9 +123,8 @@ def test_transmission_in_whole_numbers_that_is_clipped_at_all_light_does_not_end
 def test_a_step_and_turns_of_the_light_where_the_sample_fills_the_field() -> None:
     darks, flats, views = counts(60.0)
     views[20:] = (views[20:] - 100) * 0.7 + 100
-    assert "Frames 10 and 54, half a turn apart, see one and the same matter, but differ by 0.36" in told(
-        darks, flats, views
-    )
+    said = told(darks, flats, views)
+    assert "Frames 10 and 54, half a turn apart, see one and the same matter, but differ by 0.36" in said
     darks, flats, views = counts(60.0)
     views[::2] = (views[::2] - 100) * 0.7 + 100
     assert "rise and fall in turn by 0.36" in told(darks, flats, views)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,19 +16,21 @@ from hypothesis import strategies as st
 
 from beamline.core.text import spans
 from beamline.features.files.validate import describe, source_findings, validate
-from beamline.monitor.digest import digest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_spread, half_turn_unseen
 from beamline.storage.rules.scan import change_of_rows
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
+from tests.beamline.closable import Closable
 from tests.beamline.scans import seal
-from tests.beamline.storage.conftest import INFO, SHAPE
+from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, append
 from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
 DETECTOR = "entry/instrument/detector"
+FRAMES = f"{DETECTOR}/data"
 ANGLE = "entry/sample/rotation_angle"
 
 
@@ -36,8 +38,22 @@ def found(path: Path, **how: object) -> set[tuple[str, str]]:
     return {(finding.severity, finding.rule) for finding in validate(SourceOptions(path, **how))}  # type: ignore[arg-type]
 
 
-def test_a_good_scan_has_no_finding(write: Write, frames: list[Frame]) -> None:
-    assert validate(write(frames)) == []
+def with_theta(folder: Path, theta: np.ndarray, units: str | None = None) -> Path:
+    """Noise under these angles."""
+    with h5py.File(folder / "s.h5", "w") as file:
+        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
+        file["exchange/theta"] = theta
+        if units is not None:
+            file["exchange/theta"].attrs["units"] = units
+    return folder / "s.h5"
+
+
+def angles_told(scan: SourceOptions) -> list[Finding]:
+    return [finding for finding in validate(scan) if finding.rule == "angle-spread"]
+
+
+def test_a_good_scan_has_no_finding(path: Path) -> None:
+    assert validate(path) == []
 
 
 def test_exposures_that_do_not_go_together_are_told(write: Write, frames: list[Frame]) -> None:
@@ -100,53 +116,28 @@ def no_definition(file: h5py.File) -> None:
 
 
 def float_frames(file: h5py.File) -> None:
-    swap(file, f"{DETECTOR}/data", file[f"{DETECTOR}/data"][()].astype(np.float32))
+    swap(file, FRAMES, file[FRAMES][()].astype(np.float32))
 
 
-def short_key(file: h5py.File) -> None:
-    swap(file, f"{DETECTOR}/image_key", file[f"{DETECTOR}/image_key"][:-2])
-
-
-def short_angles(file: h5py.File) -> None:
-    swap(file, ANGLE, file[ANGLE][:-1])
+def shorter(name: str, n: int) -> Spoil:
+    """A file whose dataset lacks so many values at its end."""
+    return lambda file: swap(file, name, file[name][:-n])
 
 
 def copied_link(file: h5py.File) -> None:
     del file["entry/data/data"]
-    file["entry/data/data"] = file[f"{DETECTOR}/data"][()]
+    file["entry/data/data"] = file[FRAMES][()]
 
 
-def time_back(file: h5py.File) -> None:
-    file["entry/frame_log/time"][6] -= 10
+def repainted(rows: Iterable[int], pixels: Callable[[h5py.Dataset, int], np.ndarray]) -> Spoil:
+    """A file with other pixels in these rows, as if they had been written."""
 
+    def spoil(file: h5py.File) -> None:
+        for row in rows:
+            file[FRAMES][row] = image = pixels(file[FRAMES], row)
+            file["entry/digest/checksum"][row] = zlib.crc32(image.tobytes())
 
-def skipped_stamp(file: h5py.File) -> None:
-    file["entry/frame_log/framestamp"][9:] += 2
-
-
-def stuck(file: h5py.File) -> None:
-    repaint(file, 9, file[f"{DETECTOR}/data"][8])
-
-
-def repaint(file: h5py.File, row: int, pixels: np.ndarray) -> None:
-    """Other pixels, as if they had been written."""
-    file[f"{DETECTOR}/data"][row] = pixels
-    file["entry/digest/checksum"][row] = zlib.crc32(pixels.tobytes())
-
-
-def lost_triggers(file: h5py.File) -> None:
-    file["entry/progress/missing_triggers"].resize(2, 0)
-
-
-def no_beam(file: h5py.File) -> None:
-    darks = file[f"{DETECTOR}/data"][:2]
-    for row in (2, 3, 4):
-        repaint(file, row, darks[row % 2] + np.uint16(3))
-
-
-def dead_projections(file: h5py.File) -> None:
-    for row in range(5, 14):
-        repaint(file, row, np.full(SHAPE, 65535, np.uint16))
+    return spoil
 
 
 def huge_pixels(file: h5py.File) -> None:
@@ -159,9 +150,9 @@ def huge_pixels(file: h5py.File) -> None:
     [
         (no_definition, "warning", "definition", "expected 'NXtomo'"),
         (float_frames, "error", "integer-frames", "float32"),
-        (short_key, "error", "key-length", "12 entries for 14 frames"),
+        (shorter(f"{DETECTOR}/image_key", 2), "error", "key-length", "12 entries for 14 frames"),
         (put(f"{DETECTOR}/image_key", 7, 4), "error", "key-codes", r"\[7\]"),
-        (short_angles, "error", "angle-length", "13 angles for 14 frames"),
+        (shorter(ANGLE, 1), "error", "angle-length", "13 angles for 14 frames"),
         (attribute(ANGLE, units=None), "error", "angle-units", "no units attribute"),
         (attribute(ANGLE, units="mm"), "error", "angle-units", "'mm'"),
         (put(ANGLE, np.nan, 8), "error", "angles", "1 of 9 projections .* frame 8"),
@@ -176,23 +167,25 @@ def huge_pixels(file: h5py.File) -> None:
         (without("entry/sample/name"), "warning", "names", "sample/name"),
         (put("entry/end_time", "20.11.2026 5 Uhr"), "warning", "iso-times", "not ISO 8601"),
         (put("entry/end_time", "2020-01-01T00:00:00+00:00"), "warning", "iso-times", "before it starts"),
-        (time_back, "error", "time-order", "frame 6, by 9.88 s"),
+        (put("entry/frame_log/time", EPOCH - 9.28, 6), "error", "time-order", "frame 6, by 9.88 s"),
         (put("entry/frame_log/framestamp", 3, 9), "error", "framestamps", "frame 9, framestamp 3 after 3"),
-        (skipped_stamp, "warning", "framestamps", "2 frames .* frame 9"),
-        (stuck, "warning", "stuck-frames", r"first: 9\)"),
+        (put("entry/frame_log/framestamp", range(6, 11), slice(9, None)), "warning", "framestamps", "2 frames .*me 9"),
+        (repainted([9], lambda frames, row: frames[8]), "warning", "stuck-frames", r"first: 9\)"),
         (put("entry/progress/frames_committed", 99), "error", "unfinished", "99 frames .* 14 are there"),
         (put("entry/progress/finished", 0), "warning", "unfinished", "14 frames can be trusted"),
         (put("entry/progress/status", b"stopped"), "warning", "unfinished", "'stopped'"),
-        (lost_triggers, "warning", "missing-frames", "2 triggers"),
-        (no_beam, "error", "bad-references", "Was the shutter open"),
-        (dead_projections, "error", "pixels", "is 65535"),
+        (lambda file: file["entry/progress/missing_triggers"].resize(2, 0), "warning", "missing-frames", "2 triggers"),
+        (
+            repainted(range(2, 5), lambda frames, row: frames[row % 2] + np.uint16(3)),
+            "error", "bad-references", "Was the shutter open",
+        ),
+        (repainted(range(5, 14), lambda *_: np.full(SHAPE, 65535, np.uint16)), "error", "pixels", "is 65535"),
         (huge_pixels, "error", "pixel-size", "4600 mm"),
     ],
-)
+)  # fmt: skip
 def test_each_rule_finds_what_it_is_for(
-    write: Write, frames: list[Frame], spoil: Spoil, severity: str, rule: str, said: str
+    path: Path, frames: list[Frame], spoil: Spoil, severity: str, rule: str, said: str
 ) -> None:
-    path = write(frames)
     with h5py.File(path, "r+") as file:
         spoil(file)
         seal(file)
@@ -237,14 +230,12 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
 
 def test_degrees_that_are_radians(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        for frame in frames[:5]:
-            writer.append(frame, digest(frame.counts))
+        append(writer, *frames[:5])
         for i in range(40):
-            frame = replace(frames[5], index=5 + i, framestamp=i, angle=np.radians(i * np.pi / 39))
-            frame.counts[0, 0] = i
-            writer.append(frame, digest(frame.counts))
-    hits = [finding for finding in validate(tmp_path / "s.h5") if finding.rule == "angle-spread"]
-    assert "radians" in hits[0].message
+            angle = np.radians(i * np.pi / 39)
+            frame = replace(frames[5], index=5 + i, framestamp=i, angle=angle, counts=frames[5].counts + np.uint16(i))
+            append(writer, frame)
+    assert "radians" in angles_told(SourceOptions(tmp_path / "s.h5"))[0].message
 
 
 @pytest.mark.parametrize(
@@ -260,11 +251,7 @@ def test_degrees_that_are_radians(tmp_path: Path, clock: SteppedClock, frames: l
     ],
 )
 def test_radians_that_are_degrees(tmp_path: Path, theta: np.ndarray, severity: str, said: str) -> None:
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
-        file["exchange/theta"] = theta
-        file["exchange/theta"].attrs["units"] = "rad"
-    hits = [finding for finding in validate(tmp_path / "s.h5") if finding.rule == "angle-spread"]
+    hits = angles_told(SourceOptions(with_theta(tmp_path, theta, "rad")))
     assert [hit.severity for hit in hits] == [severity] * bool(severity)
     assert not hits or said in hits[0].message
 
@@ -275,10 +262,7 @@ DEGREES = np.arange(0, 180, 2.0)
 @pytest.mark.parametrize(
     ("theta", "said"),
     [
-        (
-            DEGREES * 1000,
-            "0 to 178000 degrees, 2000 from one to the next, which is a turn or more: these look like",
-        ),
+        (DEGREES * 1000, "0 to 178000 degrees, 2000 from one to the next, which is a turn or more: these look like"),
         (-DEGREES * 1000 + 7e4, "-108000 to 70000 degrees, 2000 from one"),
         (DEGREES[np.random.default_rng(0).permutation(90)] * 1000, "look like counts of an encoder"),
         (DEGREES * 65536 / 360, "0 to 32403.9 degrees, 364.1 from one"),
@@ -292,28 +276,14 @@ DEGREES = np.arange(0, 180, 2.0)
     ],
 )
 def test_angles_that_cannot_be_degrees(tmp_path: Path, theta: np.ndarray, said: str) -> None:
-    path = tmp_path / "s.h5"
-    with h5py.File(path, "w") as file:
-        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
-        file["exchange/theta"] = np.full(theta.size, np.nan)
     (tmp_path / "a.txt").write_text("\n".join(map(str, theta)))
-    hits = [hit for hit in validate(SourceOptions(path, angles=tmp_path / "a.txt")) if hit.rule == "angle-spread"]
-    assert [hit.severity for hit in hits] == ["error"]
-    assert said in hits[0].message
-    assert "--angles FILE" in hits[0].message
-
-
-class Nothing:
-    def close(self) -> None:
-        pass
+    path = with_theta(tmp_path, np.full(theta.size, np.nan))
+    (hit,) = angles_told(SourceOptions(path, angles=tmp_path / "a.txt"))
+    assert hit.severity == "error" and said in hit.message and "--angles FILE" in hit.message
 
 
 def test_angles_that_count_the_frames_are_doubted(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_text("\n".join(map(str, range(90))))
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        file["exchange/data"] = np.ones((90, 4, 5), np.uint16)
-    hits = validate(SourceOptions(tmp_path / "s.h5", angles=tmp_path / "a.txt"))
-    (hit,) = [hit for hit in hits if hit.rule == "angle-spread"]
+    (hit,) = angles_told(SourceOptions(with_theta(tmp_path, np.arange(90.0), "deg")))
     assert hit.severity == "warning" and "do they count the frames?" in hit.message
 
 
@@ -334,7 +304,7 @@ def test_angles_of_any_plan_are_no_counts_and_no_radians(
         "random": np.random.default_rng(views).random(views),
     }[order]
     source = StacksSource(
-        Path("none"), Nothing(), [FrameStack(FrameKind.PROJECTION, "views", np.ones((views, 2, 2)))],
+        Path("none"), Closable(), [FrameStack(FrameKind.PROJECTION, "views", np.ones((views, 2, 2)))],
         format="", facts={},
     )  # fmt: skip
     turns = min(turns, views / 2 if order == "even" else 1.0)  # no stage turns on by whole turns
@@ -359,16 +329,14 @@ def test_what_cannot_be_opened_is_a_finding(tmp_path: Path) -> None:
     assert found(tmp_path / "empty.h5") == {("error", "readable")}
 
 
-def test_a_growing_file_can_be_validated(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
+def test_a_growing_file_can_be_validated(writer: NXtomoWriter, tmp_path: Path, frames: list[Frame]) -> None:
+    append(writer, *frames)
     assert found(tmp_path / "s.h5") == {("warning", "unfinished")}
     writer.close()
 
 
-def test_describe(write: Write, frames: list[Frame]) -> None:
-    said = describe(write(frames))
+def test_describe(path: Path) -> None:
+    said = describe(path)
     assert said["format"] == "nxtomo"
     assert said["kinds"] == {"projection": 9, "flat": 3, "dark": 2}
     assert (said["first_angle_deg"], said["last_angle_deg"]) == (0, pytest.approx(180))
@@ -483,15 +451,10 @@ def test_views_without_light_are_named(tmp_path: Path, unlit: list[int]) -> None
     frames = rng.poisson(counts).astype(np.uint16)
     frames[[4 + view for view in unlit]] = 0
     with h5py.File(tmp_path / "s.h5", "w") as file:
-        file["exchange/data_dark"], file["exchange/data_white"], file["exchange/data"] = (
-            frames[:2],
-            frames[2:4],
-            frames[4:],
-        )
+        for name, part in (("data_dark", frames[:2]), ("data_white", frames[2:4]), ("data", frames[4:])):
+            file[f"exchange/{name}"] = part
         file["exchange/theta"] = np.arange(16) * 11.25
     (hit,) = [hit for hit in validate(tmp_path / "s.h5") if hit.rule == "unlit"]
+    rows = spans([4 + view for view in unlit])
     assert hit.severity == "warning"
-    assert (
-        f"{len(unlit)} of 16 views looked at (frames {spans([4 + view for view in unlit])}) have no light"
-        in hit.message
-    )
+    assert f"{len(unlit)} of 16 views looked at (frames {rows}) have no light" in hit.message

@@ -25,7 +25,7 @@ from recon.base.volume import Grid, Volume
 SHAPE = 3, 4, 5
 VALUES = (np.arange(60, dtype=np.float32).reshape(SHAPE) - 7) / 8
 RECORD = ReconRecord(
-    volume=Volume(VALUES, Grid(SHAPE, 0.25, (0.5, 0.0, -1.0))),
+    volume=Volume(VALUES, Grid(SHAPE, 0.25, (0.5, 0.0, -1.0), slice_pitch=0.375)),
     length_unit="mm",
     raw_file="scan.h5",
     title='a "test" of \\ µm',
@@ -40,6 +40,7 @@ NAMES = ("v.h5", "v.tif", "v", "v.ome.zarr", "v.npy", "v.nrrd")
 def test_the_suffix_names_the_format() -> None:
     suffixes = [suffix for kind in formats() for suffix in kind.suffixes]
     assert len(suffixes) == len(set(suffixes))
+    assert all(kind.suffixes[0] in suffixes_text() for kind in formats())  # in help
     assert [format_of(Path(name)) for name in NAMES] == list(formats())
     assert format_of(Path("V.TIFF")) is format_of(Path("v.tif"))
     for name in ("v.zip", "v.png", "v.html", "scan_v1.2", ".h5", ""):
@@ -83,8 +84,8 @@ def test_other_programs_read_the_same(tmp_path: Path) -> None:
     fields = dict(line.split(": ", 1) for line in header.decode("ascii").splitlines()[1:-1])
     assert header.startswith(b"NRRD0004\n")
     assert (fields["sizes"], fields["encoding"], fields["endian"]) == ("5 4 3", "raw", "little")
-    assert fields["space origin"] == "(-1.5,-0.375,0.25)"  # centre of the first voxel, x first
-    assert fields["space directions"] == "(0.25,0,0) (0,0.25,0) (0,0,0.25)"
+    assert fields["space origin"] == "(-1.5,-0.375,0.125)"  # centre of the first voxel, x first
+    assert fields["space directions"] == "(0.25,0,0) (0,0.25,0) (0,0,0.375)"
     with h5py.File(tmp_path / "v.h5") as file:
         np.testing.assert_array_equal(file["entry/data/data"][:], VALUES)
 
@@ -142,30 +143,27 @@ def test_nothing_is_overwritten(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / name]
 
 
-LONG = replace(RECORD, volume=Volume(VALUES, Grid(SHAPE, 0.25, (0.5, 0.0, -1.0), slice_pitch=0.4)))  # along z
-
-
 @pytest.mark.parametrize(("unit", "name"), [("mm", "mm"), ("px", "pixel")])
 def test_imagej_sees_a_stack_along_z_with_the_edges_of_a_voxel(tmp_path: Path, unit: str, name: str) -> None:
-    write_volume(tmp_path / "v.tif", replace(LONG, length_unit=unit))
+    write_volume(tmp_path / "v.tif", replace(RECORD, length_unit=unit))
     with tifffile.TiffFile(tmp_path / "v.tif") as tif:
         said = tif.imagej_metadata or {}
-        assert (said["slices"], said["spacing"], said["unit"]) == (3, 0.4, name)
+        assert (said["slices"], said["spacing"], said["unit"]) == (3, 0.375, name)
         assert [tif.pages.first.tags[f"{axis}Resolution"].value for axis in "XY"] == [(4, 1)] * 2  # pixels per unit
         assert tif.pages.first.tags["ResolutionUnit"].value == 1  # that of the description
 
 
 def test_large_volumes_are_a_bigtiff_of_ome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tiff, "CLASSIC_TIFF_BYTES", VALUES.nbytes)
-    write_volume(tmp_path / "v.tif", LONG)
+    write_volume(tmp_path / "v.tif", RECORD)
     with tifffile.TiffFile(tmp_path / "v.tif") as tif:
         assert (tif.is_bigtiff, tif.series[0].axes) == (True, "ZYX")
         np.testing.assert_array_equal(tif.asarray(), VALUES)
-        for size in ('PhysicalSizeZ="0.4"', 'PhysicalSizeY="0.25"', 'PhysicalSizeXUnit="mm"'):
+        for size in ('PhysicalSizeZ="0.375"', 'PhysicalSizeY="0.25"', 'PhysicalSizeXUnit="mm"'):
             assert size in (tif.ome_metadata or "")
     with opened_volume(tmp_path / "v.tif") as read:
         np.testing.assert_array_equal(read.volume.data[:], VALUES)
-        assert (read.volume.grid, read.title) == (LONG.volume.grid, LONG.title)
+        assert (read.volume.grid, read.title) == (RECORD.volume.grid, RECORD.title)
     with pytest.raises(DataError, match="this program wrote"):
         open_scan(tmp_path / "v.tif")
 
@@ -246,9 +244,3 @@ def test_a_tiff_of_a_slice_or_a_column_comes_back(tmp_path: Path, shape: tuple[i
     write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values, Grid(shape, 0.25))))
     with opened_volume(tmp_path / "v.tif") as read:
         np.testing.assert_array_equal(read.volume.data[:], values)
-
-
-def test_help_names_the_usual_suffix_of_every_format() -> None:
-    text = ".h5 (with all settings), .tif, .zarr, .npy, .nrrd, or no suffix: a folder of TIFFs"
-    assert suffixes_text() == text
-    assert all(kind.suffixes[0] in text for kind in formats())

@@ -21,14 +21,14 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE
+from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, append
 from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
 
 
-def test_paths_types_and_units_of_nxtomo(write: Write, frames: list[Frame]) -> None:
-    with h5py.File(write(frames)) as file:
+def test_paths_types_and_units_of_nxtomo(path: Path, frames: list[Frame]) -> None:
+    with h5py.File(path) as file:
         entry = file["entry"]
         assert entry["definition"][()] == b"NXtomo"
         assert entry["title"][()] == b"a test"
@@ -57,8 +57,8 @@ def test_paths_types_and_units_of_nxtomo(write: Write, frames: list[Frame]) -> N
         assert entry["record/plan"][()] == b'{"views": 9}'
 
 
-def test_nxdata_holds_hard_links_that_name_their_target(write: Write, frames: list[Frame]) -> None:
-    with h5py.File(write(frames)) as file:
+def test_nxdata_holds_hard_links_that_name_their_target(path: Path) -> None:
+    with h5py.File(path) as file:
         nxdata = file["entry/data"]
         assert nxdata.attrs["signal"] == "data"
         assert list(nxdata.attrs["axes"]) == ["rotation_angle", "y", "x"]
@@ -69,8 +69,8 @@ def test_nxdata_holds_hard_links_that_name_their_target(write: Write, frames: li
         assert nxdata["y"].shape == (SHAPE[0],)
 
 
-def test_times_are_iso_8601(write: Write, frames: list[Frame]) -> None:
-    with h5py.File(write(frames)) as file:
+def test_times_are_iso_8601(path: Path) -> None:
+    with h5py.File(path) as file:
         for name in ("start_time", "end_time"):
             said = datetime.fromisoformat(file["entry"][name][()].decode())
             assert said == datetime.fromtimestamp(EPOCH, UTC)
@@ -105,8 +105,8 @@ def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, cl
     NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock).close()
 
 
-def test_digest_and_preview_are_stored_beside_the_frame(write: Write, frames: list[Frame]) -> None:
-    with h5py.File(write(frames)) as file:
+def test_digest_and_preview_are_stored_beside_the_frame(path: Path, frames: list[Frame]) -> None:
+    with h5py.File(path) as file:
         for i, frame in enumerate(frames):
             expected = digest(frame.counts)
             np.testing.assert_array_equal(file["entry/digest/preview"][i], expected.preview)
@@ -136,11 +136,9 @@ def test_exchange_view_shows_the_same_frames_and_moves_with_the_file(
 
 
 def test_a_stopped_scan_has_a_view_of_the_rows_that_exist(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
+    writer: NXtomoWriter, tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    for frame in frames[:7]:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames[:7])
     clock.sleep(10)
     writer.close("stopped", missing=[7, 9])
     writer.close("complete")  # the second close changes nothing
@@ -220,7 +218,7 @@ def test_an_exception_inside_leaves_a_failed_but_readable_file(
         pytest.raises(RuntimeError, match="camera"),
         NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer,
     ):
-        writer.append(frames[0], digest(frames[0].counts))
+        append(writer, frames[0])
         raise RuntimeError("camera unplugged")
     with open_scan(tmp_path / "s.h5") as source:
         assert source.attributes["status"] == "failed"
@@ -238,10 +236,9 @@ def test_never_overwrites(tmp_path: Path, clock: SteppedClock) -> None:
 
 
 def test_wrong_frames_are_refused_and_nothing_is_written(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
+    writer: NXtomoWriter, tmp_path: Path, frames: list[Frame]
 ) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
+    append(writer, frames[0])
     good = frames[1]
     for bad, said in (
         (replace(good, counts=good.counts[:-1]), r"uint16 \(11, 16\), expected uint16 \(12, 16\)"),

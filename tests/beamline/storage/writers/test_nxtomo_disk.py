@@ -19,7 +19,6 @@ import h5py
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.monitor.digest import digest
 from beamline.storage import disk_file
 from beamline.storage.overlay import Overlay
 from beamline.storage.readers.open import open_scan
@@ -27,24 +26,21 @@ from beamline.storage.writers import layout, nxtomo
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.rows import Rows
 from drivers.base.frame import Frame
-from tests.beamline.storage.conftest import INFO, SHAPE
+from tests.beamline.storage.conftest import INFO, SHAPE, append
 from tests.clock import SteppedClock
 
 
 def test_a_full_disk_is_named_and_earlier_rows_stay(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    writer: NXtomoWriter, tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
-
+    append(writer, frames[0])
     full = Mock(side_effect=OSError(28, "No space left on device"))
-
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
         with pytest.raises(DataError, match=r"s\.h5 could not.*No space left.*are free.*first 1 frames"):
-            writer.append(frames[1], digest(frames[1].counts))
+            append(writer, frames[1])
     with pytest.raises(DataError, match="earlier write failed"):
-        writer.append(frames[1], digest(frames[1].counts))
+        append(writer, frames[1])
     writer.close()
     assert not writer.remarks
     with open_scan(tmp_path / "s.h5") as source:
@@ -65,15 +61,12 @@ def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_
     """To close the file would be to write once more what the disk did not take, with a traceback for each id."""
     path = tmp_path / "s.h5"
     writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
-    for frame in frames[:2]:
-        writer.append(frame, digest(frame.counts))
-
+    append(writer, *frames[:2])
     full = Mock(side_effect=no_room())
-
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
         with pytest.raises(DataError, match=r"left on device\)"):
-            writer.append(frames[2], digest(frames[2].counts))
+            append(writer, frames[2])
         patch.setattr(h5py.File, "close", full)
         patch.setattr(h5py.File, "flush", full)
         writer.close()
@@ -92,13 +85,10 @@ def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_
 
 
 def test_a_disk_that_is_full_when_the_scan_ends_is_named(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    writer: NXtomoWriter, tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
-
+    append(writer, frames[0])
     full = Mock(side_effect=no_room())
-
     with monkeypatch.context() as patch:
         patch.setattr(h5py.File, "flush", full)
         with pytest.raises(DataError, match=r"s\.h5.*first 1 frames"):
@@ -109,10 +99,9 @@ def test_a_disk_that_is_full_when_the_scan_ends_is_named(
 
 
 def test_no_view_is_begun_where_there_is_no_room_for_it(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    writer: NXtomoWriter, tmp_path: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
+    append(writer, frames[0])
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=500))
     writer.close()
     assert len(writer.remarks) == 1
@@ -129,8 +118,7 @@ def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
     """The /exchange view comes to an ordinary file: but for the head and the group, it only makes it longer."""
     before, changed = [b""], tmp_path / "s.h5"
     writer = NXtomoWriter(changed, INFO, SHAPE, clock=clock)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames)
     view_of = nxtomo.with_exchange_view
 
     def look_first(overlay: Overlay) -> Overlay:
@@ -174,7 +162,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
         handle = writer._file.id.get_vfd_handle()
         for frame in frames:
             begun.clear()
-            writer.append(frame, digest(frame.counts))
+            append(writer, frame)
             assert begun.wait(60.0)
     assert [rows for _, rows in calls[:14]] == list(range(1, 15))
     assert (handle, 14) in calls[14:]  # before the file is closed; then comes the /exchange view
@@ -195,7 +183,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     with pytest.raises(DataError, match=r"take the frame .*Input/output error.*first 3 frames"):
         for frame in frames:
-            writer.append(frame, digest(frame.counts))
+            append(writer, frame)
             if (thread := writer._to_disk._thread) is not None:
                 thread.join()
     assert (writer.committed, writer.safe) == (5, 3)  # of the other two nobody knows
@@ -215,8 +203,7 @@ def test_a_disk_that_hangs_does_not_hold_the_writer(
     monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames)
     assert (writer.committed, len(calls)) == (14, 1)
     hangs.set()
     writer.close()
@@ -234,12 +221,11 @@ def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
     full = Mock(side_effect=OSError(28, "No space left on device"))
 
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=9)
-    for frame in frames[:3]:
-        writer.append(frame, digest(frame.counts))
+    append(writer, *frames[:3])
     assert writer.committed == 0
     monkeypatch.setattr(Rows, "write", full)
     with pytest.raises(DataError, match="first 3 frames"):
-        writer.append(frames[3], digest(frames[3].counts))
+        append(writer, frames[3])
     writer.close("failed")
     with open_scan(tmp_path / "s.h5") as source:
         assert source.refresh() == 3
@@ -259,15 +245,14 @@ def _cut_in_half(path: Path) -> None:
 @pytest.mark.parametrize("at", [5, 14])
 @pytest.mark.parametrize(("touch", "said"), [(_cut, "to 0 bytes"), (_cut_in_half, "was cut"), (Path.unlink, "deleted")])
 def test_a_file_that_another_program_touches_ends_the_scan(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
+    writer: NXtomoWriter, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
 ) -> None:
     """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     with pytest.raises(DataError, match=f"was written:.*{said}"):
         for frame in frames:
             if frame.index == at:
                 touch(writer.path)
-            writer.append(frame, digest(frame.counts))
+            append(writer, frame)
         touch(writer.path)
         writer.close()
     writer.close("failed")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -98,37 +99,24 @@ def test_refuses_a_file_that_appeared_meanwhile(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_replaces_in_one_step_when_asked(tmp_path: Path) -> None:
+def test_replaces_in_one_step_when_asked_but_no_file_that_the_system_does_not_let_go_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As Windows does not of one that a viewer holds open."""
     path = tmp_path / "snapshot.h5"
-    write_reconstruction(path, _record(), replace=True)
-    write_reconstruction(path, replace(_record(), title="newer"), replace=True)
+    for title in ("old", "newer"):
+        write_reconstruction(path, replace(_record(), title=title), replace=True)
+    held = Mock(side_effect=PermissionError(13, "it is being used by another process"))
+    monkeypatch.setattr(Path, "replace", held)
+    with pytest.raises(DataError, match=r"another process.*untouched"):
+        write_reconstruction(path, _record(), replace=True)
     assert read_reconstruction(path).title == "newer"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_the_system_does_not_let_go_of_is_left_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on Windows, where nothing replaces a file that a viewer holds open."""
-    path = tmp_path / "snapshot.h5"
-    write_reconstruction(path, _record())
-
-    def held(self: Path, target: Path) -> Path:
-        raise PermissionError(13, "it is being used by another process")
-
-    monkeypatch.setattr(Path, "replace", held)
-    with pytest.raises(DataError, match=r"another process.*untouched"):
-        write_reconstruction(path, replace(_record(), title="newer"), replace=True)
-    assert read_reconstruction(path).title == _record().title
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_other_files_and_missing_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not exist"):
         write_reconstruction(tmp_path / "no" / "out.h5", _record())
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("no HDF5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["entry/data/data"] = np.zeros((2, 2, 2))
@@ -152,13 +140,6 @@ def test_damaged_voxels_are_said_to_be(tmp_path: Path) -> None:
         read_reconstruction(path)
 
 
-def test_slices_that_are_higher_than_pixels_are_wide_stay_so(tmp_path: Path) -> None:
-    record = _record((3, 4, 4), 0.02)
-    grid = Grid((3, 4, 4), 0.02, slice_pitch=0.05)
-    write_reconstruction(tmp_path / "v.h5", replace(record, volume=Volume(record.volume.data, grid)))
-    assert read_reconstruction(tmp_path / "v.h5").volume.grid.spacing == pytest.approx((0.05, 0.02, 0.02))
-
-
 KEPT = Checkpoint(
     {"parameters.raw": np.arange(4, dtype=np.float32), "generator": np.array([2**64 - 1, 3], np.uint64)},
     {"projections": "ab12", "n_views": 30, "pixel_pitch": np.asarray(0.5), "angles": np.linspace(0, 3, 30)},
@@ -180,26 +161,17 @@ def test_there_and_back_to_the_bit(tmp_path_factory: pytest.TempPathFactory, val
     np.testing.assert_array_equal(back.made_from["angles"], KEPT.made_from["angles"])
 
 
-def test_the_new_one_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
-    write_checkpoint(tmp_path / "fit.h5", KEPT)
-    write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
-    assert read_checkpoint(tmp_path / "fit.h5").steps == 7
-    assert [p.name for p in tmp_path.iterdir()] == ["fit.h5"]
-
-
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
-def test_one_that_fails_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+def test_the_new_one_takes_the_place_of_the_old_one_unless_it_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_checkpoint(tmp_path / "fit.h5", KEPT)
-
-    def fails() -> str:
-        raise error
-
-    monkeypatch.setattr(checkpoint_file, "version", fails)
-    with pytest.raises((DataError, KeyboardInterrupt)):
-        write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
-    assert read_checkpoint(tmp_path / "fit.h5").steps == 500
+    for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
+        with monkeypatch.context() as patch, pytest.raises((DataError, KeyboardInterrupt)):
+            patch.setattr(checkpoint_file, "version", Mock(side_effect=error))
+            write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
+        assert read_checkpoint(tmp_path / "fit.h5").steps == 500
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
+    assert read_checkpoint(tmp_path / "fit.h5").steps == 7
     assert [p.name for p in tmp_path.iterdir()] == ["fit.h5"]
 
 

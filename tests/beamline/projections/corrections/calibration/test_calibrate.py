@@ -10,21 +10,17 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.monitor.digest import digest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.poses import PosesOfFile
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
 from beamline.storage.pose_table import read_poses
-from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.base.clock import SystemClock
-from drivers.base.frame import Frame, FrameKind
 from recon.base.geometry import Geometry
 from recon.features.calibration.joint import knowable
+from tests.beamline.prepared_views import prepare
+from tests.beamline.scans import DARK, frames_through, write_flagged
 from tests.recon.bodies import balls
 
 N, SHAPE, PITCH, AXIS = 48, (24, 48), 0.5, 23.9
@@ -39,22 +35,13 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     geometry = Geometry.parallel(
         np.linspace(0, np.pi, N, endpoint=False), SHAPE, pixel_pitch=PITCH, axis_col=AXIS, shifts=JUMP
     )
-    counts = 100 + 40_000 * np.exp(-balls(10, 12).views(geometry))
-    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
-    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
-    angles = [np.nan] * 4 + geometry.angles.tolist()
-    with NXtomoWriter(path, ScanInfo("jump", pixel_size_mm=PITCH), SHAPE, clock=SystemClock()) as writer:
-        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
-            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
-            writer.append(frame, digest(frame.counts), [])
-    return path
+    counts = DARK + 40_000 * np.exp(-balls(10, 12).views(geometry))
+    return write_flagged(path, frames_through(counts, geometry.angles, beam=40_000), {}, pixel_size_mm=PITCH)
 
 
 def prepared(path: Path, *steps: PrepStep, **selected: object) -> PreparedProjections:
     asked: dict[str, Any] = {"axis_col": AXIS + 0.8, "steps": (Air("none"), *steps), **selected}
-    chosen = Selection(**asked)
-    with SourceOptions(path).open() as source:
-        return prepare_projections(source, chosen, lambda _: None)
+    return prepare(path, Selection(**asked))[0]
 
 
 def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path) -> None:
@@ -64,10 +51,8 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
     done = found.done["calibrate"]
-    assert (
-        done.sentence.startswith("Geometry learnt: the axis moves by +")
-        and "Views held out deviate by" in done.sentence
-    )
+    assert done.sentence.startswith("Geometry learnt: the axis moves by +")
+    assert "Views held out deviate by" in done.sentence
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
     assert plain.done["calibrate"].sentence == ""
 
@@ -94,15 +79,13 @@ def test_poses_of_a_volume_with_another_axis_are_told(
 ) -> None:
     rows = "\n".join(f"{view},{col},{row}" for view, (col, row) in enumerate(JUMP))
     (tmp_path / "poses.csv").write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
-    warnings: list[str] = []
     table = read_poses(str(tmp_path / "poses.csv"))
-    with SourceOptions(scan).open() as source:
 
-        def axis_of(known: float | None) -> float:
-            steps = Air("none"), PosesOfFile(replace(table, axis_col=known))
-            return prepare_projections(source, Selection(axis_col=given, steps=steps), warnings.append).axis_col
+    def taken(known: float | None) -> tuple[PreparedProjections, list[str]]:
+        steps = Air("none"), PosesOfFile(replace(table, axis_col=known))
+        return prepare(scan, Selection(axis_col=given, steps=steps))
 
-        axis_of(axis_of(None) + off)
+    _, warnings = taken(taken(None)[0].axis_col + off)
     assert any("go with the rotation axis of that volume" in each for each in warnings) is told
 
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from beamline.cli.main import main
 from beamline.projections.corrections.calibration.calibrate import Calibrate
-from beamline.projections.prepare import DiskBuffer, prepare_projections
+from beamline.projections.prepare import DiskBuffer
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.test_air import bent_and_straight
+from tests.beamline.prepared_views import prepare
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHAPE, VIEWS = (24, 56), 60  # pixels binned by 2
@@ -45,27 +45,13 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def _prepared(path: Path, *terms: str, buffer: DiskBuffer | None = None) -> PreparedProjections:
-    with open_scan(path) as source:
-        selection = Selection(axis_col=55.5, binning=2, steps=(Calibrate(terms),))
-        return prepare_projections(source, selection, lambda said: None, buffer)
+    return prepare(path, Selection(axis_col=55.5, binning=2, steps=(Calibrate(terms),)), buffer)[0]
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, NDArray[np.float32]]:
-    given = [
-        "recon",
-        str(scan),
-        "--axis",
-        "55.5",
-        "--bin",
-        "2",
-        "-m",
-        "fista-tv",
-        "--iterations",
-        "10",
-        "--tv-weight",
-        "0.003",
-    ]
-    done = CliRunner().invoke(main, [*given, "-o", str(output), "--no-report", *options])
+    fit = "-m fista-tv --iterations 10 --tv-weight 0.003 --no-report"
+    given = ["recon", str(scan), "--axis", "55.5", "--bin", "2", *fit.split()]
+    done = CliRunner().invoke(main, [*given, "-o", str(output), *options])
     assert done.exit_code == 0, done.output
     return done.output, read_reconstruction(output).volume.data
 
@@ -80,13 +66,10 @@ def test_soft_tissue_beside_bone_in_a_narrow_field_behind_a_bent_beam(scans: dic
     y, x = (np.arange(n) - (n - 1) / 2 for n in true.shape[1:])
     near = np.hypot(y[:, None], x) < 20
     soft = np.abs(true[2:22, near] / 0.85 - 1) < 0.2
-    mass = {name: each[2:22, near][soft].sum() / true[2:22, near][soft].sum() for name, each in
-            (("plain", plain), ("learnt", learnt))}  # fmt: skip
-    psnr = {name: 10 * np.log10(true.max() ** 2 / np.mean((each - true)[2:22, near] ** 2)) for name, each in
-            (("plain", plain), ("learnt", learnt))}  # fmt: skip
-    print("\n", mass, psnr)
-    assert mass["plain"] < 0.9 and abs(mass["learnt"] - 1) < 0.07
-    assert psnr["learnt"] > psnr["plain"] + 2
+    mass = [each[2:22, near][soft].sum() / true[2:22, near][soft].sum() for each in (plain, learnt)]
+    psnr = [10 * np.log10(true.max() ** 2 / np.mean((each - true)[2:22, near] ** 2)) for each in (plain, learnt)]
+    assert mass[0] < 0.9 and abs(mass[1] - 1) < 0.07
+    assert psnr[1] > psnr[0] + 2
 
 
 def test_a_straight_beam_stays_as_it_is_and_says_so(scans: dict[str, Path]) -> None:
@@ -108,12 +91,10 @@ def test_slabs_lose_the_same_background_to_the_bit(scans: dict[str, Path]) -> No
 
 @pytest.mark.slow
 def test_views_held_out_lose_the_surface_of_their_time(scans: dict[str, Path]) -> None:
-    with open_scan(scans["bent"]) as source:
-        plain = Selection(axis_col=55.5, binning=2, views="fixed:40")
-        found, before = (
-            prepare_projections(source, selection, lambda said: None)
-            for selection in (plain.with_steps(Calibrate(("background",))), plain)
-        )
+    plain = Selection(axis_col=55.5, binning=2, views="fixed:40")
+    found, before = (
+        prepare(scans["bent"], chosen)[0] for chosen in (plain.with_steps(Calibrate(("background",))), plain)
+    )
     assert found.held_out is not None and before.held_out is not None
     taken = before.held_out[0] - found.held_out[0]
     used = before.projections.data - found.projections.data

@@ -10,19 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.digest import digest
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.jumps.jumps import Jumps
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.base.clock import SystemClock
-from drivers.base.frame import Frame, FrameKind
+from tests.beamline.prepared_views import prepare
+from tests.beamline.scans import DARK, frames_through, write_flagged
 from tests.recon.voxels.balls import ball_views
 
 SHAPE = (8, 48)
@@ -33,24 +29,16 @@ SELECTION = Selection(axis_col=23.5, steps=(Air("none"),))
 
 
 def scan(path: Path, views: NDArray[np.float32], *jumps: int) -> Path:
-    counts = 100 + 40_000 * np.exp(-views) + np.random.default_rng(0).normal(0, 40, views.shape)
-    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
-    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * len(views)
-    angles = [np.nan] * 4 + ANGLES.tolist()
-    rows = {FIRST + view for view in jumps}
-    with NXtomoWriter(path / "scan.h5", ScanInfo("jump", pixel_size_mm=1.0), SHAPE, clock=SystemClock()) as writer:
-        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
-            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
-            said = [Flag(MotionCheck.name, Level.ALARM, i, 1.0, 0.5, "")] if i in rows else []
-            said += [Flag(OppositeCheck.name, Level.WARN, i, 1.0, 0.5, "")] if i - 3 in rows else []
-            writer.append(frame, digest(frame.counts), said)
-    return path / "scan.h5"
+    counts = DARK + 40_000 * np.exp(-views) + np.random.default_rng(0).normal(0, 40, views.shape)
+    rows = [FIRST + view for view in jumps]
+    flags = [Flag(MotionCheck.name, Level.ALARM, row, 1.0, 0.5, "") for row in rows]
+    flags += [Flag(OppositeCheck.name, Level.WARN, row + 3, 1.0, 0.5, "") for row in rows]
+    return write_flagged(path / "scan.h5", frames_through(counts, ANGLES, beam=40_000), {}, flags=flags)
 
 
 def prepared(path: Path, selection: Selection = SELECTION) -> tuple[PreparedProjections, str]:
-    told: list[str] = []
-    with SourceOptions(path).open() as source:
-        return prepare_projections(source, selection, told.append), " ".join(told)
+    found, told = prepare(path, selection)
+    return found, " ".join(told)
 
 
 def moved(x: float, z: float) -> NDArray[np.float32]:
@@ -58,8 +46,7 @@ def moved(x: float, z: float) -> NDArray[np.float32]:
 
 
 def test_views_after_a_jump_are_corrected_by_shifts(tmp_path: Path) -> None:
-    selection = Selection(views="first:55", axis_col=23.5, steps=(Air("none"),))
-    found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), selection)
+    found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), replace(SELECTION, views="first:55"))
     assert found.geometry.n_views == 55 and found.left_out == 0 and found.held_out is not None
     later, shifts, unseen = LATER[:55], found.geometry.shifts, found.held_out[1]
     assert (shifts[~later] == 0).all()
@@ -99,12 +86,9 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (Selection(axis_col=23.5, steps=(Preparation("ignore"),)), "--flags ignore: 1 view with an alarm"),
-        (
-            Selection(axis_col=23.5, steps=(Jumps("ignore"),)),
-            "The monitor saw the sample jump at frame 45; --jumps ignore",
-        ),
-        (Selection(axis_col=23.5, cone=(100.0, 200.0)), "Views of a cone beam are not corrected"),
+        (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 view with an alarm"),
+        (SELECTION.with_steps(Jumps("ignore")), "The monitor saw the sample jump at frame 45; --jumps ignore"),
+        (replace(SELECTION, cone=(100.0, 200.0)), "Views of a cone beam are not corrected"),
     ],
 )
 def test_who_wants_them_as_they_are_and_cones_get_them_so(tmp_path: Path, selection: Selection, said: str) -> None:

@@ -14,7 +14,7 @@ from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from recon.prep.correct import merge_and_empty
-from tests.beamline.array_source import ArraySource
+from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.scans import BEAM, DARK
 
 PHASE = Phase("20", distance_mm=50.0, energy_kev=20.0)
@@ -23,9 +23,7 @@ SELECTION = Selection(pixel_size_mm=1e-3, steps=(Air("none"), PHASE))
 
 def _source() -> ArraySource:
     rng = np.random.default_rng(3)
-    views = DARK + BEAM * np.exp(-rng.uniform(0, 1, (8, 48, 40)))
-    data = np.concatenate([np.full((1, 48, 40), DARK), np.full((1, 48, 40), DARK + BEAM), views]).astype(np.uint16)
-    return ArraySource(data, [2, 1] + [0] * 8, np.concatenate([[np.nan] * 2, np.radians(np.arange(0, 180, 22.5))]))
+    return counted(DARK + BEAM * np.exp(-rng.uniform(0, 1, (8, 48, 40))), np.radians(np.arange(0, 180, 22.5)))
 
 
 def _correction(selection: Selection) -> ScanCorrection:

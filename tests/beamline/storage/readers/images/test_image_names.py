@@ -19,10 +19,13 @@ from drivers.base.frame import FrameKind
 SHAPE, VIEWS = (4, 6), 12
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
 SAMPLES = (
-    "white_flower", "dark_chocolate", "flatworm", "flat_screen", "white", "dark", "flat", "whiteboard", "ob",
-    "open_beam", "df_01_b", "sample",
+    "white_flower", "dark_chocolate", "flatworm", "flat_screen", "inflated", "white", "dark", "flat", "whiteboard",
+    "ob", "open_beam", "df_01_b", "sample",
 )  # fmt: skip
-REFERENCES = ({"dark_{}": DARK, "flat_{}": FLAT}, {"df/{}": DARK, "ob/{}": FLAT}, {"DF_{}": DARK, "OB_{}": FLAT})
+REFERENCES = (
+    {"dark_{}": DARK, "flat_{}": FLAT}, {"df/{}": DARK, "ob/{}": FLAT}, {"DF_{}": DARK, "OB_{}": FLAT},
+    {"Scan3_Dark_{}": DARK, "Scan3-white-{}": FLAT}, {"darkroom/x_dark_{}": DARK, "darkroom/x_flat_{}": FLAT},
+)  # fmt: skip
 
 
 @given(

@@ -16,7 +16,7 @@ from beamline.storage.volumes.files import opened_volume, write_volume
 from recon.base.volume import Grid, Volume
 from tests.beamline.storage.volumes.test_files import RECORD
 
-SHAPE = 35, 300, 530
+SHAPE = 35, 40, 530
 VALUES = np.random.default_rng(4).normal(size=SHAPE).astype(np.float32)
 GRID = Grid(SHAPE, 0.25, (0.5, 0.0, -1.0))
 LARGE = replace(RECORD, volume=Volume(VALUES, GRID))
