@@ -1,7 +1,5 @@
 """Prepared projections made of line integrals, for tests of what follows the correction."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
