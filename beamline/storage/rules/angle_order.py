@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, coarse_views
+from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, coarse_views
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import VIEWS
 from recon.base.views import spread
@@ -22,16 +22,21 @@ _MOST = 0.75  # of some views: as many look like others that are far from them, 
 RULE = "angle-order"
 
 
-def angles_in_order(source: ScanSource) -> Iterator[Finding]:
+def angles_shown(source: ScanSource) -> Iterator[Finding]:
+    """Views show the turns, and the order of angles, that the file states."""
+    if (seen := coarse_views(source)) is not None:
+        yield from angles_seen(seen)
+        yield from angles_in_order(seen)
+
+
+def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
     """Consecutive frames look alike only if their angles are close, and close angles look alike.
 
     A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
     it where the list is shifted, so the places are looked at where angles jump.
     """
-    seen = coarse_views(source)
-    if seen is None:
-        return
-    rows, degrees = seen.rows, np.degrees(source.angles[seen.rows]) % 360
+    source, rows = seen.source, seen.rows
+    degrees = np.degrees(source.angles[rows]) % 360
     order = np.argsort(degrees, kind="stable")
     gaps = np.diff(degrees[order])
     if not (gaps > 0).any():
@@ -43,7 +48,7 @@ def angles_in_order(source: ScanSource) -> Iterator[Finding]:
     near = _lit(seen, [(int(rows[order[at]]), int(rows[order[at + 1]])) for at in beside])
     if far and near:
         unlike_far, unlike_near = (
-            float(np.median([seen.unlike([pair], False) for pair in pairs])) for pairs in (far, near)
+            float(np.median([seen.unlike_pairs([pair], False) for pair in pairs])) for pairs in (far, near)
         )
         if unlike_near > UNLIKE * unlike_far:
             yield _in_another_order(source, rows, jumps, far[0], near[0])
@@ -67,20 +72,22 @@ def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> tuple[in
     symmetry retraces its views beyond it, mirrored, which frames of two sides do not.
     """
     some = spread(rows, VIEWS)
-    some = some[[seen.lit(row) for row in some.tolist()]]
+    some = some[seen.lit(some)]
     if some.size <= PAIRS:
         return None
     pairs = list(zip(some[:-1].tolist(), some[1:].tolist(), strict=True))
     apart = np.diff(np.degrees(seen.source.angles[some]) % 360)
     allowed = np.maximum(apart / np.median(apart[apart > 0]), 1) ** 2  # views differ by the square of a small turn
-    unlike = np.array([seen.unlike([pair], False) for pair in pairs])
+    unlike = np.diagonal(seen.unlike(some), 1)
     rate = np.pad(unlike / allowed, 2, mode="edge")
     near = np.median(np.lib.stride_tricks.sliding_window_view(rate, 5), axis=1)  # some directions change faster
     usual = np.maximum(near, np.median(rate))
     for at in np.flatnonzero(unlike > UNLIKE * usual * allowed)[:PAIRS].tolist():
         around = list(zip(some[at::-1].tolist(), some[at + 1 :].tolist(), strict=False))[:_AROUND]
-        retraced = len(around) == _AROUND and seen.unlike(around, True) < _RETRACED * usual[at]
-        if not retraced and seen.unlike([pairs[at]], True) < min(2 * usual[at] * allowed[at], unlike[at] / UNLIKE):
+        retraced = len(around) == _AROUND and seen.unlike_pairs(around, True) < _RETRACED * usual[at]
+        if not retraced and seen.unlike_pairs([pairs[at]], True) < min(
+            2 * usual[at] * allowed[at], unlike[at] / UNLIKE
+        ):
             return pairs[at]
     return None
 
@@ -93,7 +100,7 @@ def _apart(turned: NDArray[np.float64]) -> NDArray[np.float64]:
 def _lit(seen: CoarseViews, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """A few of the pairs of frames, evenly spread, with light."""
     some = [pairs[at] for at in spread(np.arange(len(pairs)), PAIRS)]
-    return [pair for pair in some if all(seen.lit(row) for row in pair)]
+    return [pair for pair in some if seen.lit(np.array(pair)).all()]
 
 
 def _stated(source: ScanSource, pair: tuple[int, int]) -> str:
@@ -124,17 +131,15 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Fin
     two passes never; as they were taken, none.
     """
     some = spread(rows, VIEWS)
-    some = some[[seen.lit(row) for row in some.tolist()]]
+    some = some[seen.lit(some)]
     if some.size < PAIRS:
         return
     degrees = np.degrees(seen.source.angles[some]) % 360
     apart = _apart(degrees - degrees[:, None])
     is_far = apart > max(OTHER * 180, 2 * float(np.median(np.diff(degrees))))
-    unlike = np.full(is_far.shape, np.inf)
-    for i, j in np.argwhere(np.triu(np.ones_like(is_far), 1)).tolist():
-        unlike[i, j] = unlike[j, i] = seen.unlike([(int(some[i]), int(some[j]))], False)
     if not is_far.any():
         return
+    unlike = seen.unlike(some)
     usual, beside = float(np.median(unlike[is_far])), np.diagonal(unlike, 1)
     neighbours = np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
     far_alone = np.where(is_far, unlike, np.inf)

@@ -33,6 +33,7 @@ _FINE = 90  # of the range of angles: neighbours that tell how much a small turn
 _AROUND = 9  # views about the best of some that are looked at
 _PARTS = 4  # steps to a column in which mirror images are moved
 _LEAST_LIGHT = 1e-3  # of the beam
+_ROUNDING = 1e-12  # of the power of an image: less is none
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 
@@ -154,12 +155,15 @@ class CoarseViews:
     light: ViewLight
     rows: NDArray[np.int64]
     _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+    _lit: dict[int, bool] = field(default_factory=dict)
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """Line integrals [row, col] of a view, smoothed along its rows, so that it has two columns less."""
+        """Line integrals [row, col] of a view, each row less its mean, smoothed along its rows, so that it has two
+        columns less."""
         if row not in self._depths:
             lines = self._lines(row)
-            self._depths[row] = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
+            lines = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
+            self._depths[row] = lines - lines.mean(axis=1, keepdims=True)
         return self._depths[row]
 
     def _lines(self, row: int) -> NDArray[np.float64]:
@@ -172,28 +176,36 @@ class CoarseViews:
         seen = np.nan_to_num(cells - self.light.dark)
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
-    def lit(self, row: int) -> bool:
-        """Whether the view has light and shows a sample."""
-        known = reference_frame(self.source, row).cells
-        if known is None or self.light.dark is None or self.light.flat is None:
-            return bool(np.ptp(self._lines(row)))
-        return brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
+    def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether views have light and show a sample [view]."""
+        for row in set(rows.tolist()) - self._lit.keys():
+            known = reference_frame(self.source, row).cells
+            if known is None or self.light.dark is None or self.light.flat is None:
+                self._lit[row] = bool(np.ptp(self._lines(row)))
+            else:
+                self._lit[row] = brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
+        return np.array([self._lit[row] for row in rows.tolist()], np.bool_)
 
-    def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool, reach: float = 0.25) -> float:
+    def unlike(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """1 minus the correlation of views [view, view]; 1 for one without structure."""
+        images = np.stack([self.depth(row).ravel() for row in rows.tolist()])
+        power = np.linalg.norm(images, axis=1, keepdims=True)
+        images = np.divide(images, power, out=np.zeros_like(images), where=power > 0)
+        return np.asarray(1 - images @ images.T)
+
+    def unlike_pairs(self, pairs: Sequence[tuple[int, int]], mirrored: bool, reach: float = 0.25) -> float:
         """1 minus the correlation of pairs of views; of mirror images, about the one column of best agreement.
 
         `reach`: how far mirror images are moved, of the field: twice as far as the axis is from its middle. It is
         doubled once where the best move is the farthest.
         """
+        if not mirrored:
+            return float(np.mean([self.unlike(np.array(pair))[0, 1] for pair in pairs]))
         farthest = int(reach * (self.depth(pairs[0][0]).shape[1] + 2))
-        moves = np.arange(-farthest * _PARTS, farthest * _PARTS + 1) / _PARTS if mirrored else np.zeros(1)
-        curve = np.zeros(len(moves))
-        for one, other in pairs:
-            a, b = self.depth(one), self.depth(other)[:, :: -1 if mirrored else 1]
-            curve += [1 - _correlation(*_laid_on(a, b, move)) for move in moves.tolist()]
-        if mirrored and reach < 0.5 and int(np.argmin(curve)) in (0, len(curve) - 1):
-            return self.unlike(pairs, mirrored, 2 * reach)
-        return float(curve.min()) / len(pairs)
+        curve = np.mean([_unlike_moved(self.depth(a), self.depth(b)[:, ::-1], farthest) for a, b in pairs], axis=0)
+        if reach < 0.5 and int(np.argmin(curve)) in (0, 2 * farthest):
+            return self.unlike_pairs(pairs, mirrored, 2 * reach)
+        return float(curve.min())
 
 
 def coarse_views(source: ScanSource) -> CoarseViews | None:
@@ -210,19 +222,17 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
     return CoarseViews(source, light, views) if views.size >= _LEAST_SEEN else None
 
 
-def angles_seen(source: ScanSource) -> Iterator[Finding]:
+def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     """Views half a turn apart by their angles are mirror images (a whole turn: alike), and no others are.
 
     Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
     sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
     does: a round sample shows no angle.
     """
-    seen = coarse_views(source)
-    if seen is None:
-        return
+    source = seen.source
     views = seen.rows[np.argsort(source.angles[seen.rows], kind="stable")]
     some = spread(views, VIEWS)
-    some = some[[seen.lit(row) for row in some.tolist()]]
+    some = some[seen.lit(some)]
     degrees = np.degrees(source.angles)
     if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
         return
@@ -231,7 +241,8 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     chosen = np.flatnonzero(beside != some)
     if not chosen.size:
         return
-    near = float(np.median([seen.unlike([(int(some[at]), int(beside[at]))], False) for at in spread(chosen, PAIRS)]))
+    pairs = np.stack([some, beside], axis=1)[spread(chosen, PAIRS)]
+    near = float(np.median([seen.unlike(pair)[0, 1] for pair in pairs]))
     for mirrored in (True, False) if source.cone is None else (False,):
         turn = _turn_seen(seen, views, some, degrees, near, mirrored)
         if turn is not None:
@@ -261,18 +272,18 @@ def _turn_seen(
     period, step = (180.0 if mirrored else 360.0), float(np.ptp(degrees[some])) / (some.size - 1)
     stated = _stated_apart(seen, views, some, degrees, period)
     # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
-    off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
+    off = min((seen.unlike_pairs([pair], mirrored) for pair in stated), default=np.inf)
     if off < 2 * UNLIKE * near or (not stated and not mirrored):
         return None
     first, last = int(some[0]), int(some[-1])
     ends = [(first, row) for row in some[some.size // 4 :].tolist()] + [
         (row, last) for row in some[1 : -(some.size // 4)].tolist()
     ]
-    differences = [seen.unlike([pair], mirrored) for pair in ends]
+    differences = [seen.unlike_pairs([pair], mirrored) for pair in ends]
     usual, (early, late) = float(np.median(differences)), ends[int(np.argmin(differences))]
     fixed, moved = (early, late) if early == first else (late, early)
     around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
-    best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in spread(around, _AROUND).tolist())
+    best, nearest = min((seen.unlike_pairs([(fixed, row)], mirrored), row) for row in spread(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
     right = max(OTHER * period, 2 * step)
     apart = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
@@ -289,7 +300,8 @@ def _stated_apart(
     partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
     step = min(float(np.median(np.diff(np.unique(degrees[views])))), float(np.ptp(degrees[some])) / (some.size - 1))
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= step)
-    return [(int(some[at]), int(partner[at])) for at in spread(pairs, PAIRS) if seen.lit(int(partner[at]))]
+    few = spread(pairs, PAIRS)
+    return [(int(some[at]), int(partner[at])) for at in few[seen.lit(partner[few])]]
 
 
 def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:
@@ -324,22 +336,31 @@ def _counted(degrees: NDArray[np.float64]) -> bool:
     return bool(np.allclose(np.sort(degrees), np.arange(degrees.size)))
 
 
-def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Of two images, each row less its mean; 0 where there is nothing."""
-    a, b = (each - each.mean(axis=1, keepdims=True) for each in (a, b))
-    power = float((a * a).sum()) * float((b * b).sum())
-    return float((a * b).sum()) / power**0.5 if power > 0 else 0.0
+def _unlike_moved(a: NDArray[np.float64], b: NDArray[np.float64], farthest: int) -> NDArray[np.float64]:
+    """1 minus the correlation [move] of images where b lies up to so many columns to the left or right: first by whole
+    columns, ascending, then by fractions, of which both images take half."""
+    curves = []
+    for half in np.arange(_PARTS) / (2 * _PARTS):
+        c, d = ((1 - half) * a[:, :-1] + half * a[:, 1:], half * b[:, :-1] + (1 - half) * b[:, 1:]) if half else (a, b)
+        curves.append(1 - _correlations(c, d, np.arange(-farthest + (half > 0), farthest + 1)))
+    return np.concatenate(curves)
 
 
-def _laid_on(
-    a: NDArray[np.float64], b: NDArray[np.float64], move: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The columns that both have where b lies so many columns to the left; both take half of a fraction."""
-    whole = math.floor(move)
-    half = (move - whole) / 2
-    if half:
-        a = (1 - half) * a[:, :-1] + half * a[:, 1:]
-        b = half * b[:, :-1] + (1 - half) * b[:, 1:]
-        whole += 1
-    cols = a.shape[1]
-    return a[:, max(whole, 0) : cols + min(whole, 0)], b[:, max(-whole, 0) : cols - max(whole, 0)]
+def _correlations(a: NDArray[np.float64], b: NDArray[np.float64], moves: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Correlation [move] of the columns that both images [row, col] have where b lies so many columns to the left, each
+    row less its mean there; 0 where there is nothing."""
+    cols = np.arange(a.shape[1])
+    n, at = cols.size - np.abs(moves), cols[:, None] - cols + cols.size - 1
+
+    def sums(values: NDArray[np.float64], begin: NDArray[np.int64]) -> NDArray[np.float64]:
+        total = np.concatenate([np.zeros_like(values[..., :1]), np.cumsum(values, axis=-1)], axis=-1)
+        return np.asarray(total[..., begin + n] - total[..., begin])
+
+    together = np.bincount(at.ravel(), (a.T @ b).ravel())[moves + cols.size - 1]
+    begins = np.maximum(moves, 0), np.maximum(-moves, 0)
+    rows = [sums(image, begin) for image, begin in zip((a, b), begins, strict=True)]
+    whole = [(image * image).sum(axis=0) for image in (a, b)]
+    power = [sums(w, begin) - (r * r).sum(axis=0) / n for w, begin, r in zip(whole, begins, rows, strict=True)]
+    seen = np.logical_and(*(p > _ROUNDING * w.sum() for p, w in zip(power, whole, strict=True)))
+    both = np.where(seen, power[0] * power[1], 1.0)
+    return np.asarray(np.where(seen, (together - (rows[0] * rows[1]).sum(axis=0) / n) / np.sqrt(both), 0.0))

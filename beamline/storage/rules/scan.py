@@ -15,8 +15,8 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.angle_order import angles_in_order
-from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
+from beamline.storage.rules.angle_order import angles_shown
+from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.exposures import one_energy
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import exposures_agree, views_scaled
@@ -314,8 +314,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     enough_views,
     angles_known,
     angles_spread,
-    angles_seen,
-    angles_in_order,
+    angles_shown,
     quantity_stated,
     references_present,
     exposures_agree,

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.storage.rules.angle_order import angles_in_order
-from beamline.storage.rules.angles import angles_seen
+from beamline.storage.rules.angles import angles_seen, coarse_views
 from beamline.storage.rules.finding import Finding
 from tests.beamline.array_source import ArraySource
 
@@ -39,7 +39,8 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
 
 
 def told(source: ArraySource) -> list[Finding]:
-    return list(angles_seen(source))  # type: ignore[arg-type]
+    seen = coarse_views(source)  # type: ignore[arg-type]
+    return [] if seen is None else list(angles_seen(seen))
 
 
 def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float64]:
@@ -94,7 +95,8 @@ def test_a_round_sample_shows_no_angle() -> None:
 
 
 def ordered(source: ArraySource) -> list[Finding]:
-    return list(angles_in_order(source))  # type: ignore[arg-type]
+    seen = coarse_views(source)  # type: ignore[arg-type]
+    return [] if seen is None else list(angles_in_order(seen))
 
 
 ROD: Balls = [(11, 4, 6, 0.05)]  # off the axis: directions that mirror each other look alike
