@@ -2,6 +2,7 @@
 
 import math
 import re
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -292,20 +293,20 @@ def test_a_slow_disk_pauses_views_but_no_darks(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("block", [State.FLATS, State.ACQUIRING])
 def test_a_loss_of_beam_read_after_the_last_frame_of_a_block_is_mended(tmp_path: Path, block: State) -> None:
     """The reading after the last view (or flat) is without beam, the next one with: what came since is taken again."""
-    instrument, lost = FakeInstrument(), [False]
+    instrument, lost = FakeInstrument(), threading.Event()
 
     class Beam:
         name = "beam monitor"
 
         def reading(self) -> BeamReading:
             time.sleep(0.01)
-            value = 0.0 if lost[0] else 100.0
-            lost[0] = False
+            value = 0.0 if lost.is_set() else 100.0
+            lost.clear()
             return BeamReading(value, "mA", instrument.clock.now())
 
         def close(self) -> None: ...
 
-    instrument.at = {4 if block is State.FLATS else 16: lambda: lost.__setitem__(0, True)}
+    instrument.at = {4 if block is State.FLATS else 16: lost.set}
     devices = replace(instrument.connected(), beam_monitor=Beam())
     instrument.connected = lambda: devices  # type: ignore[method-assign]
     beam = (
