@@ -2,7 +2,7 @@
 
 import sys
 
-from beamline.core.own_packages import package_problem
+from beamline.core.installed import package_problem
 
 if _problem := package_problem(__path__[0].removesuffix("beamline").rstrip("/\\")):
     # A command says it in one line, without a traceback.
@@ -11,7 +11,7 @@ if _problem := package_problem(__path__[0].removesuffix("beamline").rstrip("/\\"
 
 def __getattr__(name: str) -> str:
     if name == "__version__":
-        from beamline.core.shipped import version
+        from beamline.core.installed import version
 
         return version()
     raise AttributeError(f"module 'beamline' has no attribute {name!r}")

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from recon.features.neural.methods import IntraTomo as IntraTomo
     from recon.features.neural.methods import SaxNerf as SaxNerf
     from recon.features.published.r2_published import R2Published as R2Published
-    from recon.features.rings.rings import WithoutRings, remove_rings
+    from recon.features.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts, Emission, weighted_lines
@@ -122,7 +122,7 @@ _LAZY = {
     "find_axis": "recon.prep.align",
     **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",
-    **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings.rings"),
+    **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings"),
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.features.joint.learnt_motion",
     **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.features.joint.series"),

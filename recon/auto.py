@@ -202,10 +202,6 @@ def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F
     return unseen_residuals(model, views, rays, projector.resolution)
 
 
-def _candidates() -> tuple[Method, ...]:
-    return Fbp(), FistaTv(), PnpDct(), R2()
-
-
 @dataclass(frozen=True, eq=False)
 class Auto:
     """Tries methods on a part of the scan, and reconstructs the volume with the one that predicts held-out views best.
@@ -225,7 +221,7 @@ class Auto:
         device=True, budget=True, needs_matter=True, halo=max(R2.traits.halo, FistaTv.traits.halo)
     )
 
-    candidates: tuple[Method, ...] = field(default_factory=_candidates)
+    candidates: tuple[Method, ...] = field(default_factory=lambda: (Fbp(), FistaTv(), PnpDct(), R2()))
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -241,8 +237,8 @@ class Auto:
         decide = control.decide or Decisions(problem.seed)
         at, because, tried = decide("method", lambda: self.choose(problem, control, decide))
         chosen = self.candidates[at]
-        if tried and isinstance(chosen, ChoosingMethod):  # with its rivals
-            chosen = chosen.as_candidate()
+        if tried:  # with its rivals
+            chosen = _candidate(chosen)
         device = problem.device if chosen.traits.device else "cpu"
         result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": because}
@@ -288,9 +284,7 @@ class Auto:
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         """Work of the single trial that compares all candidates, or of a trial of each."""
-        methods = [
-            method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
-        ]
+        methods = [_candidate(method) for method in self.candidates]
         costed = [method for method in methods if isinstance(method, CostedMethod)]
         part = trial_part(geometry, grid, ROWS)
         if part is None:

@@ -22,7 +22,7 @@ REGISTRY: dict[str, MethodEntry] = {
     "os-sirt-tv": MethodEntry(
         "recon.voxels.methods", "OsSirtTv", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
     ),
-    "pnp-dct": MethodEntry("recon.voxels.methods", "PnpDct", lengths=Lengths("iterations", (35,), (35, 15, 70))),
+    "pnp-dct": MethodEntry("recon.voxels.methods", "PnpDct", lengths=Lengths("iterations", (25,), (25, 15, 50))),
     **in_folders("recon.features", "METHODS"),
 }
 

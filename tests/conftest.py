@@ -21,8 +21,8 @@ from recon.compiled import ROOT  # before numba: it says what processor numba co
 # isort: split
 import numba
 
+from recon.compiled import LEVELS, level_for, processor_flags
 from recon.compiled.archive import ARCHIVE, PYTHONS, fresh_members, read_sources
-from recon.compiled.level import LEVELS, level_for, processor_flags
 from tests.features import folders, table
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
@@ -66,7 +66,7 @@ _FEATURES = {folder for feature in table() for folder in folders(feature)}
 
 @cache
 def _is_of_a_feature(path: Path) -> bool:
-    return not _FEATURES.isdisjoint(path.parents)
+    return not _FEATURES.isdisjoint((path, *path.parents))
 
 
 # Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of

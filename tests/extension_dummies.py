@@ -65,7 +65,7 @@ from beamline.features.trials.command import tradeoff
 from beamline.reconstruct.option_rules import RULES, takers
 from beamline.reconstruct.outcome import label_of
 from beamline.features.trials.figures import pareto_plot
-from beamline.features.trials.plans import plan
+from beamline.features.trials.tradeoff import plan
 from recon import methods
 
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))

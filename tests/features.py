@@ -1,4 +1,4 @@
-"""The features of `[tool.splatline.features]`: their folders, and how many statements the core and each feature have.
+"""The features of `[tool.splatline.features]`: where they are, and how many statements the core and each of them have.
 
 python -m tests.features [ROOT]
 """
@@ -15,7 +15,7 @@ PACKAGES = ("beamline", "recon", "drivers", "simulators")
 
 @cache
 def table(root: Path = ROOT) -> dict[str, list[str]]:
-    """Folders of each feature, and its tests' folders, which mirror them."""
+    """Folders and modules of each feature, which its tests mirror."""
     features: dict[str, list[str]] = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
         "splatline"
     ]["features"]
@@ -23,9 +23,10 @@ def table(root: Path = ROOT) -> dict[str, list[str]]:
 
 
 def folders(feature: str, root: Path = ROOT) -> list[Path]:
-    """Of a feature, with those of its tests, as far as they exist."""
+    """Of a feature, its modules, and those of its tests, as far as they exist."""
     own = [root / folder for folder in table(root)[feature]]
-    return [path for each in own for path in (each, root / "tests" / each.relative_to(root)) if path.is_dir()]
+    tests = [root / "tests" / each.relative_to(root).with_suffix("") for each in own]
+    return [path for each in (*own, *tests) for path in (each, each.with_name(f"test_{each.name}.py")) if path.exists()]
 
 
 def statements(path: Path) -> int:
@@ -38,7 +39,7 @@ def counted(root: Path = ROOT) -> dict[str, int]:
     counts = {"core": 0, **dict.fromkeys(table(root), 0)}
     for package in PACKAGES:
         for path in (root / package).rglob("*.py"):
-            counts[next((owners[p] for p in path.parents if p in owners), "core")] += statements(path)
+            counts[next((owners[p] for p in (path, *path.parents) if p in owners), "core")] += statements(path)
     return counts
 
 

@@ -20,7 +20,7 @@ from beamline.core.events import Event, VolumeDone
 from beamline.core.files import SCAN, parts_of
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
-from beamline.energies.scans import EnergyScans, read_spectra
+from beamline.energies import EnergyScans, read_spectra
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
@@ -28,9 +28,9 @@ from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file
+from beamline.scan.control import State
 from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
-from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file
 from beamline.storage.parts import JOINED
 from beamline.storage.readers.base import ScanSource

@@ -26,7 +26,7 @@ from beamline.core.errors import (
     leave_traceback,
     user_message,
 )
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.text import printable, size
 from recon.base.registry import did_you_mean
 

@@ -23,8 +23,8 @@ from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
 from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
+from beamline.core.installed import version
 from beamline.core.process import EndsWithParent
-from beamline.core.shipped import version
 from beamline.core.sinks import fan_out, sentence, while_it_works
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import printable
@@ -258,8 +258,8 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
+    from beamline.core.durations import MachineSpeed
     from beamline.core.machine import busy
-    from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:

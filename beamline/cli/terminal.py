@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TextIO
 
@@ -19,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from beamline.cli.options import json_events
+from beamline.core.durations import seconds_left
 from beamline.core.events import (
     Counted,
     Done,
@@ -34,7 +34,6 @@ from beamline.core.events import (
     TrialReached,
     VolumeDone,
 )
-from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess
 from beamline.core.sinks import Warnings, sentence
 from beamline.core.stop import terminated_like_interrupted
@@ -56,12 +55,6 @@ _COUNTED = {
     **dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames")),
     "archive": ("written and compared", "MB"),
 }  # stage: the name of its bar and what it counts; other stages are named after what they count
-
-
-@cache
-def _counted_by_features() -> dict[str, str]:
-    """What a stage of a feature counts: COUNTED of its folder; trials where it says nothing."""
-    return in_folders("beamline.features", "COUNTED")
 
 
 class Terminal:
@@ -127,7 +120,7 @@ class Terminal:
             case PhaseReached():
                 self._show_phase(event)
             case TrialReached(stage, n, of):
-                what = _counted_by_features().get(stage, "trials")
+                what = in_folders("beamline.features", "COUNTED").get(stage, "trials")
                 self._show(what, n, of, trials(event, what))
             case KernelsCompiled(_, n, seconds):
                 self._show("kernels", n, 0, f"{n} compiled in {seconds:.0f} s; once on a machine, 1 to 2 minutes")
@@ -302,8 +295,7 @@ def results(record: ReconRecord) -> str:
     columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
     if record.compared is not None:
         columns[BASELINE] = {**record.compared}
-    lines.append("")
-    lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
+    lines += ["", f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())

@@ -23,13 +23,12 @@ from beamline.config.beam import (
     StageOutputShutter,
 )
 from beamline.config.section import Section, declared, read_from, section_of
-from beamline.config.stages import StageConfig
+from beamline.config.stages import STAGES, StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.cameras import CAMERAS
 from drivers.orca_quest import DcamOptions
-from drivers.stages.registry import STAGES
 from recon.base.registry import in_folders
 
 Roi = Annotated[

@@ -29,8 +29,8 @@ from beamline.config.rehearsal import rehearsal
 from beamline.config.tree import Tree, declared_at, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
-from beamline.core.shipped import config_folder as config_folder
-from beamline.core.shipped import version
+from beamline.core.installed import config_folder as config_folder
+from beamline.core.installed import version
 from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource

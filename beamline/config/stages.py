@@ -1,5 +1,9 @@
 """Configuration of the rotation stage: one section per kind, with the keys that its settings declare; and settings that
-a program changed in a controller, kept on disk until it has restored them."""
+a program changed in a controller, kept on disk until it has restored them.
+
+Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
+folder says.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import json
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 from zlib import crc32
@@ -19,9 +24,20 @@ from beamline.core.files import write_whole
 from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
-from drivers.stages.registry import STAGES
-from drivers.stages.settings import StageSettings
+from drivers.stages.settings import StageDriver, StageSettings, with_keys
 from drivers.stages.shared import RestoresSettings
+from recon.base.registry import Registry, in_folders
+
+STAGES: Registry[StageDriver] = Registry(
+    "stage",
+    {
+        kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name)
+        for kind, name in in_folders("drivers.stages", "DRIVERS").items()
+    },
+    with_keys,
+)
+"""Kind, as a configuration names it -> the driver."""
+
 
 _IDENTITY = ("model", "serial", "device", "axis", "channel")
 

@@ -14,13 +14,14 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.core.errors import ConfigError
-from beamline.core.files import YAML_FAULTS
 from recon.base.registry import did_you_mean
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
 _MOST_VALUES, _MOST_DIGITS = 100_000, 1000
 _NOTHING = ("", "null", "~")
+YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
+"""Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 
 
 @dataclass(frozen=True)

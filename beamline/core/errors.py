@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.text import size
 from drivers.base.errors import DeviceError
 

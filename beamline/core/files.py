@@ -67,10 +67,6 @@ def _numbered(run: Path) -> dict[int, Path]:
 
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems and file systems without this call
-
-
-YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
-"""Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
 STEP_BY_STEP = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")  # not on Windows
 _JUNCTION = 0xA0000003  # st_reparse_tag of a mount point of Windows

@@ -144,12 +144,6 @@ class ChildProcess:
         self.let_go()
         return ending
 
-    def tell(self, line: str) -> None:
-        """Write a line to the stdin of a process with a tether. Raises OSError if it has ended."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(line + "\n")
-        self._process.stdin.flush()
-
     def beat(self) -> None:
         """Write a byte to the stdin of a tethered process, as a sign of life."""
         assert self._process.stdin is not None
@@ -199,6 +193,34 @@ class ChildProcess:
                 self._silent_since = time.monotonic()
                 self._on_line(line)
         self._on_end()
+
+
+def run_to_end(
+    command: Sequence[str],
+    log: Path,
+    on_line: Callable[[str], None],
+    seconds: float = math.inf,
+    silence: float = math.inf,
+) -> tuple[ProcessEnd, int | None, str]:
+    """Run a command with the same imports; an exception kills it.
+
+    Args:
+        log: file for its stderr.
+        on_line: receives each line of its stdout.
+        seconds, silence: real s in all, and without a line, after which it is killed.
+
+    Returns:
+        Why it ended, its exit code, and the last line of its stderr.
+
+    Raises:
+        OSError: the log cannot be written, or the command cannot be started.
+    """
+    with (
+        log.open("w", encoding="utf-8") as stderr,
+        ChildProcess(command, stderr, on_line, with_our_path(), tether=True) as process,
+    ):
+        ending = process.wait(seconds=seconds, silence=silence)
+    return ending, process.code, last_line(log)
 
 
 def at_end_of(pipe: int, act: Callable[[], object]) -> None:
@@ -256,9 +278,9 @@ def with_our_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
-def last_line(log: Path, start: int = 0) -> str:
-    """The last line that a process wrote to a file, from byte `start` on; "" without one."""
-    lines = log.read_bytes()[start:].decode("utf-8", errors="replace").strip().splitlines()
+def last_line(log: Path) -> str:
+    """The last line that a process wrote to a file; "" without one."""
+    lines = log.read_bytes().decode("utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else ""
 
 

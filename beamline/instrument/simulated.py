@@ -26,7 +26,7 @@ from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
-from beamline.simulate.labels import volumes_beside
+from beamline.simulate import volumes_beside
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
@@ -35,7 +35,7 @@ from recon.base.registry import in_folders
 from recon.base.volume import Grid, Volume
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VIRTUAL_START, ScaledClock, VirtualClock
-from simulators.devices.shutter import (
+from simulators.devices.in_beam import (
     SimulatedMonochromator,
     SimulatedSampleMover,
     SimulatedShutter,
@@ -46,8 +46,7 @@ from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.scene import Scene, load_scene
 from simulators.wires.registry import WIRES
-from simulators.wires.serial_url import register
-from simulators.wires.wire import Controller
+from simulators.wires.wire import Controller, register
 
 IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
 

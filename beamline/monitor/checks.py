@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from importlib import import_module
+from operator import attrgetter
 
 from beamline.monitor.check import Check, Flag, Level
 from recon.base.registry import Registry, in_folders
@@ -31,10 +32,6 @@ REGISTRY = {  # class of a check: its module in this folder
     "FieldOfViewCheck": "field",
     "OppositeCheck": "opposite",
 }
-
-
-def _bit(check: Check) -> int:
-    return check.bit
 
 
 def _distinct(*checks: Check) -> tuple[Check, ...]:
@@ -64,7 +61,9 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
 
 _MODULES = {name: f"beamline.monitor.{module}" for name, module in REGISTRY.items()}
 _CLASSES = {**_MODULES, **in_folders("beamline.monitor", "CHECKS")}
-_OURS = _distinct(*sorted((getattr(import_module(module), name)() for name, module in _CLASSES.items()), key=_bit))
+_OURS = _distinct(
+    *sorted((getattr(import_module(module), name)() for name, module in _CLASSES.items()), key=attrgetter("bit"))
+)
 BY_NAME = _all(_OURS)
 CHECKS: tuple[Check, ...] = tuple(BY_NAME.values())
 """All checks with their default limits, in the order of their bits, in which they look at a frame."""

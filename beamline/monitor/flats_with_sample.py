@@ -32,6 +32,7 @@ EMPTY, SHALLOW = 8, 10.0  # views at least, and percent of them that may be take
 OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further below
 
 Places = NDArray[np.float32]
+Depth = NDArray[np.float64] | None  # Of `depth_over_air`
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class OddFrame:
     sentence: str
 
 
-def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
+def flats_like_views(
+    flats: Sequence[Group], darks: Sequence[Group], views: Group, depth: Depth
+) -> ReferenceFault | None:
     """The fault that all flats show the sample: they look like one view, and other views are brighter.
 
     In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
@@ -66,7 +69,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     level = np.median(through[nearest])
     brighter = float(np.median([np.percentile(each, WORST) - level for each in through]))
     darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
-    if (depth := _depth_over_air(flats, darks, views)) is not None:
+    if depth is not None:
         brighter = min(brighter, -float(np.median(np.percentile(depth, 100 - WORST, axis=(1, 2)))))
     else:  # the sample fills the field: less the drift, half of its places are brighter than the others
         brighter = min(brighter, float(np.median(np.percentile(stated, WORST, axis=1))))
@@ -81,14 +84,13 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, sentence)
 
 
-def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
+def mass_missing(depth: Depth) -> ReferenceFault | None:
     """The fault that flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
     as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
     differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
     """
-    depth = _depth_over_air(flats, darks, views)
     if depth is None:
         return None
     mean = depth.mean(axis=0)
@@ -116,9 +118,8 @@ def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
     return ReferenceFault(FaultKind.SAMPLE_IN, seen, LIGHTER * least, sentence)
 
 
-def nothing_seen(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
+def nothing_seen(depth: Depth) -> float | None:
     """Line integral below which views differ from flats and from one another only by noise; None if they differ."""
-    depth = _depth_over_air(flats, darks, views)
     if depth is None:
         return None
     mean = depth.mean(axis=0)
@@ -127,7 +128,7 @@ def nothing_seen(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
     return max(shows) if all(most < limit for most, limit in zip(shows, limits, strict=True)) else None
 
 
-def _depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> NDArray[np.float64] | None:
+def depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> Depth:
     """Line integrals [view, row, col] of places, less the straight line between the edges of each row.
 
     Only views that have air there; None where they, places or flats are too few.

@@ -18,8 +18,8 @@ from beamline.core.events import event_in
 from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched
+from beamline.scan.control import State
 from beamline.scan.runs import DIED, newest
-from beamline.scan.states import State
 from beamline.storage.hdf5 import NotReadyError
 
 Event = Mapping[str, Any]

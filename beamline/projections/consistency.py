@@ -17,7 +17,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, unbinned
 from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation

@@ -10,8 +10,8 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.phases import Phases
 from beamline.core.plausible import RANGES, doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis

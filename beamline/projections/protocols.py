@@ -1,6 +1,6 @@
-"""What a step can do: a filter of each view, a search for where the sample was, a change of the rays, or of all views.
+"""What a step can do: a filter of each view, a search for where the sample was, or a change of all views.
 
-A plug-in meets one of `ViewStep`, `PlaceStep`, `RayStep` and `ScanStep`. The module of a step is imported for every
+A plug-in meets one of `ViewStep`, `PlaceStep` and `ScanStep`. The module of a step is imported for every
 help text: what reads files or needs numba, torch or scipy is imported where it is called.
 """
 
@@ -152,18 +152,6 @@ class JumpStep(Protocol):
     @property
     def corrects_jumps(self) -> bool:
         """It corrects views for them, in a finished scan."""
-
-
-@runtime_checkable
-class RayStep(PrepStep, Protocol):
-    """A step that says what the rays of each view saw beside their angle."""
-
-    def rays(self, source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, StepDone]:
-        """The geometry of these views with it, and what was done.
-
-        Raises:
-            ConfigError: the step does not fit the scan.
-        """
 
 
 class GeometryLearnt(Protocol):

@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.protocols import GeometryStep, PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
+from beamline.projections.protocols import GeometryStep, PlaceStep, PrepStep, ScanStep, ViewStep
 from beamline.projections.step import StepDone, key_of, options_of
 from recon.base.registry import Registry, in_folders
 
@@ -38,10 +38,8 @@ def registered() -> tuple[type[PrepStep], ...]:
 
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
         names_of_options = {option.name for option in options_of(step).values()}
-        if step.name != name or not isinstance(step(), ViewStep | PlaceStep | RayStep | ScanStep):
-            raise ValueError(
-                f"{step.__name__} is no ViewStep, PlaceStep, RayStep or ScanStep of the entry point's name"
-            )
+        if step.name != name or not isinstance(step(), ViewStep | PlaceStep | ScanStep):
+            raise ValueError(f"{step.__name__} is no ViewStep, PlaceStep or ScanStep of the entry point's name")
         if names_of_options & taken or not by_name.keys() >= set(step.follows):
             raise ValueError(
                 f"it has an option of another step ({names_of_options & taken}), or follows none of {sorted(by_name)}"

@@ -8,20 +8,20 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.phases import Phases
 from beamline.core.sinks import Note, Warn
 from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.protocols import GeometryLearnt, PlaceStep, RayStep, ViewMotion
+from beamline.projections.corrections.width import Width
+from beamline.projections.protocols import GeometryLearnt, PlaceStep, ViewMotion
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules import angle_order
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding, angle_order
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
@@ -49,20 +49,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     geometry = geometry_of(source, selection, axis_col, source.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
-    return with_rays(source, selection, geometry)[0]
-
-
-def with_rays(source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, dict[str, StepDone]]:
-    """The geometry of views after every `RayStep`, and what these steps did, by name.
-
-    Raises:
-        ConfigError: a step does not fit the scan.
-    """
-    done = dict[str, StepDone]()
-    for step in in_order(selection):
-        if isinstance(step, RayStep):
-            geometry, done[step.name] = step.rays(source, selection, geometry)
-    return geometry, done
+    return selection.step(Width).rays(source, selection, geometry)[0]
 
 
 @dataclass(eq=False)
@@ -72,7 +59,7 @@ class ViewGeometry:
     Attributes:
         stated_axis: the column of the rotation axis before calibration.
         moved: where the sample was in the views, by the name of the step that found it.
-        rays: what the steps on rays did, by name.
+        width: what was done about the width of rays.
         learnt: what was learnt of the geometry, by the name of the step.
     """
 
@@ -80,7 +67,7 @@ class ViewGeometry:
     selection: Selection
     stated_axis: float
     moved: dict[str, ViewMotion] = field(default_factory=dict)
-    rays: dict[str, StepDone] = field(default_factory=dict)
+    width: StepDone = field(default_factory=StepDone)
     learnt: dict[str, GeometryLearnt] = field(default_factory=dict)
 
     @property
@@ -92,7 +79,7 @@ class ViewGeometry:
     def done(self) -> dict[str, StepDone]:
         """What the steps did, by their names."""
         calibrated = {name: learnt.done for name, learnt in self.learnt.items()}
-        return {**{name: motion.done for name, motion in self.moved.items()}, **self.rays, **calibrated}
+        return {**{name: motion.done for name, motion in self.moved.items()}, Width.name: self.width, **calibrated}
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
         """Let each step find the sample position; returns the `usable` views that remain usable."""
@@ -117,7 +104,7 @@ class ViewGeometry:
         geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
-        geometry, self.rays = with_rays(self.source, part, geometry)
+        geometry, self.width = part.step(Width).rays(self.source, part, geometry)
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beamline.core.machine_speed import MachineSpeed
+from beamline.core.durations import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import binned, run_on

@@ -16,10 +16,10 @@ from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
-from beamline.projections.views import with_rays
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
@@ -101,10 +101,10 @@ class FollowedViews:
         """The geometry of one view at 0 rad, with the axis in this column of the full detector."""
         return geometry_of(self.source, self.selection, axis_col, np.zeros(1))
 
-    def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, dict[str, StepDone]]:
-        """The geometry of views with the stage's motion during exposures, and what its steps did, by name."""
+    def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
+        """The geometry of views with the width of their rays, and what was done about that."""
         geometry = geometry_of(self.source, self.selection, axis_col, self.source.angles[view_ids])
-        return with_rays(self.source, self.selection, geometry)
+        return self.selection.step(Width).rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """[view] radians for the fit: mid-exposure, middle row. The fit ignores motion."""

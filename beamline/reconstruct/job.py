@@ -10,10 +10,9 @@ from typing import Any
 from numpy.typing import NDArray
 
 import recon
+from beamline.core.durations import Phases, seconds_left
 from beamline.core.errors import DataError
 from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
-from beamline.core.machine_speed import seconds_left
-from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections

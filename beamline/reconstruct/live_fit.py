@@ -22,6 +22,7 @@ from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
 from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.width import Width
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
@@ -355,11 +356,11 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        geometry, seen = self.views.geometry(axis_col, projections.view_ids)
+        geometry, width = self.views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
         compare_with_flats(self.source, selection, projections, self._warn, refused=False)
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
-        done = {**self._correction.done, **seen}
+        done = {**self._correction.done, Width.name: width}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved

@@ -13,9 +13,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import REPORT, refuse_existing
-from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.prepared import PreparedProjections

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.phases import Phases
+from beamline.core.durations import Phases
 from beamline.core.text import count, spans
 from beamline.projections.flagged_frames import reasons, reference_images, returned_views, worst_frames
 from beamline.projections.prepared import PreparedProjections

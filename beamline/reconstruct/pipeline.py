@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 
+from beamline.core.durations import Phases
 from beamline.core.errors import DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
-from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count

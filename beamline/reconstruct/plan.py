@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered
 from beamline.core.machine import Need
-from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens

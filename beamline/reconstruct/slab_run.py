@@ -15,7 +15,7 @@ import numpy as np
 
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.files import remove
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other

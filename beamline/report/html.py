@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from beamline.core.errors import DataError
 from beamline.core.files import write_whole
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.report.metrics import METRICS, formatted
 
 FactTable = Mapping[str, str]  # Values for people, by name; a table of two columns on the page

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 
-_COLUMNS = 4
+COLUMNS = 4
 
 
 class SliceSheet:
@@ -59,15 +59,15 @@ class SliceSheet:
         """These slices, four beside one another, in the grey window of the first."""
         low, high = matter_window(self._shown[labels[0]])
         rows, cols = self._shown[labels[0]].shape
-        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
+        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // COLUMNS)
         # One image: a panel for each slice takes ten times as long to draw.
-        sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
+        sheet = np.full((down * (rows + head), COLUMNS * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
         figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         for i, label in enumerate(labels):
-            top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
+            top, left = i // COLUMNS * (rows + head), i % COLUMNS * (cols + gap)
             sheet[top + head : top + head + rows, left : left + cols] = self._shown[label]
             axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
         axes.text(0.02 * cols, head + 0.95 * rows, f"x → {self._down} ↓", fontsize=6, color="tab:orange")
@@ -75,7 +75,6 @@ class SliceSheet:
         return png(figure)
 
 
-COLUMNS = 4
 _COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
 
 

@@ -13,10 +13,10 @@ from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Wa
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block, return_triggers
+from beamline.scan.control import State
 from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
 from beamline.scan.ledger import LedgerError
 from beamline.scan.references import REFERENCES
-from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError

@@ -1,8 +1,9 @@
-"""Control: verbs to a running scan from another terminal.
+"""Control: states of a scan in their allowed order, and verbs to a running one from another terminal.
 
-A verb is an empty file of that name in the folder `control` of the run, which only its owner can write to. The scan
-removes the file and obeys. This works on every system and file system, without an open port or a parser. Owners and
-modes, if the system has them, are checked at every use, and a replaced folder is ignored.
+docs/states.md draws the states and explains the verbs in each. A verb is an empty file of that name in the folder
+`control` of the run, which only its owner can write to. The scan removes the file and obeys. This works on every system
+and file system, without an open port or a parser. Owners and modes, if the system has them, are checked at every use,
+and a replaced folder is ignored.
 """
 
 from __future__ import annotations
@@ -19,11 +20,66 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Sink, Warned, event_in, whole_lines
+from beamline.core.events import Sink, StateEntered, Warned, event_in, whole_lines
 from beamline.core.files import CONTROL, EVENTS, SCAN, open_below, parts_of, same_file
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.scan.states import State
 from beamline.storage.writer_lock import held
+
+
+class State(StrEnum):
+    """The activity of a scan."""
+
+    IDLE = "idle"
+    PREPARING = "preparing"
+    DARKS = "darks"
+    FLATS = "flats"
+    TAXI = "taxi"
+    ACQUIRING = "acquiring"
+    PAUSED = "paused"
+    FINISHING = "finishing"
+    DONE = "done"
+    STOPPED = "stopped"
+    ABORTED = "aborted"
+    FAILED = "failed"
+
+    @property
+    def ended(self) -> bool:
+        """Whether this state is final."""
+        return not NEXT[self]
+
+
+_TAKING = frozenset({State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING})
+
+NEXT: Mapping[State, frozenset[State]] = {
+    State.IDLE: frozenset({State.PREPARING}),
+    State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
+    **{state: (_TAKING - {state}) | {State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
+    State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
+    State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
+    **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
+}
+"""The states that may follow each one."""
+
+
+class StateMachine:
+    """The state machine of one scan; `state` is the current state. Changes are sent to the sink as the event
+    `state`."""
+
+    def __init__(self, sink: Sink = lambda event: None, state: State = State.IDLE) -> None:
+        self._sink, self.state = sink, state
+
+    def enter(self, state: State, message: str = "") -> None:
+        """Change to a state, with a message; staying in a state without a message emits nothing.
+
+        Raises:
+            ValueError: the state must not follow the present one; nothing has changed.
+        """
+        if state is not self.state and state not in NEXT[self.state]:
+            raise ValueError(f"a scan cannot go from {self.state} to {state}")
+        if state is not self.state or message:
+            self.state = state
+            self._sink(StateEntered(state, message))
+
 
 POLL = 0.1  # real s between checks
 ANSWER_WITHIN = 5.0  # real s within which a scan accepts a verb

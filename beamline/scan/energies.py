@@ -18,6 +18,7 @@ from beamline.core.run_result import RunResult
 from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
+from beamline.scan.control import State
 from beamline.scan.live_process import Commands
 from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.resume import (
@@ -30,7 +31,6 @@ from beamline.scan.resume import (
 )
 from beamline.scan.run import run_scan
 from beamline.scan.runs import describe
-from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file
 from drivers.base.clock import SystemClock
 from drivers.in_beam import Ask

@@ -16,8 +16,8 @@ from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, assigned, placing, unassigned
+from beamline.scan.control import State
 from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, enter, settle
-from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout

@@ -13,12 +13,10 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from queue import Empty, Full, Queue
-from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +31,7 @@ from beamline.monitor.watch import Monitor, look_past_failures, rehearse
 from beamline.plan.plan import Retake, Timeline
 from beamline.scan.references import ReferenceLog
 from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
+from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
@@ -48,17 +47,6 @@ REHEARSED = 10.0  # real s of it, after which the scan says what it waits for
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
-
-
-class Writer(Protocol):
-    """Writes rows to a file: NXtomoWriter."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def safe(self) -> int: ...
-    def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None: ...
-    def flush(self) -> None: ...
 
 
 def room(timeline: Timeline) -> int:
@@ -116,7 +104,7 @@ class Recorder:
 
     def __init__(
         self,
-        writer: Writer,
+        writer: NXtomoWriter,
         monitor: Monitor,
         timeline: Timeline,
         *,

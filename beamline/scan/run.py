@@ -33,17 +33,16 @@ from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
 from beamline.plan.plan import Retake, spread_retakes
 from beamline.projections.flagged_frames import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
-from beamline.scan.control import verbs_taken
+from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
 from beamline.scan.resume import ResumableRun, other_devices
-from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
-from beamline.simulate.labels import LabelLog, labels_path, write_labels
+from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock

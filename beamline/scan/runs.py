@@ -16,8 +16,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import event_in, whole_lines
 from beamline.core.files import CONFIG, CONTROL, EVENTS, SCAN, STAMP, is_below, open_below, parts_of
 from beamline.core.text import one_line, size
-from beamline.scan.control import running, state_of
-from beamline.scan.states import State
+from beamline.scan.control import State, running, state_of
 from beamline.storage.interrupted import next_step
 
 DIED = "died"  # State of a run whose process has ended without a final event

@@ -17,7 +17,7 @@ from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import count, size
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.plan import Retake
-from beamline.scan.states import State, StateMachine
+from beamline.scan.control import State, StateMachine
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading
 

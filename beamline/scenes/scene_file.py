@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in, whole_file
-from beamline.core.shipped import shipped_scenes
+from beamline.core.installed import shipped_scenes
 from beamline.core.voxel_kind import VoxelKind
-from beamline.simulate.labels import volumes_beside
+from beamline.simulate import volumes_beside
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry
 from recon.base.registry import in_folders, unknown

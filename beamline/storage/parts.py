@@ -27,8 +27,14 @@ from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import add_exchange_view, ending_in, state_ending
-from beamline.storage.writers.rows import altered_rows, record_checksums, require_earlier
+from beamline.storage.writers.rows import (
+    add_exchange_view,
+    altered_rows,
+    ending_in,
+    record_checksums,
+    require_earlier,
+    state_ending,
+)
 from drivers.base.frame import FrameKind
 
 JOINED = "joined.h5"  # The file of all parts, in the folder of the run, where its first part is

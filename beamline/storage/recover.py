@@ -29,17 +29,17 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import (
+from beamline.storage.writers.rows import (
     DIED,
     RUNNING,
     ScanEnding,
+    altered_rows,
     ending_in,
     has_exchange_view,
     state_ending,
     state_words,
     with_exchange_view,
 )
-from beamline.storage.writers.rows import altered_rows
 
 COMPARED = 2**31  # bytes of the last frames: more than a machine that loses power has not brought to the disk yet
 

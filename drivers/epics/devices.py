@@ -279,7 +279,7 @@ def _valid(channel: ProcessVariable, device: str) -> PvValue:
 
 
 class PvSource:
-    """Implements `drivers.beam_monitors.reading.TextSource`: the number of a process variable as text.
+    """Implements `drivers.beam_monitors.TextSource`: the number of a process variable as text.
 
     Raises:
         DeviceRefused: an address of another kind.

@@ -127,7 +127,7 @@ class StageSettings(Protocol):
 
 
 class StageDriver(Protocol):
-    """A driver's class; each stage's folder has one, and `drivers.stages.registry` lists them.
+    """A driver's class; each stage's folder has one, and `beamline.config.stages` lists them.
 
     Attributes:
         Settings: the class of its settings.

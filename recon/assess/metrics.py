@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -263,21 +263,28 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
-    dense, empty = _Moments(), _Moments()
-    for image, part in zip(volume, mask, strict=True):
-        dense, empty = dense.joined(image[part == 1]), empty.joined(image[part == 0])
-    if not dense.n or not empty.n:
-        raise ValueError(f"the mask marks {dense.n} dense and {empty.n} empty voxels; both are needed")
-    if not (np.isfinite(dense.mean) and np.isfinite(empty.squares)):
+    dense, empty = (int(np.count_nonzero(mask == kind)) for kind in (1, 0))
+    if not dense or not empty:
+        raise ValueError(f"the mask marks {dense} dense and {empty} empty voxels; both are needed")
+
+    def mean_of(kind: int, off: float = 0.0, power: int = 1) -> float:
+        """Mean of a power of the values of a region, less `off`; slice by slice, in float64."""
+        images = zip(volume, mask, strict=True)
+        total = sum(float(((image[part == kind].astype(np.float64) - off) ** power).sum()) for image, part in images)
+        return total / (dense if kind else empty)
+
+    with np.errstate(invalid="ignore"):
+        mean, base = mean_of(1), mean_of(0)
+        spread = math.sqrt(mean_of(0, base, 2))
+    if not (math.isfinite(mean) and math.isfinite(spread)):
         raise ValueError("the volume holds NaN or infinite values")
-    spread = float(np.sqrt(empty.squares / empty.n))
 
     def decibel(signal: float) -> float:
         if not signal > 0:
             return float("-inf")
         return float(20 * np.log10(signal / spread)) if spread else float("inf")
 
-    return decibel(dense.mean), decibel(abs(dense.mean - empty.mean))
+    return decibel(mean), decibel(abs(mean - base))
 
 
 def contrast(truth: Array, volume: Array) -> dict[str, float]:
@@ -316,22 +323,3 @@ def contrast(truth: Array, volume: Array) -> dict[str, float]:
     if cold.any():
         figures["spillover"] = float(volume[cold].mean()) / mean
     return figures
-
-
-@dataclass(frozen=True)
-class _Moments:
-    """Number, mean and sum of squared deviations of values, joined slice by slice (Chan, Golub & LeVeque 1979)."""
-
-    n: int = 0
-    mean: float = 0.0
-    squares: float = 0.0
-
-    def joined(self, values: Array) -> _Moments:
-        if not values.size:
-            return self
-        more = np.asarray(values, np.float64)
-        n, mean = self.n + more.size, float(more.mean())
-        with np.errstate(invalid="ignore"):
-            away, own = mean - self.mean, float(np.sum((more - mean) ** 2))
-        squares = self.squares + own + away**2 * self.n * more.size / n
-        return _Moments(n, self.mean + away * more.size / n, squares)

@@ -23,11 +23,6 @@ SHARPENED = 0.75
 """Of what voxels are blurrier than views, that the model makes up for. Without: -0.5, -0.9 dB of `pnp-dct` on bone and
 cement, +0.2, -0.3 of FISTA-TV; with all of it -0.2, 0.0 and -0.3, -0.3 (docs/numerics.md)."""
 
-# How short may a trial be?
-
-TRIAL_THRESHOLD = 1.6
-"""Times the threshold of 35 steps, which so few steps prefer. Without: -1.0 dB on fibres with texture."""
-
 # How do patches work?
 
 FIRST_THRESHOLD = 8.0

@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from recon.compiled import ROOT
+from recon.compiled import LEVELS, ROOT
 from recon.compiled.archive import (
     ARCHIVE,
     PYTHONS,
@@ -32,7 +32,6 @@ from recon.compiled.archive import (
     unsealed,
     write_archive,
 )
-from recon.compiled.level import LEVELS
 
 PACKAGES = ("beamline", "recon", "simulators")
 Index = dict[Any, str]

@@ -17,7 +17,7 @@ import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
-from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
+from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
@@ -29,7 +29,7 @@ from recon.splatting.splat import project, voxel_means
 from recon.voxels.held_out import MOST_TRIALS, HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods import PnpDct, choose_patches, residuals_of_patches
-from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, ordered_fista, pnp_dct
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -56,7 +56,7 @@ class _Watch:
     """
 
     def __init__(self, control: RunControl, n_views: int, fits: bool = False) -> None:
-        usual, refined = PnpDct().trial_sweeps, FINISH_SWEEPS + TRIAL_STEPS
+        usual, refined = PnpDct().trial_sweeps, FINISH_SWEEPS + PnpDct.iterations
         first, whole = (round(share * DEFAULT_STEPS) + refined if fits else 0 for share in (FIRST_SHARE, 1.0))
         self._planned = usual + first, round(MOST_TRIALS * usual) + first + whole
         self._control, self._n_views = control, n_views
@@ -129,11 +129,11 @@ class _Planning:
         weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
-        patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
+        patches, tried = choose_patches(problem, weight, lambda: judge, PnpDct.iterations), self.tried
         tried.direct = judge.residuals(judge.start) if judge.direct else None
         tried.smooth = judge.of_weight(weight)
         if patches.better:
-            tried.patches = residuals_of_patches(judge, judge.start, patches.strength)
+            tried.patches = residuals_of_patches(judge, judge.start, PnpDct.iterations, patches.strength)
         voxels = tried.by_voxels
         assert voxels is not None
         for share in (FIRST_SHARE, 1.0):
@@ -163,9 +163,7 @@ class _Planning:
             )
         )
         refined = trial.volume_by(
-            lambda some, x: refine(
-                _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
-            ),
+            lambda some, x: refine(_without(some, beyond), x, weight, strength, FINISH_SWEEPS),
             volume_lines(np.maximum(_middle_of(fitted.volume.data, part.projector.grid.shape), 0)),
         )
         residuals = trial.residuals(refined, other)
@@ -204,9 +202,7 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
     return model - Projector(views, grid).forward(np.maximum(inside, 0))
 
 
-def refine(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int, steps: int
-) -> F32:
+def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
     ended = False
 
@@ -220,7 +216,7 @@ def refine(
     if ended or not strength:
         return x
     further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
-    return pnp_dct(further, x, strength, steps=steps)
+    return pnp_dct(further, x, strength, steps=PnpDct.iterations)
 
 
 def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fit: Fit) -> Candidates:
@@ -264,11 +260,10 @@ class _Finish:
         trial = cache(partial(HeldOutTrial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
-            patches = choose_patches(problem, weight, trial)
+            patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0
-        steps = PnpDct().iterations
-        self.planned = self.iterations + (steps if strength else 0)
-        return refine(problem, x, weight, strength, self.iterations, steps)
+        self.planned = self.iterations + (PnpDct.iterations if strength else 0)
+        return refine(problem, x, weight, strength, self.iterations)
 
 
 class Finished(NamedTuple):

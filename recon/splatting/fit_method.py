@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
-from recon.base.method import Method
+from recon.base.method import BoundedMethod, CheckpointedMethod, EarlyStopMethod, SignedMethod
 
 if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
     from recon.base.choices import Start
@@ -16,14 +16,11 @@ if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
 
 
 @runtime_checkable
-class FitMethod(Method, Protocol):
+class FitMethod(BoundedMethod, EarlyStopMethod, SignedMethod, CheckpointedMethod, Protocol):
     """A fit of Gaussians with these settings, see `R2`."""
 
     @property
     def steps(self) -> int | None: ...
-
-    @property
-    def seconds(self) -> float | None: ...
 
     @property
     def gaussians(self) -> int | Gaussians | None: ...
@@ -32,20 +29,10 @@ class FitMethod(Method, Protocol):
     def start(self) -> Start: ...
 
     @property
-    def early_stop(self) -> bool: ...
-
-    @property
     def finish(self) -> int | None: ...
 
     @property
-    def allow_negative(self) -> bool: ...
-
-    @property
     def fit(self) -> FitSettings: ...
-
-    @property
-    def planned_steps(self) -> int | None:
-        """Number of steps of the fit; None if only `seconds` end it."""
 
     @property
     def by_content(self) -> bool:

@@ -33,7 +33,7 @@ from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import direct_work
 from recon.voxels.held_out import CHOICE_SWEEPS, LEAST_VIEWS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import TRIAL_STEPS, subsets_of
+from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
@@ -235,7 +235,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     """The work of `train.run_fit`."""
     if method.planned_steps is None:
         return Costs({method.name: Work.of(CLOCK, method.seconds or 0.0)})
-    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid)
+    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid, PnpDct.iterations)
     fit = _fit(method, geometry, grid, method.planned_steps)
     if not method.by_content or geometry.n_views < LEAST_VIEWS:
         if method.finish_sweeps == 0:
@@ -250,7 +250,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     if (part := trial_part(geometry, grid)) is not None:
         share = part[0].detector_shape[0] / geometry.detector_shape[0]
         own = method.for_trial(share, FIRST_SHARE)
-        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
+        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, PnpDct.iterations)
         trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
     return Costs(volumes, weight + patches + trial)
 
@@ -293,7 +293,7 @@ def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
     refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
     if method.finish is not None:
         return refined
-    return refined + patch_steps(geometry, grid, PnpDct().iterations)
+    return refined + patch_steps(geometry, grid, PnpDct.iterations)
 
 
 def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:

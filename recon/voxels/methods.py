@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Count, Natural, NonNegative
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, TRIAL_THRESHOLD
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
@@ -25,7 +25,7 @@ from recon.voxels.held_out import (
     preferred_strength,
 )
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
-from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
 from recon.voxels.voxel_problem import (
     Momentum,
     TotalVariationProx,
@@ -195,7 +195,7 @@ class PnpDct(VoxelMethod):
     label: ClassVar[str] = "PnP-DCT"
     traits: ClassVar[Traits] = Traits(halo=16, own_length=True, error_bars=(2.3, 0.25))
 
-    iterations: Count = 35
+    iterations: Count = 25
     patch_threshold: NonNegative | None = None
     allow_negative: bool = False
 
@@ -204,7 +204,7 @@ class PnpDct(VoxelMethod):
     @property
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * TRIAL_STEPS
+        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * self.iterations
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         ended, sweeps = False, 0 if x.any() else self.first_sweeps
@@ -224,7 +224,7 @@ class PnpDct(VoxelMethod):
             return x
         share = self.patch_threshold
         if share is None:
-            strength = choose_patches(problem, weight, trial).strength
+            strength = choose_patches(problem, weight, trial, self.iterations).strength
         else:
             strength = problem.decide("threshold", lambda: share * density_unit(x))
         further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
@@ -232,7 +232,7 @@ class PnpDct(VoxelMethod):
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         first = FistaTv().costs(geometry, grid)
-        choice = patch_choice(geometry, grid) if self.patch_threshold is None else Work()
+        choice = patch_choice(geometry, grid, self.iterations) if self.patch_threshold is None else Work()
         work = first.volumes[FistaTv.name] + patch_steps(geometry, grid, self.iterations)
         return Costs({self.name: work}, first.choice + choice)
 
@@ -257,9 +257,11 @@ class Patches(NamedTuple):
 
 
 def choose_patches(
-    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None]
+    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None], steps: int
 ) -> Patches:
     """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
+
+    Trials take as many steps as the volume will: noise enters with each, so that few steps prefer a weaker prior.
 
     The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
     views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
@@ -272,7 +274,7 @@ def choose_patches(
         if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
         smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
-        found = preferred_strength(partial(residuals_of_patches, judge, smooth), first)
+        found = preferred_strength(partial(residuals_of_patches, judge, smooth, steps), first)
         if found is None:
             return [first, 0]
         judge.remember("patches", found)
@@ -282,12 +284,10 @@ def choose_patches(
     return Patches(strength, bool(better))
 
 
-def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
-    """Residuals of held-out views for the volume that patches make of `x`."""
+def residuals_of_patches(trial: HeldOutTrial, x: F32, steps: int, strength: float) -> F64:
+    """Residuals of held-out views for the volume that so many steps with patches make of `x`."""
 
     def made(strength: float) -> F32:
-        return trial.volume_by(
-            lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x
-        )
+        return trial.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), x)
 
     return trial.residuals_of("patches", strength, made)

@@ -201,9 +201,6 @@ def subsets_of(geometry: Geometry, most: int, fewest: int = 1) -> int:
     return max(1, min(most, max(whole, fewest) if whole else 1))
 
 
-TRIAL_STEPS = 15
-"""Steps with patches. Without, with all 35: level within 0.1 dB, and half as much CPU time again."""
-
 STEPS = 5
 """Steps towards the views between two thresholds."""
 

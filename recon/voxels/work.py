@@ -19,7 +19,7 @@ from recon.voxels.held_out import (
     TRIALS,
     TV_STEPS,
 )
-from recon.voxels.priors import STEPS, TRIAL_STEPS, subsets_of
+from recon.voxels.priors import STEPS, subsets_of
 from recon.voxels.projector import Projector, views_of_exposure
 from recon.voxels.voxel_problem import POWER_ROUNDS, POWER_ROWS
 
@@ -107,11 +107,11 @@ def weight_choice(geometry: Geometry, grid: Grid) -> Work:
     return first + direct_work(*part) + power_rounds(*part, subsets_of(part[0], SUBSETS)) + trials
 
 
-def patch_choice(geometry: Geometry, grid: Grid) -> Work:
-    """Work of `choose_patches`: the noise of a volume, and the usual number of trials."""
+def patch_choice(geometry: Geometry, grid: Grid, steps: int) -> Work:
+    """Work of `choose_patches`: the noise of a volume, and the usual number of trials of so many steps."""
     noise = power_rounds(geometry, grid) + STEPS * (sweep(geometry, grid) + on_volume("pass", grid, 2))
     part = trial_part(geometry, grid)
     if part is None:
         return noise
     smooth = fista_sweeps(*part, TRIAL_SWEEPS, SUBSETS, TV_STEPS)
-    return noise + smooth + TRIALS * patch_steps(*part, TRIAL_STEPS)
+    return noise + smooth + TRIALS * patch_steps(*part, steps)

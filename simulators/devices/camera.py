@@ -18,10 +18,10 @@ from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from simulators.devices.camera_view import CameraView, Exposed
+from simulators.devices.in_beam import CameraView, Exposed
 from simulators.devices.trigger_line import TriggerLine
 from simulators.effects.chain import Label
-from simulators.frame.sensor import CONVERSION, OFFSET
+from simulators.effects.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError, Detector
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene

@@ -27,7 +27,7 @@ from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
 from simulators.frame.mapping import Positive, build, located, named
 from simulators.light.beam import Beam
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 from simulators.samples.sample import Sample
 
 if TYPE_CHECKING:

@@ -1,4 +1,8 @@
-"""Wire: the far end of a serial cable: bytes in, bytes out."""
+"""Wire: the far end of a serial cable: bytes in, bytes out; and `sim://name`, which opens it.
+
+pyserial opens such a URL by the same code path as a real port. It finds the scheme in `simulators.wires.protocol_sim`
+once this module is imported. Names are process-wide, as the ports of a computer are.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,9 @@ import threading
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol, Self
+
+import serial
+from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_bytes
 
 from drivers.base.clock import Clock
 from simulators.devices.trigger_line import TriggerLine
@@ -95,3 +102,118 @@ class Build(Protocol):
 
     def controller(self, clock: Clock, line: TriggerLine) -> Controller:
         """The controller with its trigger output wired to `line`, which also learns the sample's true angle."""
+
+
+SCHEME = "sim://"
+POLL = 1e-3  # s on the device's clock between two checks for a missing reply
+
+if "simulators.wires" not in serial.protocol_handler_packages:
+    serial.protocol_handler_packages.append("simulators.wires")
+
+
+class _Ports:
+    """The simulated ports of this process: the devices plugged in, and the open ports."""
+
+    def __init__(self) -> None:
+        self._wires: dict[str, Wire] = {}
+        self._open: dict[str, Wire] = {}
+        self._lock = threading.Lock()
+
+    def plug(self, name: str, wire: Wire) -> None:
+        with self._lock:
+            self._wires[name] = wire
+            self._open.pop(name, None)
+
+    def open(self, name: str) -> Wire:
+        with self._lock:
+            if name in self._open:
+                raise SerialException(f"could not open port {SCHEME}{name}: it is open already")
+            if name not in self._wires:
+                known = ", ".join(SCHEME + known for known in sorted(self._wires)) or "none"
+                raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
+            self._open[name] = self._wires[name]
+            return self._wires[name]
+
+    def find(self, name: str) -> Wire | None:
+        with self._lock:
+            return self._wires.get(name)
+
+    def close(self, name: str, wire: Wire) -> None:
+        with self._lock:
+            if self._open.get(name) is wire:
+                del self._open[name]
+
+
+_PORTS = _Ports()  # pyserial gives its handler only the URL, so the names are kept here
+
+
+def register(name: str, wire: Wire) -> str:
+    """Plug a simulated device in; returns the URL that opens it. It replaces a device of the same name."""
+    _PORTS.plug(name, wire)
+    return SCHEME + name
+
+
+def plugged(url: str) -> Wire | None:
+    """The simulated device of a URL, for drivers that exchange no bytes; None if nothing is plugged in there."""
+    return _PORTS.find(url[len(SCHEME) :])
+
+
+class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no types
+    """pyserial's side of a simulated port. Bytes arrive at once, whatever the baud rate; timeouts run on the device's
+    clock, so that a virtual second costs nothing."""
+
+    is_open: bool
+
+    def open(self) -> None:
+        if self.is_open:
+            raise SerialException("port is already open")
+        self._name = self.port[len(SCHEME) :]
+        self._wire = _PORTS.open(self._name)
+        self._wire.transmit()  # opening a port drops earlier bytes, as an operating system does
+        self._received = bytearray()
+        self.is_open = True
+
+    def close(self) -> None:
+        if self.is_open:
+            self.is_open = False
+            _PORTS.close(self._name, self._wire)
+
+    @property
+    def in_waiting(self) -> int:
+        self._take()
+        return len(self._received)
+
+    def read(self, size: int = 1) -> bytes:
+        self._take()
+        deadline = None if self.timeout is None else self._wire.clock.now() + self.timeout
+        while len(self._received) < size and (deadline is None or self._wire.clock.now() < deadline):
+            self._wire.clock.sleep(POLL)
+            self._take()
+        taken = bytes(self._received[:size])
+        del self._received[:size]
+        return taken
+
+    def write(self, data: bytes) -> int:
+        if not self.is_open:
+            raise PortNotOpenError()
+        sent = to_bytes(data)
+        self._wire.receive(sent)
+        return len(sent)
+
+    def reset_input_buffer(self) -> None:
+        self._take()
+        self._received.clear()
+
+    def _take(self) -> None:
+        if not self.is_open:
+            raise PortNotOpenError()
+        self._received += self._wire.transmit()
+
+    def _reconfigure_port(self) -> None:
+        """pyserial calls it when a setting changes; settings do not affect this port."""
+
+    def _update_dtr_state(self) -> None:
+        """No modem lines."""
+
+    def _update_rts_state(self) -> None:
+        """No modem lines."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 

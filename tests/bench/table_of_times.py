@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from recon.compiled.level import LEVELS, level_for, processor_flags
+from recon.compiled import LEVELS, level_for, processor_flags
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

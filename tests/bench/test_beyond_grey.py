@@ -21,7 +21,7 @@ from recon.assess.metrics import psnr
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.surfaces.marching import Mesh, half_way, on_level, surface
+from recon.features.surfaces import Mesh, half_way, on_level, surface
 from simulators.samples.materials.materials import known
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene

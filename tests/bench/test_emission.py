@@ -12,7 +12,7 @@ import pytest
 import recon
 from recon.base.method import Method
 from simulators.frame.shot import Detector
-from simulators.scenes.emission.counts import NemaPhantom, Scanner, events
+from simulators.scenes.emission import NemaPhantom, Scanner, events
 
 SHAPE, VIEWS, PITCH = (16, 64), 120, 1.0  # mm
 PHANTOM = NemaPhantom()

@@ -22,8 +22,8 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.error_bars import error_bars
-from recon.features.particles.particles import cleaned, measured, parted, volume_deviation
-from recon.post.enhance import clusters, enhanced, enhanced_deviation
+from recon.features.particles import cleaned, measured, parted, volume_deviation
+from recon.post import clusters, enhanced, enhanced_deviation
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.projector import Projector
 from tests.bench.quality_cases import Case, dense_battery, slab

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from beamline.core.shipped import shipped_scenes
+from beamline.core.installed import shipped_scenes
 from beamline.scenes.scene_file import open_scene
 from simulators.effects.catalogue import CATALOGUE
 from simulators.frame.shot import Shot
-from simulators.scenes.cost.explain import explain
+from simulators.scenes.cost import explain
 from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene
 

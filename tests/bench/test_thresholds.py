@@ -113,7 +113,6 @@ def _fit(**settings: Any) -> recon.R2:
 
 REMOVED: dict[str, Removed] = {
     "SHARPENED": Removed(0.0, (*ALL, "shell, cone")),
-    "TRIAL_THRESHOLD": Removed(1.0, PATCHES),
     "FIRST_THRESHOLD": Removed(1.0, ("12 shell", "12 foam", "12 bone", "12 cement"), recon.PnpDct()),
     "PULL": Removed(0.3, PATCHES),
     "FALL": Removed(1.0, PATCHES),

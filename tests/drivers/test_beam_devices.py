@@ -17,9 +17,9 @@ from drivers.epics.devices import EnergyUnit, FilterPvs, MonochromatorPvs, PvFil
 from drivers.in_beam import ManualFilter, ManualMonochromator, PlacedStage, StagePlaces
 from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.clock import VirtualClock
-from simulators.devices.shutter import SimulatedMonochromator
+from simulators.devices.in_beam import SimulatedMonochromator
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, record_of, serve_pva
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat

@@ -13,7 +13,7 @@ from drivers.in_beam import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSamp
 from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.soft_ioc import TickingClock, record_of
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat

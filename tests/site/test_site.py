@@ -26,7 +26,7 @@ from drivers.testing.stages import Build, StageBench, StageConformance, StageKin
 from recon.testing import MethodConformance
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.site.site_of_an_instrument.cameras import SiteCamera, SiteCameraSettings
 from tests.site.site_of_an_instrument.methods import Mean
 from tests.site.site_of_an_instrument.readers import NPY_STACK

@@ -1,25 +1,23 @@
-"""Batches: many scans by one recipe, in a worker process that ends after a failure, and a table of the results."""
+"""Batches: many scans by one recipe, each in a process of its own, and a table of the results."""
 
 from __future__ import annotations
 
 import csv
-import json
 import sys
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal
 
+from pydantic import TypeAdapter
+
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
-from beamline.core.files import RECON, named_on_failure, remove, whole_file
+from beamline.core.files import RECON, named_on_failure, remove, whole_file, write_whole
 from beamline.core.machine import Need
-from beamline.core.machine_speed import seconds_left
-from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
-from beamline.core.text import count, size
+from beamline.core.process import ProcessEnd, json_object, run_to_end
+from beamline.core.text import count, csv_text, one_line, size
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
@@ -27,11 +25,8 @@ from recon.assess.time_model import duration_text
 RowState = Literal["waiting", "done", "poor", "failed"]
 
 TABLE, RECIPE = "batch.csv", "recipe.yaml"
-_WORKER_LOG = ".worker.txt"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
-COMMAND = (sys.executable, "-m", "beamline.features.batch.recon_worker")
-"""The worker, which reconstructs scan after scan: libraries are loaded and kernels compiled once."""
-_POLL = 0.2  # real s between two checks of the worker
+COMMAND = (sys.executable, "-m", "beamline.cli.main")
 _SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
 
 
@@ -58,6 +53,9 @@ class BatchRow:
     @property
     def has_volume(self) -> bool:
         return self.state in ("done", "poor")
+
+
+_ROWS = TypeAdapter(list[BatchRow])
 
 
 @dataclass(frozen=True)
@@ -93,8 +91,19 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
         raise DataError(f"Another batch works in {folder}. Wait for its end, or name another folder.")
     lock = WriterLock(folder / RECIPE)
     try:
-        with Worker(folder / _WORKER_LOG) as worker:
-            return _run_all(options, worker, sink, clock)
+        rows = _rows(options.scans, _read(folder))
+        _write(folder, rows)
+        start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
+        for tried, n in enumerate(waiting):
+            spent = clock.now() - start
+            eta, rate = seconds_left(tried, len(waiting), spent), 60 * tried / max(spent, 1e-9)
+            sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
+            row = rows[n] = _one(rows[n], options, sink, clock)
+            _write(folder, rows)
+            sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+            now = clock.now()
+            sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
+        return rows
     finally:
         lock.release()
 
@@ -162,95 +171,6 @@ def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) ->
     return BatchPlan(folder=folder, rows=rows, needs=needs, **vars(Need.in_turn(needs.values())))
 
 
-class Worker:
-    """A worker process that reconstructs scan after scan; it ends with the context.
-
-    After a scan without a volume the next one gets a new process, so that a crash, a lack of memory or leftovers of a
-    failure harm no other scan.
-
-    Args:
-        log: file for its stderr while it works on a scan.
-        silence: real s without a line, after which a scan is taken to hang.
-    """
-
-    def __init__(self, log: Path, command: Sequence[str] = COMMAND, silence: float = _SILENCE) -> None:
-        self._log, self._command, self._silence = log, command, silence
-        self._running = ExitStack()
-        self._process: ChildProcess | None = None
-        self._on_line: Callable[[str], None] = lambda line: None
-        self._heard, self._code, self._ended = 0.0, 0, threading.Event()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.end()
-
-    def run(self, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int | None, str]:
-        """The exit code of `beamline` with these arguments, and the last line of its stderr."""
-        self._on_line = on_line
-        process = self._process or self._start()
-        self._ended.clear()
-        before = self._log.stat().st_size
-        self._heard = time.monotonic()
-        with suppress(OSError):  # it has ended since
-            process.tell(json.dumps(list(arguments)))
-        silent = False
-        while process.running and not silent and not self._ended.wait(_POLL):
-            silent = time.monotonic() - self._heard > self._silence
-        if not process.running:
-            process.wait()  # for its last lines
-        reason = last_line(self._log, before)
-        if self._ended.is_set():
-            code: int | None = self._code
-        else:
-            code = None if silent else process.code
-            reason = f"no output from the worker for {self._silence:g} s; it was ended" if silent else reason
-        if code not in _WITH_VOLUME:
-            self.end()
-        return code, reason
-
-    def _start(self) -> ChildProcess:
-        stderr = self._running.enter_context(self._log.open("w", encoding="utf-8"))
-        started = ChildProcess(self._command, stderr, self._take, with_our_path(), tether=True)
-        self._process = self._running.enter_context(started)
-        return self._process
-
-    def end(self) -> None:
-        """End the process; the next scan gets another one."""
-        self._running.close()
-        self._process = None
-        self._log.unlink(missing_ok=True)
-
-    def _take(self, line: str) -> None:
-        self._heard = time.monotonic()
-        data = json_object(line) or {}
-        if data.get("event") == "ended":
-            self._code = int(data["exit_code"])
-            self._ended.set()
-        else:
-            self._on_line(line)
-
-
-def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> list[BatchRow]:
-    folder = options.folder
-    rows = _rows(options.scans, _read(folder))
-    _write(folder, rows)
-    start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
-    for tried, n in enumerate(waiting):
-        spent = clock.now() - start
-        eta = seconds_left(tried, len(waiting), spent)
-        rate = 60 * tried / max(spent, 1e-9)
-        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
-        rows[n] = _one(rows[n], options, worker, sink, clock)
-        _write(folder, rows)
-        row = rows[n]
-        sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
-        now = clock.now()
-        sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
-    return rows
-
-
 def names_of(scans: Sequence[Path]) -> list[str]:
     """A name for each file: its stem, with as many of its folders as make it unique."""
     parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
@@ -306,7 +226,7 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     return [*earlier, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
 
 
-def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> BatchRow:
+def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> BatchRow:
     """Reconstruct a scan."""
     began, last = clock.now(), dict[str, Any]()
 
@@ -328,18 +248,21 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
     try:
         with named_on_failure(work):
             work.mkdir()
-        code, stderr = worker.run(_arguments(options, row.scan, work), pass_on)
+        log = work / "stderr.txt"
+        ending, code, stderr = run_to_end(
+            [*COMMAND, *_arguments(options, row.scan, work)], log, pass_on, silence=_SILENCE
+        )
+        log.unlink()
         state = _WITH_VOLUME.get(code, "failed") if (work / RECON).is_file() else "failed"
         if state != "failed":
             with named_on_failure(place):
                 work.replace(place)
-    except BaseException:
-        worker.end()  # before its files are removed
-        raise
     finally:
         remove(work)
     residual = last.get("residual_held_out", last.get("residual"))
     reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+    if ending is ProcessEnd.SILENT:
+        reason = f"no output from its process for {_SILENCE:g} s; it was ended"
     message = "" if state == "done" else reason or f"no volume: its process ended with code {code}"
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
@@ -361,23 +284,11 @@ def _read(folder: Path) -> list[BatchRow]:
     path = folder / TABLE
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [_row(record) for record in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError, csv.Error) as error:
-        raise DataError(f"{path} is no table of a batch ({error}). Nothing was touched.") from error
-
-
-def _row(record: Mapping[str, str]) -> BatchRow:
-    results: Mapping[str, RowState] = {result: result for result in get_args(RowState)}
-    numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
-    return BatchRow(
-        record["name"], record["scan"], results[record["state"]], method=record["method"], message=record["message"],
-        **numbers,
-    )  # fmt: skip
+            return _ROWS.validate_python([{k: v for k, v in row.items() if v} for row in csv.DictReader(file)])
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
-    path = folder / TABLE
-    with whole_file(path, replace=True) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, [column.name for column in fields(BatchRow)])
-        table.writeheader()
-        table.writerows(asdict(row) for row in rows)
+    names = [column.name for column in fields(BatchRow)]
+    write_whole(folder / TABLE, csv_text([names, *(vars(row).values() for row in rows)]), replace=True)

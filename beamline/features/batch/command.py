@@ -34,8 +34,8 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
 def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
     """What the reconstruction of a scan takes, with its output on the disk of the folder `beside`."""
     from beamline.cli.recon import options_of, recon  # the batch itself needs none of it
+    from beamline.core.durations import MachineSpeed
     from beamline.core.machine import busy
-    from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.estimate import estimate
 
     recipe = [] if config is None else ["--config", str(config)]

@@ -24,8 +24,9 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, Validat
 
 import recon
 from beamline.config.section import Section
+from beamline.config.tree import YAML_FAULTS
 from beamline.core.errors import BeamlineError, ConfigError
-from beamline.core.files import SETTINGS, YAML_FAULTS, text_in
+from beamline.core.files import SETTINGS, text_in
 from beamline.core.process import SAFE_PATH
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry

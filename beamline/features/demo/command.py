@@ -146,7 +146,7 @@ def _compare(
     scan: Path, volume: Path, truth: Callable[[Grid], Volume], shown: _Shown, sink: Sink, clock: Clock
 ) -> None:
     """Compare the live volume and FBP of the same views with the truth, on a page that replaces the volume's."""
-    from beamline.gaussians.model import read_model
+    from beamline.gaussians import read_model
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
     from beamline.reconstruct.options import OutputPaths, report_beside

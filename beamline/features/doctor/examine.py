@@ -20,8 +20,8 @@ from beamline.config.beam import BeamMonitorSection, FoundFilter, FoundMonochrom
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, FilterConfig, MonochromatorConfig
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
+from beamline.core.installed import OWN_PACKAGES, clashing_distributions
 from beamline.core.machine import free_memory
-from beamline.core.own_packages import OWN_PACKAGES, clashing_distributions
 from beamline.core.text import size
 from beamline.features.doctor import devices
 from beamline.features.doctor.check import Diagnosis, Grade, of_error
@@ -229,7 +229,7 @@ def packages(owners: Mapping[str, Sequence[str]]) -> Diagnosis:
     """Whether other distributions have packages of our names. Where Python finds theirs, no command starts at all.
 
     Args:
-        owners: their names for each distribution, as of `beamline.core.own_packages.clashing_distributions`.
+        owners: their names for each distribution, as of `beamline.core.installed.clashing_distributions`.
     """
     if not owners:
         return Diagnosis("packages", Grade.OK, f"No other distribution has a package named {', '.join(OWN_PACKAGES)}.")

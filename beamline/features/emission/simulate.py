@@ -23,7 +23,7 @@ from beamline.scenes.request import Output, SimulateRequest
 from beamline.scenes.scene_file import Truth, grid_of, open_other, write_truth
 from beamline.storage import hdf5
 from drivers.base.clock import SystemClock
-from simulators.scenes.emission.counts import EmissionScene, Events, events, load_emission
+from simulators.scenes.emission import EmissionScene, Events, events, load_emission
 
 _BYTES_A_LINE = 120  # as measured
 

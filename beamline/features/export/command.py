@@ -253,7 +253,7 @@ def _export_film(request: ExportRequest) -> None:
 
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
     from beamline.features.export.film_file import write_ply
-    from beamline.gaussians.model import read_model
+    from beamline.gaussians import read_model
 
     with answering(as_json) as answer:
         refuse_existing(output)

@@ -18,7 +18,7 @@ from PIL import GifImagePlugin, Image
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import whole_file
 from beamline.core.sinks import Warn
-from beamline.gaussians.model import Model
+from beamline.gaussians import Model
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource

@@ -27,8 +27,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.scan import altered_sentence, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, complete
-from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
+from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Record, Rows, ScanEnding, complete
 from drivers.base.frame import FrameKind
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.nexus import Places, find
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from beamline.storage.writers import layout
 
 Rule = Callable[[Places], Iterator[Finding]]

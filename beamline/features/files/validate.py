@@ -21,7 +21,7 @@ from beamline.storage.readers.base import LookedEnoughError, ScanSource, rows_re
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import BriefSource
 from beamline.storage.recon_record import ReconRecord
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import VIEWS, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended

@@ -76,7 +76,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, **values: An
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
-    from beamline.energies.scans import EnergyScans, read_spectra
+    from beamline.energies import EnergyScans, read_spectra
     from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
     from beamline.scan.energies import scans_of
     from recon.features.joint.methods import EnergySeries

@@ -30,8 +30,8 @@ from beamline.core.files import refuse_existing, whole_file
 from recon.base.registry import unknown
 
 if TYPE_CHECKING:
-    from beamline.gaussians.model import Model
-    from recon.features.surfaces.marching import Mesh
+    from beamline.gaussians import Model
+    from recon.features.surfaces import Mesh
 
 
 Box = tuple[tuple[float, float], ...]
@@ -69,7 +69,7 @@ def angles_of(text: str) -> NDArray[np.float64]:
 @contextmanager
 def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Answer]]:
     """The model behind `volume`, for a new file at `output`."""
-    from beamline.gaussians.model import read_model  # here: help needs none of it
+    from beamline.gaussians import read_model  # here: help needs none of it
 
     refuse_shared({"VOLUME": volume, "--output": output})
     with answering(as_json) as answer:

@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.machine import free_memory
-from beamline.gaussians.model import Model, read_model
+from beamline.gaussians import Model, read_model
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import ScanEnding, complete
-from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
+from beamline.storage.writers.rows import PER_FLUSH, Record, Rows, ScanEnding, complete
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.base.volume import Grid, Volume
-from recon.features.surfaces.marching import BySlices, Mesh, half_way, on_level, surface
+from recon.features.surfaces import BySlices, Mesh, half_way, on_level, surface
 from recon.splatting.splat import project, voxelize
 
 _SLICES = 16  # made at a time

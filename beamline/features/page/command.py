@@ -137,8 +137,11 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
 
 
 def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:
-    from beamline.features.page.run_browser import RunBrowser  # these load HDF5 and the server
-    from beamline.features.page.serve import open_port, start
+    from beamline.features.page.serve import (
+        RunBrowser,  # these load HDF5 and the server
+        open_port,
+        start,
+    )
 
     with closing(RunBrowser(folder)) as runs:
         serve_shown(start(runs.app, open_port(bind, port)), browse)

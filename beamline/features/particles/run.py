@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.text import count, csv_text
 from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
 from beamline.storage import hdf5
@@ -24,7 +24,7 @@ from beamline.storage.volumes.files import whole_volume
 from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
-from recon.features.particles.particles import (
+from recon.features.particles import (
     NECK,
     Particles,
     bodies_outside,
@@ -33,7 +33,7 @@ from recon.features.particles.particles import (
     parted,
     volume_deviation,
 )
-from recon.post.enhance import (
+from recon.post import (
     Box,
     Clusters,
     clusters,

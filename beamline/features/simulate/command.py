@@ -17,8 +17,8 @@ from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import CostExplained, Done, Sink
 from beamline.core.files import refuse_existing, remove, write_whole
+from beamline.core.installed import shipped_scenes
 from beamline.core.machine import free_memory, machine, machine_line
-from beamline.core.shipped import shipped_scenes
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
@@ -89,7 +89,7 @@ def simulate(request: SimulateRequest) -> None:
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
     """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
-    from beamline.simulate.labels import labels_path
+    from beamline.simulate import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
     seen: dict[str, str] = {}

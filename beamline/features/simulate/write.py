@@ -13,23 +13,23 @@ from pathlib import Path
 
 import numpy as np
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import FrameStored, Sink
 from beamline.core.files import refuse_existing
-from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM
 from beamline.report.figures import grey_window, new_figure, png
 from beamline.scenes.scene_file import SceneFile
-from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
+from beamline.simulate import LabelledRun, LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.chain import Anomaly, Label
 from simulators.frame.shot import CannotExposeError
-from simulators.scenes.cost.explain import FrameCost, explain
+from simulators.scenes.cost import FrameCost, explain
 from simulators.scenes.expose import PlannedFrame, Scan, expose
 
 PREVIEW_BIN = 4

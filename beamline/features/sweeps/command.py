@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import TYPE_CHECKING
 
 import click
@@ -147,7 +148,8 @@ def _options(context: click.Context) -> ReconOptions:
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
-    return replace(options_of(context, BASELINE), target=OutputPaths(Path("slice.h5"), None, written=False))
+    target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
+    return replace(options_of(context, BASELINE), target=target)
 
 
 def _run(
@@ -157,29 +159,29 @@ def _run(
     from beamline.features.sweeps.sweep import scores_of, sliced, sweep_sheet, sweep_slices
 
     slices: list[SweptSlice] = []
-    first = trials[0][1]
     with answering(as_json) as answer:
-        sink, clock = answer.sink, answer.clock
-        with sliced([each for _, each in trials]) as cut:
-            planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
-            try:
-                for each in sweep_slices(planned, sink, clock, answer.counting("slices")):
-                    slices.append(each)
-            except KeyboardInterrupt:
-                if not slices:
-                    raise
-            rows = cut[0].selection.rows
-        scores = scores_of(slices, direct=first.method.traits.direct)
-        for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
+        cut = sliced([each for _, each in trials])
+        planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
+        try:
+            for each in sweep_slices(planned, answer.sink, answer.clock, answer.counting("slices")):
+                slices.append(each)
+        except KeyboardInterrupt:
+            if not slices:
+                raise
+        rows, direct = cut[0].selection.rows, cut[0].method.traits.direct
+        scores = scores_of(slices, direct=direct)
+        for sentence in _remarks(slices, scores, options, direct=direct):
             answer.warn(sentence)
         where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
-        title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
-        write_whole(path.with_suffix(".csv"), table_of(slices, scores))
+        title = f"{Path(cut[0].source.path).name}{where}, {slices[0].views.geometry.n_views} views"
+        table = _rows(slices, scores, ("residual_held_out", "verdict", "seconds"), (".6g", "", ".3g"))
+        write_whole(path.with_suffix(".csv"), csv_text(table))
         write_whole(path, sweep_sheet(slices, scores, options, title))
         best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
         means = None if scores is None else scores.shares.tolist()
         facts = {"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means}
-        answer.done(facts, _lines(slices, scores), f"sheet     {path}", f"table     {facts['table']}")
+        lines = _rows(slices, scores, (METRICS["residual_held_out"].label, "", "s"), (".5g", "-", ".2g"))
+        answer.done(facts, aligned(lines, ">"), f"sheet     {path}", f"table     {facts['table']}")
     return slices, scores
 
 
@@ -213,35 +215,33 @@ def _remarks(
     return remarks
 
 
-def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    """The table as CSV: values, residual of held-out views, whether the slice is the best or equivalent to it, and
-    seconds.
-    """
-    rows = [[*slices[0].values, "residual_held_out", "verdict", "seconds"]]
-    for n, each in enumerate(slices):
-        residual = "" if scores is None else f"{scores.shares[n]:.6g}"
-        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
-    return csv_text(rows)
-
-
 def _verdict(scores: Scores | None, n: int) -> str:
     if scores is None or not scores.alike[n]:
         return ""
     return "best" if n == scores.best else "alike"
 
 
-def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    rows = [[*slices[0].values, METRICS["residual_held_out"].label, "", "s"]]
-    for n, each in enumerate(slices):
-        residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
-        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
-    return aligned(rows, ">")
+def _rows(
+    slices: Sequence[SweptSlice], scores: Scores | None, heading: tuple[str, str, str], digits: tuple[str, str, str]
+) -> list[list[str]]:
+    """A heading, then of each slice: values, residual of views held out, whether it is the best or not significantly
+    different from it, and seconds.
+
+    Args:
+        digits: of the residual, what stands for an unknown one, digits of the seconds.
+    """
+    residual, unknown, seconds = digits
+    known = [unknown] * len(slices) if scores is None else [f"{share:{residual}}" for share in scores.shares]
+    return [[*slices[0].values, *heading]] + [
+        [*each.values.values(), known[n], _verdict(scores, n), f"{each.seconds:{seconds}}"]
+        for n, each in enumerate(slices)
+    ]
 
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     """Print the time and memory of the sweep."""
+    from beamline.core.durations import MachineSpeed
     from beamline.core.machine import Need, busy
-    from beamline.core.machine_speed import MachineSpeed
     from beamline.core.text import count, size
     from beamline.features.sweeps.sweep import sliced
     from beamline.reconstruct.estimate import estimate
@@ -249,8 +249,7 @@ def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
 
     with answering(as_json) as answer:
         speed = MachineSpeed()
-        with sliced([each for _, each in trials]) as cut:
-            needs = [estimate(each, speed, busy()) for each in cut]
+        needs = [estimate(each, speed, busy()) for each in sliced([each for _, each in trials])]
         together = Need.in_turn(needs)
         total = None if any(each.seconds is None for each in needs) else together.seconds
         time, first = "not known" if total is None else f"about {duration_text(total)} at most", needs[0]

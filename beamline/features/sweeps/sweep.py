@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,12 +18,12 @@ from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
-from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import WIDTH, new_figure, png, show_grey
 from beamline.report.metrics import METRICS
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import ONE_IN
 from recon.base.greys import matter_window
 from recon.base.method import Reconstruction, RunControl
@@ -51,31 +48,28 @@ class SweptSlice:
         values: of the options, by name.
         image: [y, x] in 1/mm (1/px), the middle slice of the rows.
         seconds: of the reconstruction.
-        views: its views held out, corrected as its own options say.
-        projected: [view, row, col] what the volume shows in them, at this resolution.
+        views: corrected as its own options say, some of them held out.
+        projected: [view, row, col] what the volume shows in those held out, at this resolution.
     """
 
     values: Mapping[str, str]
     image: F32
     seconds: float
-    views: HeldOutViews
+    views: PreparedProjections
     projected: F32
     resolution: ViewResolution
 
     @property
-    def label(self) -> str:
-        return ", ".join(f"{name} {value}" for name, value in self.values.items())
+    def ids(self) -> I64:
+        """Rows of the file of the views held out."""
+        assert self.views.held_out_ids is not None
+        return self.views.held_out_ids
 
-
-@dataclass(frozen=True, eq=False)
-class HeldOutViews:
-    """Held-out views, which no volume of the sweep was fitted to: rows of the file, and line integrals [view, row,
-    col].
-    """
-
-    ids: NDArray[np.int64]
-    data: F32
-    prepared: PreparedProjections
+    def held_out(self, ids: I64) -> F32:
+        """Views held out [view, row, col], by these rows of the file; pixels that were not measured are NaN."""
+        assert self.views.held_out is not None
+        data, measured = self.views.held_out[0][np.searchsorted(self.ids, ids)], self.views.measured
+        return data if measured is None else np.where(measured, data, np.float32(np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +106,8 @@ class Scores:
         return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
 
 
-@contextmanager
-def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
-    """The same reconstruction options for a few rows around the middle, with no output.
+def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
+    """The same reconstruction options for a few rows around the middle.
 
     A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
     are given, all of them are made.
@@ -122,15 +115,11 @@ def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
-    with tempfile.TemporaryDirectory(prefix="beamline-") as folder:
-        target = OutputPaths(Path(folder) / "slice.h5", None, written=False)
-        cut = []
-        for trial in trials:
-            with trial.source.open() as source:
-                selection = _middle(source, trial.selection, halo)
-            cut.append(replace(trial, target=target, selection=selection))
-        yield cut
+    halo, cut = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials), []
+    for trial in trials:
+        with trial.source.open() as source:
+            cut.append(replace(trial, selection=_middle(source, trial.selection, halo)))
+    return cut
 
 
 def _middle(source: ScanSource, selection: Selection, halo: int) -> Selection:
@@ -168,13 +157,14 @@ def sweep_slices(
             wanted = replace(asked, axis_col=axis)
         if selected != (source_words, wanted):
             with options.source.open() as source:
-                views = _held_out(prepare_projections(source, wanted, warn))
+                views = prepare_projections(source, wanted, warn)
+            views = hold_out(views, ONE_IN, advice="take a scan with more views")
             if wanted.axis_col is None and source_words == first:
-                axis = views.prepared.axis_col
+                axis = views.axis_col
                 wanted = replace(wanted, axis_col=axis)
             selected = source_words, wanted
-        own = views.prepared if asked.axis_col is None or not of_axes else _about(views.prepared, asked)
-        made = swept_slice(options, own, Grid.matching(views.prepared.geometry), sink, clock)
+        own = views if asked.axis_col is None or not of_axes else _about(views, asked)
+        made = swept_slice(options, own, Grid.matching(views.geometry), sink, clock)
         assert own.held_out is not None
         projector = Projector(own.held_out[1], made.volume.grid)
         projected = projector.forward(np.asarray(made.volume.data))
@@ -214,39 +204,28 @@ def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProje
     )
 
 
-def _held_out(prepared: PreparedProjections) -> HeldOutViews:
-    held = hold_out(prepared, ONE_IN, advice="take a scan with more views")
-    assert held.held_out is not None and held.held_out_ids is not None
-    data = np.array(held.held_out[0], np.float32)
-    if held.measured is not None:
-        data[:, ~held.measured] = np.nan
-    return HeldOutViews(held.held_out_ids, data, held)
-
-
 def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores | None:
     """Residual of each volume in the held-out views; None if slices differ in pixels, or in their held-out views.
 
     A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
     compared with them as every value corrects them, and the mean counts.
     """
-    shapes = {each.views.data.shape[1:] for each in slices}
-    common = slices[0].views.ids
+    shapes = {each.projected.shape[1:] for each in slices}
+    common = slices[0].ids
     for each in slices[1:]:
-        common = np.intersect1d(common, each.views.ids)
+        common = np.intersect1d(common, each.ids)
     if len(shapes) > 1 or not common.size:
         return None
     judges = {id(each.views): each for each in reversed(slices)}.values()  # one resolution for all geometries
-    residuals = np.zeros((len(slices), common.size))
-    scale, alike, first = 0.0, True, slices[0].views
+    residuals, first = np.zeros((len(slices), common.size)), slices[0].held_out(common)
+    scale, alike = 0.0, True
     for judge in judges:
-        at = np.searchsorted(judge.views.ids, common)
-        measured, resolution = judge.views.data[at], judge.resolution.select(at)
+        measured, resolution = judge.held_out(common), judge.resolution.select(np.searchsorted(judge.ids, common))
         if not np.isfinite(measured).any(axis=(1, 2)).all():
             return None
-        alike &= np.array_equal(measured, first.data[np.searchsorted(first.ids, common)], equal_nan=True)
+        alike &= np.array_equal(measured, first, equal_nan=True)
         for n, each in enumerate(slices):
-            model = each.projected[np.searchsorted(each.views.ids, common)]
-            left, own = squares_left(model, measured, resolution)
+            left, own = squares_left(each.projected[np.searchsorted(each.ids, common)], measured, resolution)
             residuals[n] += np.sqrt(left)
         scale += float(np.sqrt(own.mean()))
     if scale == 0:
@@ -285,7 +264,8 @@ def sweep_sheet(
         if n == 0:
             axes.set(xlabel="x →", ylabel="← y")
         colour = _colour(scores, n)
-        words = each.label if scores is None else f"{each.label}\n{scores.shares[n]:.5g}"
+        words = ", ".join(f"{name} {value}" for name, value in each.values.items())
+        words = words if scores is None else f"{words}\n{scores.shares[n]:.5g}"
         axes.set_title(words, fontsize=7, color=colour)
         for side in axes.spines.values():
             side.set(color=colour, linewidth=0.8 if colour == "black" else 2.5)

@@ -19,9 +19,8 @@ from beamline.core.text import one_line
 from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity, StampedValues
 from beamline.page.recording import Recording
 from beamline.page.tiles import MOST, TileRegion
-from beamline.scan.control import Asked, Verb, ask
+from beamline.scan.control import Asked, State, Verb, ask
 from beamline.scan.runs import DIED, newest
-from beamline.scan.states import State
 from beamline.storage.hdf5 import NotReadyError
 
 Picture = NDArray[np.float32]

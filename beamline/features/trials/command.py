@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,17 +35,14 @@ from beamline.cli.selection_options import chosen, light_asked, light_options, s
 from beamline.cli.terminal import answering, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.features.trials.view_choices import STUDIES
-from drivers.base.clock import Clock, SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 
 if TYPE_CHECKING:
-    from beamline.core.events import Sink
-    from beamline.core.sinks import Warn
-    from beamline.features.trials.launch import TrialData
-    from beamline.features.trials.layout import TableLayout
-    from beamline.features.trials.runner import Planned
-    from beamline.features.trials.table import TrialTable
+    from beamline.features.trials.layout import Plan, TableLayout
+    from beamline.features.trials.runner import ComparedScan
+    from beamline.projections.scan_statistics import LightAsked
 
 
 def listed(value: str) -> tuple[str, ...]:
@@ -150,10 +147,10 @@ def tradeoff(request: TradeoffRequest) -> None:
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
-    from beamline.energies.scans import EnergyScans, read_spectra
+    from beamline.energies import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
+    from beamline.features.trials.tradeoff import planned_tradeoff
     from beamline.scan.energies import scans_of
 
     context, files = click.get_current_context(), request.files
@@ -168,41 +165,44 @@ def tradeoff(request: TradeoffRequest) -> None:
         scans = None
         if request.spectra is not None:
             scans = EnergyScans((source, *(each for each, _ in others)), read_spectra(request.spectra))
-        light = light_asked(request.values["photons_per_count"], request.values["dose_in"])
-        options = TradeoffOptions(
-            scan=ComparedScan(source, selection, folder, request.truth, light),
-            methods=request.methods or (),
-            several=SeveralVolumes(request.volumes or 0, scans, names_in(request.states)),
+        scan = ComparedScan(
+            source, selection, folder, request.methods or (), request.truth, _light(request), request.seconds,
+            request.max_seconds, request.seed, repeating(context, files, folder),
+        )  # fmt: skip
+        plan = partial(
+            planned_tradeoff,
+            scan,
             depth="quick" if request.quick else "full",
-            max_seconds=request.max_seconds,
-            seconds=request.seconds,
-            seed=request.seed,
-            command=repeating(context, files, folder),
+            volumes=request.volumes or 0,
+            scans=scans,
+            states=names_in(request.states),
         )
-    run = partial(run_tradeoff, options, begun=begun)
-    _compare(request, folder, TRADEOFF, partial(planned_tradeoff, options), run)
+    _compare(scan, TRADEOFF, plan, dry=request.dry, as_json=request.as_json, begun=begun)
+
+
+def _light(request: TradeoffRequest | StudyRequest) -> LightAsked | None:
+    return light_asked(request.values["photons_per_count"], request.values["dose_in"])
 
 
 def _compare(
-    request: TradeoffRequest | StudyRequest,
-    folder: Path,
-    layout: TableLayout,
-    plan: Callable[[Warn], tuple[TrialData, Planned]],
-    run: Callable[[Sink, Clock], TrialTable],
+    scan: ComparedScan, layout: TableLayout, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None
 ) -> None:
     """Run a comparison and print its table, or print what it will take."""
-    from beamline.features.trials.dry_run import print_dry_run
+    from beamline.core.durations import MachineSpeed
+    from beamline.features.trials.forecast import dry_run
     from beamline.features.trials.layout import text
+    from beamline.features.trials.runner import run_comparison
 
-    if request.dry:
-        print_dry_run(plan, folder, request.as_json)
-        return
-    with answering(request.as_json) as answer:
-        table = run(answer.sink, answer.clock)
-        answer.lines = text(table, layout), f"\n{'report':<10}{folder / layout.page}"
+    with answering(as_json) as answer:
+        if dry:
+            expected = dry_run(plan, scan.folder, answer.warn, MachineSpeed())
+            answer.done(expected, *expected.lines())
+            return
+        table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
+        answer.lines = text(table, layout), f"\n{'report':<10}{scan.folder / layout.page}"
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
-        raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {folder}.")
+        raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {scan.folder}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +271,7 @@ def study(request: StudyRequest) -> None:
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.study import StudyOptions, layout_of, planned_study, run_study
+    from beamline.features.trials.study import StudyOptions, layout_of, planned_study
 
     methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
@@ -279,16 +279,10 @@ def study(request: StudyRequest) -> None:
     settings = row_settings(context.command, methods, dict(request.values))
     source, selection = chosen(request.file, request.seed, request.values)
     folder = request.output or Path(f"{request.file.stem}_{request.which}")
-    light = light_asked(request.values["photons_per_count"], request.values["dose_in"])
-    options = StudyOptions(
-        scan=ComparedScan(source, selection, folder, request.truth, light),
-        study=STUDIES[request.which],
-        methods=methods,
-        settings=settings,
-        seconds=request.seconds,
-        filter=request.ramp,
-        draws=request.draws,
-        seed=request.seed,
+    scan = ComparedScan(
+        source, selection, folder, methods, request.truth, _light(request), request.seconds, seed=request.seed,
         command=repeating(context, request.file, folder),
-    )
-    _compare(request, folder, layout_of(options.study), partial(planned_study, options), partial(run_study, options))
+    )  # fmt: skip
+    options = StudyOptions(scan, STUDIES[request.which], settings, request.ramp, request.draws)
+    plan = partial(planned_study, options)
+    _compare(scan, layout_of(options.study), plan, dry=request.dry, as_json=request.as_json)

@@ -17,7 +17,9 @@ from beamline.config.load import load, plan_of, scene_mapping
 from beamline.core.errors import ConfigError
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
-from beamline.features.trials.runner import ComparedScan, OpenedScan
+from beamline.features.trials.launch import TrialData
+from beamline.features.trials.runner import ComparedScan, table_of
+from beamline.features.trials.table import TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, ViewChoice
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import axis_col_of, scene_of
@@ -114,7 +116,7 @@ class _Instrument:
             return _Taken(plan, prepared, seconds, instrument.truth(grid).data)
 
 
-def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[OpenedScan, list[ViewChoice]]:
+def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, Sequence[ViewChoice]]:
     """Scans by all plans as one set of views, with views held out that no plan took, and the views of each plan.
 
     Args:
@@ -162,9 +164,8 @@ def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[OpenedScan, list[ViewCh
         raise ConfigError(f"{scan.source.path}: no plan can be taken. {choices[-1].reason}")
     prepared = joined([each.prepared for each in taken])
     unseen = judge.prepared.projections.data, judge.prepared.geometry.seen_with(NO_WIDTH)
-    grid = Grid.matching(prepared.geometry)
-    facts = {"configuration": str(scan.source.path), "volume": " × ".join(map(str, grid.shape))}
-    return OpenedScan(facts, replace(prepared, held_out=unseen), grid, judge.truth, None), choices
+    data = TrialData(replace(prepared, held_out=unseen), judge.truth)
+    return data, table_of(scan, {"configuration": str(scan.source.path)}, prepared), choices
 
 
 def _choice(label: str, taken: _Taken, instrument: _Instrument, begun: int) -> ViewChoice:

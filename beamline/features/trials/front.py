@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 from beamline.features.trials.figures import cost_curves, pareto_plot
-from beamline.features.trials.layout import TableColumn, TableLayout, metric_column
-from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable, steps
+from beamline.features.trials.layout import TableColumn, TableLayout, in_digits
+from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.projections.scan_statistics import Light
 from beamline.report.html import Picture
@@ -29,27 +31,30 @@ class _Figure:
     shown: Callable[[float], str]
 
 
-def _digits(name: str) -> Callable[[float], str]:
-    return lambda value: f"{value:.{METRICS[name].digits}f}" if math.isfinite(value) else "undefined"
-
-
-def _period(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "none"
-
-
 _FIGURES = {
-    "psnr": _Figure("PSNR", "PSNR (dB)", "dB against the truth", _digits("psnr")),
-    "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", _digits("ssim3d")),
-    "rmse": _Figure("RMSE", "RMSE", "of the activity", _digits("rmse")),
-    "signal_to_background": _Figure("S/B", "signal/background", "hot regions over the body", _digits("recovery")),
-    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", _digits("sbr_error")),
-    "recovery": _Figure("hot", "contrast recovery", "contrast of hot regions over the truth's", _digits("recovery")),
-    "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", _digits("spillover")),
-    "variation": _Figure("noise", "noise", "standard deviation of the body over its level", _digits("variation")),
-    "residual_held_out": _Figure(
-        "held out", "held-out res.", METRICS["residual_held_out"].label, _digits("residual_held_out")
+    "psnr": _Figure("PSNR", "PSNR (dB)", "dB against the truth", partial(in_digits, "psnr")),
+    "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", partial(in_digits, "ssim3d")),
+    "rmse": _Figure("RMSE", "RMSE", "of the activity", partial(in_digits, "rmse")),
+    "signal_to_background": _Figure(
+        "S/B", "signal/background", "hot regions over the body", partial(in_digits, "recovery")
     ),
-    "resolution": _Figure("FSC", "FSC ({})", "period in {} to which two halves of the views agree", _period),
+    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", partial(in_digits, "sbr_error")),
+    "recovery": _Figure(
+        "hot", "contrast recovery", "contrast of hot regions over the truth's", partial(in_digits, "recovery")
+    ),
+    "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", partial(in_digits, "spillover")),
+    "variation": _Figure(
+        "noise", "noise", "standard deviation of the body over its level", partial(in_digits, "variation")
+    ),
+    "residual_held_out": _Figure(
+        "held out", "held-out res.", METRICS["residual_held_out"].label, partial(in_digits, "residual_held_out")
+    ),
+    "resolution": _Figure(
+        "FSC",
+        "FSC ({})",
+        "period in {} to which two halves of the views agree",
+        lambda value: f"{value:.3g}" if math.isfinite(value) else "none",
+    ),
 }
 
 _NEAR = 1.0  # dB below the best figure: a tenth more error
@@ -63,17 +68,28 @@ _FSC = (
 def _columns(table: TrialTable) -> Sequence[TableColumn]:
     settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
     return [
-        *(TableColumn(name, _of_trial(name)) for name in ("group", "method", "views", "binning")),
+        *(TableColumn(name, attrgetter(f"trial.{name}")) for name in ("group", "method", "views", "binning")),
         *(TableColumn(name, partial(_setting, name)) for name in settings),
         TableColumn("status", lambda o: o.status),
         TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
-        TableColumn("seconds", lambda o: o.seconds, "s", "s", shown=lambda o: _time(o.seconds)),
-        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: _time(o.cpu_seconds)),
-        TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0, lambda o: o.reached),
-        TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, _megabytes),
+        TableColumn("seconds", lambda o: o.seconds, "s", "s", words=_time),
+        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", words=_time),
+        TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0),
+        TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, lambda n: f"{n / 1e6:.0f}"),
         TableColumn("gaussians_end", lambda o: o.gaussians),
         *dose_columns(table),
-        *(_figure(name, table.length_unit) for name in _names(table)),
+        *(
+            TableColumn(
+                name,
+                partial(_metric, name),
+                figure.heading.format(table.length_unit),
+                figure.short,
+                9,
+                figure.shown,
+                metric=True,
+            )
+            for name, figure in _figures(table).items()
+        ),
         TableColumn("quality_db", lambda o: o.quality(table.by)),
         TableColumn("message", lambda o: o.message),
     ]
@@ -85,7 +101,7 @@ def _marked(table: TrialTable) -> set[int]:
 
 
 def _legend(table: TrialTable) -> Sequence[str]:
-    figures = [_FIGURES[name] for name in _names(table)]
+    figures = _figures(table).values()
     words = "; ".join(f"{each.short}: {each.legend.format(table.length_unit)}" for each in figures)
     return [*([f"{words}."] if words else []), "*: on the front of time and quality."]
 
@@ -144,23 +160,13 @@ def _setting(name: str, outcome: Outcome) -> Any:
     return outcome.trial.settings.get(name)
 
 
-def _of_trial(name: str) -> Callable[[Outcome], Any]:
-    return lambda outcome: getattr(outcome.trial, name)
+def _metric(name: str, outcome: Outcome) -> float | None:
+    return outcome.metrics.get(name)
 
 
-def _figure(name: str, length_unit: str) -> TableColumn:
-    figure = _FIGURES[name]
-    heading = figure.heading.format(length_unit)
-    return metric_column(name, lambda o: o.metrics.get(name), figure.shown, heading, figure.short, 9)
-
-
-def _names(table: TrialTable) -> list[str]:
+def _figures(table: TrialTable) -> dict[str, _Figure]:
     """Of the metrics that any trial has."""
-    return [name for name in _FIGURES if any(name in o.metrics for o in table.outcomes)]
-
-
-def _megabytes(outcome: Outcome) -> str:
-    return "n/a" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
+    return {name: figure for name, figure in _FIGURES.items() if any(name in o.metrics for o in table.outcomes)}
 
 
 def _time(seconds: float) -> str:
@@ -195,12 +201,11 @@ def conclusions(table: TrialTable) -> list[str]:
         words += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
     out = [f"{words}.", *out]
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
-    for stretch in steps(kept, seconds, qualities):
-        chance = "" if not table.quality.of_views else f" ± {table.chance(stretch.end, stretch.start):.2f}"
-        out.append(
-            f"+{stretch.gain:.2f}{chance} dB for {_duration(stretch.cost)} more "
-            f"({_duration(stretch.per_decibel)} a dB): {compared[stretch.end].trial.label}."
-        )
+    for i, j in pairwise(kept):
+        rise, cost = qualities[j] - qualities[i], seconds[j] - seconds[i]
+        chance = f" ± {table.chance(j, i):.2f}" * table.quality.of_views
+        price = f"{_duration(cost)} more ({_duration(cost / rise)} a dB)"
+        out.append(f"+{rise:.2f}{chance} dB for {price}: {compared[j].trial.label}.")
     out += _level(table, kept[-1])
     if any("resolution" in outcome.metrics for outcome in compared):
         out.append(_FSC)

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
+from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
-from beamline.core.process import ChildProcess, ProcessEnd, json_object, last_line, with_our_path
-from beamline.features.trials.trial import Outcome, Status, Trial
+from beamline.core.process import ProcessEnd, json_object, run_to_end
+from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from recon.base.arrays import F32, F64, I64
@@ -75,6 +76,8 @@ class TrialData:
     def save(self, folder: Path) -> None:
         """Into a new folder: each array in a .npy file, numbers and words in one of JSON, without how it was prepared.
 
+        Files `reference.METHOD.npy` and `data.regions.npy` may follow.
+
         Raises:
             DataError: the disk did not take it.
         """
@@ -121,16 +124,6 @@ class TrialData:
         return cls(prepared, **{"truth": None, **of("data")}, references=of("reference"))
 
 
-def write_reference(folder: Path, method: str, volume: F32) -> None:
-    """A volume that trials of the method are compared with, beside data that were saved."""
-    write_array(folder / f"reference.{method}.npy", volume)
-
-
-def write_regions(folder: Path, regions: NDArray[np.int8]) -> None:
-    """The dense and the empty regions, beside data that were saved."""
-    write_array(folder / "data.regions.npy", regions)
-
-
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
     """The views of a row of a study, each the mean of a window of views.
 
@@ -155,14 +148,8 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
         )
     counted = whole.weights
     least = None if counted is None else np.stack([counted[group].min(axis=0) for group in groups])
-    means = np.stack([_mean(np.asarray(whole.data[group])) for group in groups])
+    means = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
     return replace(middle, projections=replace(middle.projections, data=means, weights=least), geometry=geometry)
-
-
-def _mean(views: F32) -> F32:
-    """The line integrals [row, col] of the mean transmission of some views [view, row, col]."""
-    least = views.min(axis=0)  # taken out before the exponential, which would be 0 behind much matter
-    return np.asarray(least - np.log(np.exp(least - views).mean(axis=0)), np.float32)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -218,9 +205,7 @@ JOB = TypeAdapter(TrialJob)
 """Reads and writes a job as JSON."""
 
 
-def command(job: Path) -> Sequence[str]:
-    """The command that runs the job in the file `job`."""
-    return [sys.executable, "-m", "beamline.features.trials.worker", str(job)]
+COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 
 
 def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | None = None) -> None:
@@ -230,14 +215,13 @@ def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | No
         work: a folder with the data, `DATA`.
         max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
     """
-    kinds = {_kernels(trial): trial for trial in trials}
+    # a method and its settings that are words decide which kernels are compiled
+    kinds = {
+        (trial.method, *(value for value in trial.settings.values() if isinstance(value, str))): trial
+        for trial in trials
+    }
     job = TrialJob(work / DATA, compiled=tuple(kinds.values()))
     _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
-
-
-def _kernels(trial: Trial) -> tuple[str, ...]:
-    """A trial's method and its settings that are words: they decide which kernels it compiles."""
-    return trial.method, *(value for value in trial.settings.values() if isinstance(value, str))
 
 
 def run_trial(
@@ -253,48 +237,28 @@ def run_trial(
     Raises:
         DataError: the disk did not take the job or the volume: trials to come would fail, too.
     """
-    return _outcome(trial, _run(TrialJob(work / DATA, trial, seed, keep), work, max_seconds))
+    event, (ending, code, reason) = _run(TrialJob(work / DATA, trial, seed, keep), work, max_seconds)
+    if event.pop("event", None) == "result":
+        return Outcome(trial, "done", **event)
+    if ending is ProcessEnd.OUT_OF_TIME:
+        return Outcome(trial, "out of time", message="ended: the time given with --max-seconds was over")
+    message = event.get("message", f"its process ended with code {code}" + (f": {reason}" if reason else ""))
+    if code == DataError.exit_code:
+        raise DataError(message)
+    return Outcome(trial, "failed", message=message)
 
 
-@dataclass(frozen=True)
-class _Ended:
-    """A process that has ended: its last event, its exit code, the last line of its stderr, and whether its time was
-    over."""
-
-    event: Mapping[str, Any]
-    code: int | None
-    last_line: str
-    out_of_time: bool
-
-
-def _run(job: TrialJob, work: Path, max_seconds: float | None = None) -> _Ended:
-    path, log = work / "job.json", work / "stderr.txt"
+def _run(
+    job: TrialJob, work: Path, max_seconds: float | None
+) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
+    """The last event of a process that does the job, and how it ended, see `run_to_end`."""
+    path, events = work / "job.json", [dict[str, Any]()]
     with named_on_failure(path):
         path.write_bytes(JOB.dump_json(job))
-    last: dict[str, Any] = {}
 
-    def remember(line: str) -> None:
-        nonlocal last
-        last = json_object(line) or last
+    def on_line(line: str) -> None:
+        events.append(json_object(line) or events[-1])
 
-    with (
-        log.open("w", encoding="utf-8") as stderr,
-        ChildProcess(command(path), stderr, remember, with_our_path(), tether=True) as process,
-    ):
-        ending = process.wait(seconds=math.inf if max_seconds is None else max_seconds)
-    return _Ended(last, process.code, last_line(log), ending is ProcessEnd.OUT_OF_TIME)
-
-
-def _outcome(trial: Trial, ended: _Ended) -> Outcome:
-    event = dict(ended.event)
-    if event.pop("event", None) == "result":
-        curve = [(float(s), float(q)) for s, q in event.pop("curve", [])]
-        return Outcome(trial, "done", curve=tuple(curve), **event)
-    status: Status = "out of time" if ended.out_of_time else "failed"
-    if ended.out_of_time:
-        return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
-    default = f"its process ended with code {ended.code}" + (f": {ended.last_line}" if ended.last_line else "")
-    message = str(event.get("message", default))
-    if ended.code == DataError.exit_code:
-        raise DataError(message)
-    return Outcome(trial, status, math.nan, message=message)
+    limit = math.inf if max_seconds is None else max_seconds
+    ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=limit)
+    return events[-1], ended

@@ -10,14 +10,17 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from beamline.core.events import TrialDone
+from beamline.core.events import Event, TrialDone
 from beamline.core.files import write_whole
+from beamline.core.installed import version
 from beamline.core.machine import machine_line
-from beamline.core.shipped import version
+from beamline.core.sinks import Warn
 from beamline.core.text import csv_text
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome
+from beamline.features.trials.trial import Outcome, Trial
 from beamline.report.html import Picture, render
+from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 
 _WIDTH = 120  # characters
@@ -32,7 +35,7 @@ class TableColumn:
         value: plain, or None where it is not known.
         heading: on the page; empty: neither there nor in the text.
         short: in the text, `width` characters wide; 0: the last column, as wide as it needs.
-        shown: in words, of a trial that is done.
+        words: a value that is known, of a trial that is done, as text.
         metric: it is a figure of merit, which events tell, too.
     """
 
@@ -41,25 +44,20 @@ class TableColumn:
     heading: str = ""
     short: str = ""
     width: int = 8
-    shown: Callable[[Outcome], str] = lambda outcome: ""
+    words: Callable[[Any], str] = str
     metric: bool = False
 
+    def shown(self, outcome: Outcome) -> str:
+        """The value as text."""
+        known = self.value(outcome)
+        return "–" if known is None else self.words(known)
 
-def metric_column(
-    name: str,
-    value: Callable[[Outcome], float | None],
-    shown: Callable[[float], str],
-    heading: str,
-    short: str,
-    width: int,
-) -> TableColumn:
-    """The column of a figure of merit; `shown`: a value in words."""
 
-    def in_words(outcome: Outcome) -> str:
-        known = value(outcome)
-        return "–" if known is None else shown(known)
-
-    return TableColumn(name, value, heading, short, width, in_words, metric=True)
+def in_digits(metric: str, value: float) -> str:
+    """A figure with the digits of its metric; "equal" for the PSNR of two equal volumes."""
+    if math.isfinite(value):
+        return f"{value:.{METRICS[metric].digits}f}"
+    return "equal" if metric == "psnr" and value > 0 else "undefined"
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,29 @@ class TableLayout:
     question: str = ""
     marked: Callable[[TrialTable], Collection[int]] = lambda table: ()
     legend: Callable[[TrialTable], Sequence[str]] = lambda table: ()
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """What a comparison will do.
+
+    Attributes:
+        data: that all trials share.
+        table: before any trial is done.
+        started: the event that says so.
+        references: trials whose volumes others are compared with, in addition to the truth: each with those of its
+            method. The first one has the dense and the empty regions.
+    """
+
+    data: TrialData
+    table: TrialTable
+    layout: TableLayout
+    started: Event
+    references: tuple[Trial, ...] = ()
+
+
+Plan = Callable[[Warn], Planned]
+"""Reads and corrects the views of a scan, and says which trials to run. ConfigError, DataError: nothing was written."""
 
 
 def status_text(outcome: Outcome) -> str:

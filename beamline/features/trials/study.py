@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,24 +11,22 @@ from functools import partial
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Sink, StudyStarted
+from beamline.core.events import StudyStarted
 from beamline.core.files import REPORT
-from beamline.core.machine import machine
 from beamline.core.sinks import Warn
 from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.figures import against_cost, figures_of_rows
 from beamline.features.trials.front import dose_columns
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.layout import TableColumn, TableLayout, metric_column, records
-from beamline.features.trials.runner import ComparedScan, OpenedScan, Planned, RunLimits, opened_scan, run_comparison
+from beamline.features.trials.layout import Planned, TableColumn, TableLayout, in_digits, records
+from beamline.features.trials.runner import ComparedScan, opened_scan
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewChoice, ViewSet
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import dose_scale
 from beamline.report.html import Picture
-from beamline.report.metrics import METRICS, Metric
+from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
-from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32, F64
 from recon.base.choices import Filter
@@ -53,84 +50,73 @@ class StudyOptions:
 
     Attributes:
         scan: the study chooses from its views.
-        methods: names in `recon.methods`.
-        settings: of these methods, by name; methods left out have their own.
-        seconds: of each row, the same for all methods; None: methods end when their work is done.
+        settings: of its methods, by name; methods left out have their own.
         filter: of the FBP of all views.
         draws: how often random views are drawn.
     """
 
     scan: ComparedScan
     study: Study
-    methods: Sequence[str]
     settings: Mapping[str, Mapping[str, Plain]] = field(default_factory=dict)
-    seconds: float | None = None
     filter: Filter = "shepp-logan"
     draws: int = 3
-    seed: int = 0
-    command: str = ""
+
+    def trial(self, method: str, choice: ViewChoice) -> Trial:
+        """The reconstruction of these views by a method."""
+        settings = dict(self.settings.get(method, {}))
+        return Trial("method", method, choice.n_views, settings=settings, choice=choice).in_time(self.scan.seconds)
 
 
-def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> TrialTable:
-    """Run all rows of a study, see `run_comparison`."""
-    limits = RunLimits(options.scan.folder, options.seed)
-    return run_comparison(partial(planned_study, options), limits, sink, clock, now)
-
-
-def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned]:
+def planned_study(options: StudyOptions, warn: Warn) -> Planned:
     """Read and correct the views, and choose those of each row.
 
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    path, rows, regions = options.scan.source.path, options.study.rows, None
-    opened, choices = taken_scans(options.scan, warn) if rows is None else _chosen_views(options, rows, warn)
-    prepared, truth, geometry = opened.prepared, opened.truth is not None, opened.prepared.geometry
-    table = TrialTable(
-        tuple(_row(choice, method, options) for choice in choices for method in options.methods),
-        "psnr" if rows is None else "psnr_all",
-        prepared.length_unit,
-        machine(),
-        {**opened.facts, "views to choose from": str(geometry.n_views)},
-        options.command,
-        light=opened.light,
-        notes=_notes(options, geometry.n_views, truth),
+    scan, study = options.scan, options.study
+    if study.rows is None:
+        data, table, choices = taken_scans(scan, warn)
+    else:
+        data, table = opened_scan(scan, warn)
+        choices = study.rows(_view_set(options, data.prepared))
+    n_views = data.geometry.n_views
+    outcomes = tuple(
+        Outcome(options.trial(method, choice), "not run", message=choice.reason)
+        for choice in choices
+        for method in scan.methods
     )
+    notes = _notes(options, n_views, data.truth is not None)
+    by = "psnr" if study.rows is None else "psnr_all"
+    table = replace(table, outcomes=outcomes, by=by, notes=notes).with_fact("views to choose from", str(n_views))
     if not table.todo:
         raise DataError(
-            f"{path}: {geometry.n_views} views are too few for any row of {options.study.name}: "
+            f"{scan.source.path}: {n_views} views are too few for any row of {study.name}: "
             f"left out: {choices[-1].reason}. Take a scan with more views."
         )
     for choice in choices:
         if choice.groups is None:
             warn(f"{choice.label} is left out: {choice.reason}")
-    whole = ViewChoice(REFERENCE, [[view] for view in range(geometry.n_views)])
-    fbp = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
-    others = (
-        Trial("method", method, geometry.n_views, settings=dict(options.settings.get(method, {})), choice=whole)
-        for method in options.methods
-        if method != BASELINE
-    )
-    references = (fbp, *(trial.in_time(options.seconds) for trial in others))
-    started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
-    if opened.truth is not None and rows is None:
-        with suppress(ValueError):  # no contrast
-            regions = metrics.kmeans_mask(metrics.sampled(opened.truth), options.seed)
-        return TrialData(prepared, opened.truth, regions=regions), Planned(table, layout_of(options.study), started)
-    data = TrialData(replace(prepared, held_out=None), opened.truth)
-    return data, Planned(table, layout_of(options.study), started, references)
+    left_out = len(table.outcomes) - len(table.todo)
+    started = StudyStarted(scan.source.path, len(table.todo), left_out, study.name)
+    if study.rows is None:
+        if data.truth is not None:
+            with suppress(ValueError):  # no contrast
+                data = replace(data, regions=metrics.kmeans_mask(metrics.sampled(data.truth), scan.seed))
+        return Planned(data, table, layout_of(study), started)
+    whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
+    fbp = Trial("method", BASELINE, n_views, settings={"filter": options.filter}, choice=whole)
+    others = (options.trial(method, whole) for method in scan.methods if method != BASELINE)
+    data = replace(data, prepared=replace(data.prepared, held_out=None))
+    return Planned(data, table, layout_of(study), started, (fbp, *others))
 
 
-def _chosen_views(
-    options: StudyOptions, rows: Callable[[ViewSet], Sequence[ViewChoice]], warn: Warn
-) -> tuple[OpenedScan, Sequence[ViewChoice]]:
-    """A scan that was taken, and the views of it that each row has."""
-    opened = opened_scan(options.scan, warn)
-    geometry = opened.prepared.geometry
+def _view_set(options: StudyOptions, prepared: PreparedProjections) -> ViewSet:
+    """The views of a scan that was taken, which rows choose from."""
+    geometry = prepared.geometry
     turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
     places = np.concatenate((geometry.shifts, turns), axis=1)
-    clear = clearest(np.mod(geometry.angles, geometry.period), opened.prepared.projections.data)
-    return opened, rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places, clear))
+    clear = clearest(np.mod(geometry.angles, geometry.period), prepared.projections.data)
+    return ViewSet(geometry.angles, geometry.period, options.scan.seed, options.draws, places, clear)
 
 
 def clearest(angles: F64, lines: F32) -> int:
@@ -146,12 +132,6 @@ def clearest(angles: F64, lines: F32) -> int:
     counts = near.sum(axis=1)
     means = np.divide(near @ dense, counts, out=np.full(middles.size, np.inf), where=counts > 0)
     return int(middles[np.argmin(means)])
-
-
-def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
-    """A row before it is done."""
-    trial = Trial("method", method, choice.n_views, settings=dict(options.settings.get(method, {})), choice=choice)
-    return Outcome(trial.in_time(options.seconds), "not run", message=choice.reason)
 
 
 def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
@@ -175,8 +155,8 @@ def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
     for method, settings in options.settings.items():
         if settings:
             notes.append(f"{method}: {', '.join(f'{name} {value}' for name, value in settings.items())}.")
-    if options.seconds is not None:
-        notes.append(f"Each row had {options.seconds:g} s; direct methods take what they take.")
+    if (seconds := options.scan.seconds) is not None:
+        notes.append(f"Each row had {seconds:g} s; direct methods take what they take.")
     if truth and options.study.rows is not None:
         notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
     return notes
@@ -201,13 +181,24 @@ def _columns(table: TrialTable) -> Sequence[TableColumn]:
         TableColumn("window", lambda o: _choice(o).window),
         TableColumn("frames", lambda o: o.trial.frames),
         *dose_columns(table),
-        *(TableColumn(name, partial(_fact, name), name, name, 11, partial(_fact_text, name)) for name in _facts(table)),
+        *(TableColumn(name, partial(_fact, name), name, name, 11, "{:.4g}".format) for name in _facts(table)),
         TableColumn("status", lambda o: o.status),
-        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
-        TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
-        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"),
-        TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
-        *(_figure(name, name in shown) for name in _FIGURES),
+        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, "{:g}".format),
+        TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", words="{:.1f}".format),
+        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", words="{:.1f}".format),
+        TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0),
+        *(
+            TableColumn(
+                name,
+                partial(value_of, name),
+                words * (name in shown),
+                words,
+                12,
+                partial(in_digits, metric),
+                metric=True,
+            )
+            for name, (words, metric) in _FIGURES.items()
+        ),
         TableColumn("message", lambda o: o.message),
     ]
 
@@ -216,7 +207,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
     pictures, figures = [], names(table)
     if table.compared:
         caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
-        axes = {name: _FIGURES[name][0] + " (dB)" * bool(_metric(name).unit) for name in figures}
+        axes = {name: words + " (dB)" * bool(METRICS[metric].unit) for name, (words, metric) in _FIGURES.items()}
         picture = figures_of_rows(table, {axes[name]: partial(value_of, name) for name in figures})
         pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
         first = "psnr_truth" if "psnr_truth" in figures else figures[0]
@@ -250,10 +241,6 @@ def _fact(name: str, outcome: Outcome) -> float:
     return _choice(outcome).facts.get(name, math.nan)
 
 
-def _fact_text(name: str, outcome: Outcome) -> str:
-    return f"{_fact(name, outcome):.4g}"
-
-
 def value_of(name: str, outcome: Outcome) -> float | None:
     """A figure of a row; None where it is not known."""
     return outcome.metrics.get(_MEASURED.get(name, name))
@@ -262,29 +249,6 @@ def value_of(name: str, outcome: Outcome) -> float | None:
 def names(table: TrialTable) -> list[str]:
     """Figures that any row has."""
     return [name for name in _FIGURES if any(value_of(name, outcome) is not None for outcome in table.outcomes)]
-
-
-def _metric(name: str) -> Metric:
-    return METRICS[_FIGURES[name][1]]
-
-
-def formatted(name: str, value: float) -> str:
-    """A figure with its digits; "equal" for the PSNR of two equal volumes."""
-    metric = _metric(name)
-    if math.isfinite(value):
-        return f"{value:.{metric.digits}f}"
-    return "equal" if metric is METRICS["psnr"] and value > 0 else "undefined"
-
-
-def _figure(name: str, shown: bool) -> TableColumn:
-    heading = _FIGURES[name][0]
-
-    return metric_column(name, partial(value_of, name), partial(formatted, name), heading * shown, heading, 12)
-
-
-def _asked(outcome: Outcome) -> str:
-    seconds = outcome.trial.seconds_asked
-    return "–" if seconds is None else f"{seconds:g}"
 
 
 def draws(table: TrialTable) -> list[str]:
@@ -296,7 +260,8 @@ def draws(table: TrialTable) -> list[str]:
         parts = []
         for name in names(table):
             values = [value for o in rows if (value := value_of(name, o)) is not None]
-            low, high = formatted(name, min(values)), formatted(name, max(values))
-            parts.append(f"{_FIGURES[name][0]} {formatted(name, float(np.mean(values)))} ({low} to {high})")
+            words, metric = _FIGURES[name]
+            mean, low, high = (in_digits(metric, float(of(values))) for of in (np.mean, min, max))
+            parts.append(f"{words} {mean} ({low} to {high})")
         sentences.append(f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}.")
     return sentences

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -69,6 +68,10 @@ class TrialTable:
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         """The table with this outcome in place of the one of this number."""
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
+
+    def with_fact(self, name: str, value: str) -> TrialTable:
+        """The table with one more fact about the scan."""
+        return replace(self, scan={**self.scan, name: value})
 
     @property
     def n_done(self) -> int:
@@ -164,30 +167,3 @@ def front(
         if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
             kept.append(i)
     return kept
-
-
-@dataclass(frozen=True)
-class Step:
-    """From one point of a front to the next.
-
-    Attributes:
-        start, end: positions of the points.
-        cost: extra cost of the second point.
-        gain: its extra quality, dB.
-    """
-
-    start: int
-    end: int
-    cost: float
-    gain: float
-
-    @property
-    def per_decibel(self) -> float:
-        """The cost of a dB on this step."""
-        return self.cost / self.gain
-
-
-def steps(kept: Sequence[int], costs: Sequence[float], qualities: Sequence[float]) -> list[Step]:
-    """The steps along a front, by rising cost; none if it has fewer than two points."""
-    pairs = itertools.pairwise(kept)
-    return [Step(a, b, costs[b] - costs[a], qualities[b] - qualities[a]) for a, b in pairs]

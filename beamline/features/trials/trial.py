@@ -50,11 +50,6 @@ class Trial:
         return by_name(self.method).traits.several
 
     @property
-    def direct(self) -> bool:
-        """Its method makes one pass without iterations."""
-        return by_name(self.method).traits.direct
-
-    @property
     def left_out(self) -> bool:
         """The scan has not the views that it asks for."""
         return self.choice is not None and self.choice.groups is None

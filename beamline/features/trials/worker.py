@@ -1,8 +1,8 @@
 """One trial in a process of its own, so that its peak memory is its own.
 
-`python -m beamline.features.trials.worker JOB` reads the job and its arrays, and says progress and the result as
-lines of JSON on stdout. A job may also be to compile what trials will need, once for all of them: compiling takes
-memory that would otherwise count as the first trial's. Its stdin is a pipe that nothing is written to: when it ends,
+`python -m beamline.features.trials.worker JOB` reads the job and its arrays, and prints the result as JSON. A job may
+also be to compile what trials will need, once for all of them: compiling takes memory that would otherwise count as
+the first trial's. Its stdin is a pipe that nothing is written to: when it ends,
 the parent process has ended, and this one ends, too.
 """
 
@@ -14,7 +14,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-import recon
 from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
@@ -40,22 +39,17 @@ from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
+from recon.features.trials import fourier_shell_correlation, soft_cylinder
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution
 from recon.warm_up import warm_up
-
-Say = Callable[[Mapping[str, Any]], None]
-
-_SAY_EVERY = 0.5  # s
 
 
 def run(
     trial: Trial,
     data: TrialData,
     seed: int,
-    say: Say,
     now: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
     keep: Path | None = None,
@@ -71,22 +65,25 @@ def run(
     """
     if trial.choice is not None:
         prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
-        prepared = replace(prepared, geometry=_turning(prepared.geometry, trial.choice.arc))
+        if arc := trial.choice.arc:
+            views = prepared.geometry
+            prepared = replace(prepared, geometry=views.seen_with(replace(views.width, arc=arc), views.skew))
     else:
         angles, period = data.geometry.angles, data.geometry.period
         prepared = data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
     grid, result, judged, warned = Grid.matching(data.geometry), None, None, list[warnings.WarningMessage]()
-    ready(trial, data.geometry)
+    warm_up(trial.build(), data.geometry)  # so that compilation is in no trial's time
     reset_peak_memory()
     before, began = cpu(), now()
     if trial.parts > 1:
         volume_at = by_parts(trial.parts, data, lambda part: _alone(trial, part, grid, seed))
     else:
-        control = ended_in_time(trial, now, _progress(say, now))
+        control = ended_in_time(trial, now)
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             result = reconstruct(trial, prepared, grid, seed, control)
-        volume_at = result.at or _always(on_grid(result.volume, grid).data)
+        one = on_grid(result.volume, grid).data
+        volume_at = result.at or (lambda view: one)
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
@@ -141,25 +138,6 @@ def measured(
     return figures, squared
 
 
-def _turning(geometry: Geometry, arc: float) -> Geometry:
-    """The geometry of views whose stage turned by `arc` radians in an exposure; without any, as it is."""
-    return geometry.seen_with(replace(geometry.width, arc=arc), geometry.skew) if arc else geometry
-
-
-def _always(volume: F32) -> VolumeAt:
-    """The one volume, whenever a view was taken."""
-    return lambda view: volume
-
-
-def ready(trial: Trial, geometry: Geometry) -> None:
-    """Load what the trial needs, on a toy of the same kind, so that compilation is in no trial's time.
-
-    Raises:
-        ValueError: the method does not take such views.
-    """
-    warm_up(trial.build(), geometry)
-
-
 def _alone(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> F32:
     """The volume [z, y, x] of these views alone, with no view held out."""
     result = reconstruct(trial, replace(prepared, held_out=None), grid, seed, ended_in_time(trial))
@@ -195,13 +173,9 @@ def reconstruct(
     return run_on(method, views, target, seed, control)
 
 
-def ended_in_time(
-    trial: Trial,
-    now: Callable[[], float] = time.perf_counter,
-    on_progress: Callable[[recon.Progress], None] | None = None,
-) -> RunControl:
+def ended_in_time(trial: Trial, now: Callable[[], float] = time.perf_counter) -> RunControl:
     """The control of a reconstruction that begins now, and ends when the trial's seconds, if any, are over."""
-    control = RunControl(on_progress=on_progress, now=now)
+    control = RunControl(now=now)
     return control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
 
 
@@ -218,53 +192,28 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
     """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
     if volume.grid == grid:
         return volume
-    index = [
-        (there - here[0]) / edge
-        for there, here, edge in zip(grid.coordinates(), volume.grid.coordinates(), volume.grid.spacing, strict=True)
-    ]
-    out = np.empty(grid.shape, np.float32)
-    plane = np.meshgrid(index[1], index[2], indexing="ij")
-    for k, height in enumerate(index[0]):
-        where = np.stack((np.full_like(plane[0], height), *plane))
-        ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
-    return Volume(out, grid)
-
-
-def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
-    reported = -math.inf
-
-    def on_progress(progress: recon.Progress) -> None:
-        nonlocal reported
-        if now() - reported >= _SAY_EVERY:
-            reported = now()
-            say({"event": "progress", "step": progress.step, "steps": progress.steps})
-
-    return on_progress
+    edges = volume.grid.spacing
+    scale, offset = np.divide(grid.spacing, edges), np.subtract(grid.first, volume.grid.first) / edges
+    data = ndimage.affine_transform(volume.data, scale, offset, grid.shape, np.float32, order=1, mode="nearest")
+    return Volume(data, grid)
 
 
 def main(job: Path) -> int:
-    """Run the `TrialJob` in the file `job`."""
-
-    def say(line: Mapping[str, Any]) -> None:
-        print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
-
-    work = JOB.validate_json(job.read_bytes())
+    """Do the `TrialJob` in the file `job`, and print an event; the exit code."""
+    work, code = JOB.validate_json(job.read_bytes()), 0
     try:
         data = TrialData.load(work.data)
         for trial in work.compiled:
             with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                ready(trial, data.geometry)
+                warm_up(trial.build(), data.geometry)
         if work.trial is None:
             return 0
-        result = run(work.trial, data, work.seed, say, keep=work.keep)
-    except ValueError as error:
-        say({"event": "failed", "message": str(error)})
-        return 1
-    except DataError as error:  # the disk
-        say({"event": "failed", "message": str(error)})
-        return error.exit_code
-    say({"event": "result", **result})
-    return 0
+        event = {"event": "result", **run(work.trial, data, work.seed, keep=work.keep)}
+    except (ValueError, DataError) as error:  # DataError: the disk
+        code = error.exit_code if isinstance(error, DataError) else 1
+        event = {"event": "failed", "message": str(error)}
+    print(json.dumps(event), flush=True)  # noqa: T201 - stdout is this process's only way out
+    return code
 
 
 if __name__ == "__main__":

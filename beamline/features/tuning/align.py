@@ -17,7 +17,7 @@ from beamline.features.tuning.tune import mean_counts, static_block, take
 from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.plan import Block, Mode
 from drivers.base.frame import Frame, FrameKind
-from recon.features.tuning.pair import align_pair, finest_structure
+from recon.features.tuning import align_pair, finest_structure
 from recon.prep.align import AxisError
 
 N = 4

@@ -20,7 +20,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.core.voxel_kind import VoxelKind
-from beamline.energies.scans import Spectra
+from beamline.energies import Spectra
 from beamline.reconstruct.memory import SHARE
 from beamline.report.figures import downwards, dpi_for, new_figure, planes, png
 from beamline.storage.readers.open import open_scan

@@ -219,7 +219,7 @@ def _charge_map(
 ) -> None:
     """`--volume`: the state-of-charge map, and its picture."""
     from beamline.core.files import refuse_existing, remove, write_whole
-    from beamline.energies.scans import read_spectra
+    from beamline.energies import read_spectra
     from beamline.features.xafs.charge_map import charge_map, picture
     from beamline.storage.volumes.files import write_volume
 

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError
 from beamline.core.events import Counted, Sink
-from beamline.core.machine_speed import seconds_left
 from beamline.features.xafs.contrast import ContrastRegions, XafsCurve, contrast_of, curve_of
 from beamline.storage import hdf5
 from drivers.base.clock import Clock

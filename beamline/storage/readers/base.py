@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.digest import LARGEST
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import Mask
 

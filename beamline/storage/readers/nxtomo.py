@@ -45,8 +45,7 @@ from beamline.storage.readers.nexus import (
 )
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
-from beamline.storage.writers.rows import altered_rows, require_earlier
+from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import Mask
 

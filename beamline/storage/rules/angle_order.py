@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, coarse_views
-from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import VIEWS
 from recon.base.views import spread
 

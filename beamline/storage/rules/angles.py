@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.finding import Finding, Severity
+from beamline.storage.rules import Finding, Severity
 from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups
 from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind

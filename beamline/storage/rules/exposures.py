@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.monitor.references import ReferenceFrame
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.wrapped import in_words, of_energies
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.prep.references import dark_at

@@ -12,8 +12,8 @@ from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, lit_places, noise_o
 from beamline.monitor.odd_references import LIT
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
+from beamline.storage.rules import Finding
 from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure, views_differ
-from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import (
     ReferenceGroups,
     cells_of,

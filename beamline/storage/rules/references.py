@@ -15,6 +15,7 @@ from beamline.core.text import spans
 from beamline.monitor.digest import block_means, check_block, is_valid
 from beamline.monitor.flats_with_sample import (
     brighter_in_places,
+    depth_over_air,
     flats_like_views,
     lit_places,
     mass_missing,
@@ -32,8 +33,8 @@ from beamline.monitor.references import (
     judge,
 )
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules import Finding
 from beamline.storage.rules.exposures import levelled, usual_exposure, views_differ
-from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 
@@ -132,8 +133,8 @@ def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGrou
         groups_judged += judge([*dark, *own], limits, witnesses)[len(dark) :]
     alike, brighter = None, None
     if lit and not any(group.faults for group in groups_judged[len(dark) :]):
-        alike = nothing_seen(lit, dark, views)
-        fault = flats_like_views(lit, dark, views) or mass_missing(lit, dark, views)
+        depth = depth_over_air(lit, dark, views)
+        alike, fault = nothing_seen(depth), flats_like_views(lit, dark, views, depth) or mass_missing(depth)
         if fault is not None:
             groups_judged = [
                 replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in groups_judged

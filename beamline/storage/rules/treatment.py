@@ -15,7 +15,7 @@ from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord

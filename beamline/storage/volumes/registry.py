@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.storage.volumes.entry import FormatEntry
+from beamline.storage.volumes import FormatEntry
 from recon.base.registry import Registry, in_folders
 
 if TYPE_CHECKING:

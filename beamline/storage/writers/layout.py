@@ -38,7 +38,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import preview_shape
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, VALID, write_legend

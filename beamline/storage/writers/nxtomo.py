@@ -30,9 +30,16 @@ from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import STATUSES, ScanEnding, state_ending, state_words, with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
-from beamline.storage.writers.rows import Record, Rows
+from beamline.storage.writers.rows import (
+    STATUSES,
+    Record,
+    Rows,
+    ScanEnding,
+    state_ending,
+    state_words,
+    with_exchange_view,
+)
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame
 from drivers.base.protocols import BeamReading

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
-from beamline.core.shipped import version
+from beamline.core.installed import version
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import datasets, hdf5
 from beamline.storage.recon_record import ReconRecord as ReconRecord

@@ -18,8 +18,7 @@ from drivers.epics.channel import OPENERS, PvValue
 from drivers.stages.epics.stage import EpicsSettings
 from simulators.devices.motor import Ended, PulseMotor
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.serial_url import SCHEME, plugged
-from simulators.wires.wire import BytesWire
+from simulators.wires.wire import SCHEME, BytesWire, plugged
 
 CHOICES = {".SPMG": ("Stop", "Pause", "Move", "Go"), ".SET": ("Use", "Set")}
 DONE, AT_HIGH, PROBLEM, AT_LOW, HOMED = 0x2, 0x4, 0x200, 0x2000, 0x4000  # Bits of MSTA

@@ -14,7 +14,7 @@ import pytest
 
 from beamline.features.files.nexus import nexus_findings
 from beamline.instrument.connect import connect
-from beamline.storage.writers.ending import ScanEnding, ending_in
+from beamline.storage.writers.rows import ScanEnding, ending_in
 from drivers.base.protocols import TriggerTrain
 from tests.beamline import ran
 from tests.beamline.ball_scan import small

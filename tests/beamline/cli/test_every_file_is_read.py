@@ -12,7 +12,7 @@ import pytest
 
 from beamline.page.volume import ShownVolume
 from beamline.reconstruct.measure import read_truth
-from beamline.simulate.labels import volumes_beside
+from beamline.simulate import volumes_beside
 from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline, succeeds
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged

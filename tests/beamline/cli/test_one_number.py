@@ -23,6 +23,7 @@ from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
 from tests.beamline.array_source import ArraySource
 from tests.beamline.cli.small_scan import SCAN, beamline, succeeds
+from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import write_exchange
 from tests.clock import SteppedClock
 
@@ -42,10 +43,10 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
     by_recon = measure(volume, prepared, None)["residual_held_out"]
     assert prepared.held_out is not None and prepared.held_out_ids is not None
-    data, unseen = prepared.held_out
-    projector = Projector(unseen, grid)
-    views = sweep.HeldOutViews(prepared.held_out_ids, data, prepared)
-    one = sweep.SweptSlice({"a": "1"}, volume.data[0], 0.0, views, projector.forward(volume.data), projector.resolution)
+    projector = Projector(prepared.held_out[1], grid)
+    one = sweep.SweptSlice(
+        {"a": "1"}, volume.data[0], 0.0, prepared, projector.forward(volume.data), projector.resolution
+    )
     scores = sweep.scores_of([one])
     assert scores is not None
     by_tradeoff, _ = worker.measured("fbp", lambda _: volume.data, data_of.TrialData(prepared, None), grid, None)
@@ -137,8 +138,9 @@ def test_what_was_done_is_a_note_and_what_may_be_wrong_a_warning() -> None:
 
 def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
     sweep = pytest.importorskip(SWEEP)
-    views = sweep.HeldOutViews(np.arange(4), np.ones((4, 2, 8), np.float32), None)  # type: ignore[arg-type]
     image, views_at = np.zeros((8, 8), np.float32), Geometry.parallel(np.arange(4.0), (2, 8))
+    lines = np.ones((4, 2, 8), np.float32)
+    views = prepared_views(lines, views_at, held_out=(lines, views_at), held_out_ids=np.arange(4))
     even = ViewResolution.of(views_at, Grid.matching(views_at))
 
     def leaving(share: float) -> object:

@@ -7,13 +7,13 @@ import pytest
 import yaml
 
 from beamline.config.load import Config, config_folder, load
+from beamline.config.stages import STAGES
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
-from drivers.stages.registry import STAGES
 from tests.slow_cases import others_slow
 
 INSTRUMENT = config_folder() / "instrument.yaml"

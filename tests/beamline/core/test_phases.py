@@ -2,8 +2,8 @@
 
 import pytest
 
+from beamline.core.durations import Phases
 from beamline.core.events import Event
-from beamline.core.phases import Phases
 from tests.clock import SteppedClock
 
 

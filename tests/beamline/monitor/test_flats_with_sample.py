@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from beamline.storage.rules.references import references_usable
 from tests.beamline.array_source import ArraySource
 

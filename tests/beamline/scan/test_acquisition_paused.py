@@ -14,7 +14,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
-from beamline.scan.states import State, StateMachine
+from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import Supervision
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame

@@ -20,12 +20,12 @@ from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
-from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
 from simulators.scenes.scene import load_scene
 from simulators.wires.pm16c.box import BoxBuild
 from simulators.wires.pm16c.wire import PM16CBuild
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 
 N = 24
 SETTINGS = CameraSettings(0.02, TriggerSource.EXTERNAL, roi=(1148, 2044, 8, 8))

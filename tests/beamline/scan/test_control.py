@@ -14,8 +14,7 @@ from beamline.core.events import Event
 from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
 from beamline.scan import control
-from beamline.scan.control import Verb, running, state_of, tell, verbs_taken
-from beamline.scan.states import State
+from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran

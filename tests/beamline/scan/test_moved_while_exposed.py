@@ -23,7 +23,7 @@ from beamline.scan.run import run_scan
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import Camera
-from simulators.wires.serial_url import plugged
+from simulators.wires.wire import plugged
 from tests.beamline.ball_scan import COMMON, STAGES, small
 
 KINDS = {name: STAGES[name] for name in ("pm16c", "pi_gcs", "zaber")} | {

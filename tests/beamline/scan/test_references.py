@@ -16,9 +16,9 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.scan.control import State
 from beamline.scan.references import ReferenceLog
 from beamline.scan.run import run_scan
-from beamline.scan.states import State
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline import fakes

@@ -23,10 +23,9 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.views import checked_views
 from beamline.scan import control
-from beamline.scan.control import Verb, running, tell
+from beamline.scan.control import State, Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import run_scan
-from beamline.scan.states import State
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.changed import OverlaidSource

@@ -20,9 +20,9 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
 from beamline.scan import run as run_module
+from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
-from beamline.scan.states import State
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.scan.states import NEXT, State, StateMachine
+from beamline.scan.control import NEXT, State, StateMachine
 
 PAGE = Path(__file__).parents[3] / "docs" / "states.md"
 ENDS = {State.DONE, State.STOPPED, State.ABORTED, State.FAILED}

@@ -16,9 +16,8 @@ from beamline.api.instrument import Instrument
 from beamline.config.load import Config
 from beamline.core.errors import ScanStopped
 from beamline.core.stop import StopRequest, stop_signals
-from beamline.scan.control import Verb, ask, tell
+from beamline.scan.control import State, StateMachine, Verb, ask, tell
 from beamline.scan.run import run_scan
-from beamline.scan.states import State, StateMachine
 from tests.beamline.fakes import HOME, FakeInstrument
 from tests.beamline.features.page.served import served
 from tests.beamline.ran import small

@@ -18,7 +18,7 @@ from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
-from beamline.scan.states import State
+from beamline.scan.control import State
 from beamline.scan.supervision import (
     AlarmReaction,
     BacklogGuard,

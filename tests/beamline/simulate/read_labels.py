@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from beamline.simulate.labels import LabelledRun
+from beamline.simulate import LabelledRun
 
 
 def read_labels(path: Path) -> tuple[LabelledRun, ...]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
+from beamline.simulate import LabelledRun, LabelLog, labels_path, write_labels
 from simulators.effects.chain import Label
 from tests.beamline.simulate.read_labels import read_labels
 

@@ -23,8 +23,8 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
 from beamline.storage.rules.scan import scan_ended
 from beamline.storage.writer_lock import QUIET
-from beamline.storage.writers.ending import DIED, ScanEnding
 from beamline.storage.writers.nxtomo import NXtomoWriter
+from beamline.storage.writers.rows import DIED, ScanEnding
 from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE
 from tests.clock import SteppedClock

@@ -18,7 +18,7 @@ from beamline.core.events import KINDS
 from beamline.features.files.ingest import ingest
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS
 from beamline.monitor.digest import digest
-from beamline.simulate.labels import LabelledRun, write_labels
+from beamline.simulate import LabelledRun, write_labels
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor
-from drivers.beam_monitors.reading import TextBeamMonitor
+from drivers.beam_monitors import TextBeamMonitor
 from drivers.epics.devices import PvSource
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
 

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import BeamMonitor, BeamReading
-from drivers.beam_monitors.reading import PATTERN, ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor
+from drivers.beam_monitors import PATTERN, ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor
 from simulators.devices.clock import VirtualClock
-from simulators.wires.electrometer.wire import OVER_RANGE, ElectrometerWire
-from simulators.wires.serial_url import register
+from simulators.wires.electrometer import OVER_RANGE, ElectrometerWire
+from simulators.wires.wire import register
 
 RING = "Ring current: ([-+0-9.eE]+) mA"
 

@@ -19,11 +19,11 @@ from drivers.orca_quest import DcamOptions
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures
-from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.box import BoxBuild
 from simulators.wires.pm16c.wire import PM16CBuild
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.dcam.fake import World
 
 SENSOR = (64, 64)

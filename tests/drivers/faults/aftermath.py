@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from beamline.scan.control import State
 from beamline.scan.run import SAFE, UNSAFE
-from beamline.scan.states import State
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned

@@ -37,7 +37,7 @@ from drivers.base.frame import Frame, FrameKind
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers.dcam.fake import World
 from tests.drivers.stages.flat_settings import flat

@@ -16,7 +16,7 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import LONGEST_REPLY, Framing
 from simulators.devices.clock import VirtualClock
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 
 NAMES = (f"framing-test-{number}" for number in itertools.count())
 GCS = Framing(command_end=b"\n", line_end=b"\n", continued=" ")

@@ -16,7 +16,7 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import RECENT_LINES
 from simulators.devices.clock import VirtualClock
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 
 NAMES = (f"line-test-{number}" for number in itertools.count())
 NUMBER = r"-?\d+"

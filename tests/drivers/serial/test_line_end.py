@@ -21,8 +21,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.serial.line import LineRules, Probe, SerialLine
 from simulators.devices.clock import VirtualClock
-from simulators.wires.serial_url import register
-from simulators.wires.wire import Wire
+from simulators.wires.wire import Wire, register
 from tests.simulators.wires.transports import serve_pty, serve_tcp
 
 NAMES = (f"line-end-test-{number}" for number in itertools.count())

@@ -11,7 +11,7 @@ from drivers.base.errors import DeviceError
 from drivers.serial.line import QUIET, LineRules, Probe, SerialLine
 from drivers.serial.line_reader import Framing
 from simulators.devices.clock import VirtualClock
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans
 
 NAMES = (f"fuzz-line-{number}" for number in itertools.count())

@@ -22,8 +22,7 @@ from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import ScaledClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
-from simulators.wires.serial_url import register
-from simulators.wires.wire import Wire
+from simulators.wires.wire import Wire, register
 from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers import zaber_rig
 from tests.drivers.stages import pi_gcs_rig

@@ -10,7 +10,7 @@ from drivers.base.clock import Clock
 from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"stage-test-{number}" for number in itertools.count())

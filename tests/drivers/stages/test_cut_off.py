@@ -9,7 +9,7 @@ import pytest
 
 from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.testing.stages.bench import LONG, SPEED
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.stages.rig import NAMES, StageRig
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
 

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.base.errors import DeviceError
 from drivers.testing.stages.bench import LONG, SPEED
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.stages.rig import NAMES, StageRig
 from tests.drivers.stages.rigs import RigOf, every_stage
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from recon.compiled import ROOT, archive
+from recon.compiled import ROOT, archive, level_for, processor_flags
 from recon.compiled.archive import (
     ARCHIVE,
     carried,
@@ -24,7 +24,6 @@ from recon.compiled.archive import (
     unsealed,
     write_archive,
 )
-from recon.compiled.level import level_for, processor_flags
 
 KERNEL = """
 from numba import njit

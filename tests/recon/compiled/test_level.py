@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from beamline.core.process import with_our_path
-from recon.compiled.level import BASELINE, LEVELS, V3, V4, level_for, processor_flags
+from recon.compiled import BASELINE, LEVELS, V3, V4, level_for, processor_flags
 
 ZEN_2 = V3.flags | {"sha_ni", "sse4a"}
 

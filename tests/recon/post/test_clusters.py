@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.post.enhance import clusters, elbow, k_means
+from recon.post import clusters, elbow, k_means
 
 
 @settings(max_examples=25)

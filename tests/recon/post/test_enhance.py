@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from recon.post.enhance import enhanced, inscribed_box, rescaled, sample_circle
+from recon.post import enhanced, inscribed_box, rescaled, sample_circle
 from tests.recon.post.phantom import CIRCLE, SHAPE, WALL, can
 
 

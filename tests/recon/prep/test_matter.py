@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xraylib
 
-from recon.features.beam_hardening.curve import curve_of_spectrum
+from recon.features.beam_hardening import curve_of_spectrum
 from recon.prep.matter import KNOWN, absorbed_dose, delta_beta, mass_attenuation, tube_spectrum
 from simulators.light.beam import Beam, Tube
 from simulators.samples.materials.materials import Palette

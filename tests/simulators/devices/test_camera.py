@@ -17,9 +17,9 @@ from drivers.base.protocols import CameraFrame, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
-from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.frame.sensor import CONVERSION
+from simulators.effects.sensor import CONVERSION
 from simulators.scenes.scene import load_scene
 from tests.drivers.orca_bench import SETTINGS, orca_bench, says_what_an_orca_says
 from tests.simulators import chance

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
-from simulators.devices.camera_view import CameraView, Exposed
+from simulators.devices.in_beam import CameraView, Exposed
 from simulators.scenes.expose import Scan
 from tests.simulators import shots
 

@@ -9,7 +9,7 @@ import numpy as np
 from drivers.base.protocols import TriggerSource
 from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
-from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
 from tests.drivers.orca_bench import SETTINGS
 from tests.simulators import shots

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drivers.base.protocols import SampleMover, Shutter
-from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 
 
 def test_a_shutter_starts_closed_and_follows() -> None:

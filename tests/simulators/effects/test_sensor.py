@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
+from simulators.effects import sensor
 from simulators.effects.sensor import (
     FEW,
     Adc,
@@ -20,9 +21,8 @@ from simulators.effects.sensor import (
     QuantumEfficiency,
     ReadNoise,
     Saturation,
+    digitise,
 )
-from simulators.frame import sensor
-from simulators.frame.sensor import digitise
 from simulators.frame.shot import CannotExposeError
 from tests.simulators import chance, shots
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import serial
 
-from drivers.stages.registry import STAGES
+from beamline.config.stages import STAGES
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
 from simulators.wires.registry import WIRES
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 
 
 def _pm16c() -> PM16CController:

@@ -10,7 +10,7 @@ from pydantic import Field, PositiveInt
 from beamline.config.beam import BeamMonitorSection
 from beamline.config.section import without
 from drivers.base.clock import Clock
-from drivers.beam_monitors.reading import (
+from drivers.beam_monitors import (
     PATTERN,
     QUERY,
     ElectrometerQuery,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from beamline.projections.protocols import ScanPart
     from recon.base.arrays import F32, F64
     from recon.base.geometry import Geometry
-    from recon.features.beam_hardening.curve import Curve
+    from recon.features.beam_hardening import Curve
 
     Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -131,7 +131,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
     """The hardening curve for a scan's line integrals [view, row, col], and a sentence about it; None for no
     correction.
     """
-    from recon.features.beam_hardening.curve import NoCurveError, curve_of_spectrum
+    from recon.features.beam_hardening import NoCurveError, curve_of_spectrum
 
     highest = max(float(view.max()) for view in views)
     if step.spectrum is not None:
@@ -173,8 +173,8 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
         NoCurveError: the sample is of several materials, the curve does not settle, or it makes masses differ more. Or
             the beam is a cone, whose views need not hold the same mass.
     """
-    from recon.features.beam_hardening.curve import NoCurveError, curve_of_paths
-    from recon.post.enhance import k_means
+    from recon.features.beam_hardening import NoCurveError, curve_of_paths
+    from recon.post import k_means
     from recon.reconstruction import reconstruct
     from recon.voxels.projector import project
 

@@ -18,7 +18,7 @@ from beamline.projections.step import StepDone, StepMemory, option
 from beamline.projections.usable_views import part_numbers
 from drivers.base.frame import FrameKind
 from recon.base.volume import Grid
-from recon.features.jumps.clusters import jump_clusters, part_groups, thinned
+from recon.features.jumps import jump_clusters, part_groups, thinned
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,7 +14,7 @@ from beamline.projections.step import StepDone, StepMemory, option, positive
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
-    from recon.features.phase.paganin import Paganin
+    from recon.features.phase import Paganin
     from recon.prep.correct import Projections
 
 
@@ -45,7 +45,7 @@ class Phase:
         material: the ratio of delta to beta, or a material, as the user said it; None: it is not retrieved.
         distance_mm: from the sample to the detector; None takes the file's.
         energy_kev: None takes the file's.
-        unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.paganin.Paganin`; None: none.
+        unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
     """
 
     name: ClassVar[str] = "phase"
@@ -125,7 +125,7 @@ class Phase:
             ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.
         """
         from beamline.projections.selection import cone_of, pixel_size
-        from recon.features.phase.paganin import Paganin, length_of
+        from recon.features.phase import Paganin, length_of
 
         if source.row_pitch_mm is not None:
             raise ConfigError(f"--phase needs square pixels; those of {source.path} are not square.")

@@ -1,4 +1,4 @@
-"""Rings: stripes of the sinograms are removed, see `recon.features.rings.rings`."""
+"""Rings: stripes of the sinograms are removed, see `recon.features.rings`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Rings:
     """Removal of stripes from line integrals.
 
     Attributes:
-        way: see `recon.features.rings.rings.remove_rings_in_place`.
+        way: see `recon.features.rings.remove_rings_in_place`.
     """
 
     name: ClassVar[str] = "rings"
@@ -39,14 +39,14 @@ class Rings:
     needs_finished: ClassVar[str] = ""
 
     def memory(self, part: ScanPart) -> StepMemory:
-        from recon.features.rings.rings import removal_memory
+        from recon.features.rings import removal_memory
 
         return StepMemory(alone=removal_memory(part.geometry.n_views, part.geometry.detector_shape, self.way))
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
-        from recon.features.rings.rings import remove_rings_in_place, rings_seen
+        from recon.features.rings import remove_rings_in_place, rings_seen
 
         data, axis_col = views.projections.data, views.geometry.axis_col
         if self.way == "none":

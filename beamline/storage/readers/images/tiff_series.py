@@ -31,7 +31,7 @@ from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource
 from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 
 MOST_FILES = 100_000
 LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes

@@ -1,5 +1,213 @@
-"""Scans of Zeiss instruments."""
+"""Scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
+
+Stream names, types and units after two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
+with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide views by the one reference without a
+dark, which the instrument has subtracted. Images are as they are stored.
+"""
 
 from __future__ import annotations
 
-FORMATS = {"txrm": "beamline.storage.readers.zeiss.txrm"}
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.text import count
+from beamline.storage import hdf5
+from beamline.storage.readers.base import Opening, ScanFormat
+from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.writers.rows import ScanEnding
+from drivers.base.frame import FrameKind
+
+FORMATS = {"txrm": __name__}
+
+_SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
+_TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}
+_PER_STORAGE = 100  # images
+_CONE = 1  # of ImageInfo/XrayGeometry
+_ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
+
+
+class TxrmFile:
+    """The streams of a .txrm file. Used within hdf5.readable, which converts its errors to a DataError."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import olefile
+        except ImportError as error:
+            raise DataError(
+                f'{path} is a .txrm file, which needs the library olefile: pip install "splatline[txrm]".'
+            ) from error
+        self._ole = olefile.OleFileIO(path)
+
+    def bytes_of(self, name: str) -> bytes:
+        """The content of a stream; KeyError if there is none."""
+        if not self._ole.exists(name):
+            raise KeyError(f"there is no stream {name}")
+        return bytes(self._ole.openstream(name).read())
+
+    def numbers(self, name: str, dtype: str, n: int = 1) -> NDArray[Any] | None:
+        """The first n numbers of a stream; None if it is missing or shorter."""
+        if not self._ole.exists(name):
+            return None
+        content, wanted = self.bytes_of(name), n * np.dtype(dtype).itemsize
+        return np.frombuffer(content[:wanted], dtype) if len(content) >= wanted else None
+
+    def number(self, name: str) -> int | None:
+        """The first integer of a stream; None if there is none."""
+        numbers = self.numbers(name, "<i4")
+        return None if numbers is None else int(numbers[0])
+
+    def image(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An image [row, col]; ValueError if the stream has another size."""
+        return np.frombuffer(self.bytes_of(name), dtype).reshape(shape)
+
+    def close(self) -> None:
+        self._ole.close()
+
+
+class _Views:
+    """The projections [view, row, col], each read when it is asked for."""
+
+    ndim = 3
+
+    def __init__(self, file: TxrmFile, path: Path, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
+        self._file, self._path, self.shape, self.dtype = file, path, shape, dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: tuple[slice, slice]) -> NDArray[Any]:
+        views, rows = key
+        wanted = range(len(self))[views]
+        out = np.empty((len(wanted), len(range(self.shape[1])[rows]), self.shape[2]), self.dtype)
+        with hdf5.readable(self._path):
+            for part, i in zip(out, wanted, strict=True):  # a whole image at a time: its file has no smaller pieces
+                name = f"ImageData{i // _PER_STORAGE + 1}/Image{i + 1}"
+                part[:] = self._file.image(name, self.shape[1:], self.dtype)[rows]
+        return out
+
+
+def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
+    """Open a .txrm file. `own_angles` False: the caller supplies the angles, so the file may lack them.
+
+    DataError where olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
+    """
+    with hdf5.readable(path):
+        file = TxrmFile(path)
+        with hdf5.closed_on_error(file):
+            return _source(path, file, own_angles)
+
+
+def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
+    info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
+    lost = [name for name, value in info.items() if value is None]
+    if lost:
+        raise DataError(f"{path} is no .txrm scan: there is no stream ImageInfo/{lost[0]}.")
+    rows, cols, planned, kind = (int(value) for value in info.values() if value is not None)
+    n = min(planned, taken if (taken := file.number("ImageInfo/ImagesTaken")) is not None else planned)
+    if min(rows, cols) < 1 or rows * cols > 2**31:
+        raise DataError(f"{path} says that its images have {rows} x {cols} pixels: it is damaged.")
+    if kind not in _TYPES:
+        raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
+    if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
+        raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
+    _refuse(path, file)
+    stacks = [FrameStack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
+    reference = _TYPES.get(
+        file.number("ReferenceData/DataType") or file.number("ReferenceData/ImageInfo/DataType") or 0
+    )
+    if reference is not None:
+        flat = file.image("ReferenceData/Image", (rows, cols), reference)[None]
+        dark = np.zeros_like(flat)  # subtracted by the instrument
+        stacks = [
+            FrameStack(FrameKind.DARK, "dark", dark),
+            FrameStack(FrameKind.FLAT, "ReferenceData/Image", flat),
+            *stacks,
+        ]
+    source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
+    if (shifts := _shifts(path, file, n)).any():
+        source.stated_shifts = np.full((source.image_key.size, 2), np.nan)
+        source.stated_shifts[-n:] = shifts
+    if n < planned:
+        source.stated_ending = ScanEnding("stopped", reason=f"{n} of {count(planned, 'planned view')} were taken.")
+    angles = file.numbers("ImageInfo/Angles", "<f4", n)
+    if own_angles:
+        if angles is None:
+            raise DataError(f"{path} does not say the angles of its {n} views: give --angles FILE (degrees).")
+        source.angles[-n:] = np.radians(angles.astype(np.float64))
+    _set_exposures(source, file, n)
+    _set_scale(source, file)
+    return source
+
+
+def _refuse(path: Path, file: TxrmFile) -> None:
+    if file.number("ImageInfo/AcquisitionMode") not in (None, _ACQUIRED):
+        raise DataError(f"{path} is a volume (.txm) or a single image, not a scan: give the .txrm file.")
+    if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):  # as the streams are spelt
+        raise DataError(
+            f"{path} is a mosaic; expected views of one field each. Stitch it with the microscope's program."
+        )
+
+
+def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
+    """Displacement of each image, [view, 2] pixels (col, row).
+
+    The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
+    it). In a real file the displacement of each view against the one before has the opposite sign, too.
+    """
+    shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
+    shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
+    if not np.isfinite(shifts).all():
+        raise DataError(f"{path}: {(~np.isfinite(shifts)).sum()} of its views' shifts are no numbers: it is damaged.")
+    return shifts
+
+
+def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
+    """Seconds of the views and of the reference, which may have its own."""
+    views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
+    source.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
+    for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):
+        seconds = file.numbers(name, "<f4")
+        if seconds is not None and seconds[0] > 0:
+            source.exposures[source.image_key == FrameKind.FLAT] = seconds[0]
+            break
+
+
+def _set_scale(source: StacksSource, file: TxrmFile) -> None:
+    """Pixel size, which the file states at the sample (µm), and the distances of a cone (mm, of either sign)."""
+    pixel, near, far = (
+        None if lengths is None else abs(float(lengths[0]))
+        for lengths in (
+            file.numbers(f"ImageInfo/{name}", "<f4") for name in ("PixelSize", "StoRADistance", "DtoRADistance")
+        )
+    )
+    if pixel is not None and 0 < pixel < math.inf:
+        source.pixel_size_mm = pixel * 1e-3
+    if file.number("ImageInfo/XrayGeometry") == _CONE and near and far and math.isfinite(near + far):
+        source.cone = (near, near + far)
+        if source.pixel_size_mm is not None:
+            source.pixel_size_mm *= (near + far) / near
+
+
+def _facts(file: TxrmFile) -> dict[str, str | float | int]:
+    """What else the file says, in its own units."""
+    facts: dict[str, str | float | int] = {}
+    for name in ("Energy", "Current", "OpticalMagnification", "CamPixelSize", "Temperature"):
+        values = file.numbers(f"ImageInfo/{name}", "<f4")
+        if values is not None and np.isfinite(values[0]):
+            facts[name] = float(values[0])
+    return facts
+
+
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_SIGNATURE)) == _SIGNATURE
+
+
+FORMAT = ScanFormat(".txrm (Zeiss)", _recognises, lambda path, opening: open_txrm(path, own_angles=opening.own_angles))

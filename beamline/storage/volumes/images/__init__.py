@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from beamline.storage.volumes.entry import FormatEntry
+from beamline.storage.volumes import FormatEntry
 
 _MODULE = "beamline.storage.volumes.images.tiff"
 FORMATS = {

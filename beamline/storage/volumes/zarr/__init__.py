@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from beamline.storage.volumes.entry import FormatEntry
+from beamline.storage.volumes import FormatEntry
 
 FORMATS = {"ome_zarr": FormatEntry("beamline.storage.volumes.zarr.ome_zarr", "OmeZarr", (".zarr",))}

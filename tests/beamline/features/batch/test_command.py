@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.features.batch import batch, command, recon_worker
-from beamline.features.batch.batch import BatchOptions, BatchRow, Worker, names_of, run_batch
+from beamline.core.process import ProcessEnd
+from beamline.features.batch import batch, command
+from beamline.features.batch.batch import COMMAND, BatchOptions, BatchRow, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -31,13 +32,16 @@ def _table(folder: Path) -> dict[str, dict[str, str]]:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scans are reconstructed without a process of their own, which takes seconds to start."""
 
-    def run(worker: Worker, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int, str]:
-        result = beamline(*arguments)
+    def run(
+        command: Sequence[str], log: Path, on_line: Callable[[str], None], silence: float
+    ) -> tuple[ProcessEnd, int, str]:
+        log.touch()
+        result = beamline(*command[len(COMMAND) :])
         for text in result.stdout.splitlines():
             on_line(text)
-        return result.exit_code, (result.stderr.splitlines() or [""])[-1]
+        return ProcessEnd.EXITED, result.exit_code, (result.stderr.splitlines() or [""])[-1]
 
-    monkeypatch.setattr(Worker, "run", run)
+    monkeypatch.setattr(batch, "run_to_end", run)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -103,58 +107,41 @@ def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share
 
 def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(folder / "second.h5", SCAN)
-    done: list[str] = []
+    done: list[Path] = []
 
-    def run(worker: Worker, arguments: Sequence[str], on_line: object) -> tuple[int, str]:
-        output = Path(arguments[arguments.index("--output") + 1])
+    def run(command: Sequence[str], log: Path, *_: object, **__: object) -> tuple[ProcessEnd, int, str]:
+        output = Path(command[command.index("--output") + 1])
+        log.touch()
         if done:
             output.with_suffix(".h5.partial").touch()
             raise KeyboardInterrupt
-        done.append(arguments[1])
+        done.append(output)
         output.touch()
-        return 0, ""
+        return ProcessEnd.EXITED, 0, ""
 
-    monkeypatch.setattr(Worker, "run", run)
+    monkeypatch.setattr(batch, "run_to_end", run)
     result = beamline("batch", "scan.h5", "second.h5", "-o", "out")
     assert result.exit_code == 4
     assert {name: row["state"] for name, row in _table(folder / "out").items()} == {"scan": "done", "second": "waiting"}
     assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
 
 
-WORKS = """
-import json, os, sys, time
-for line in sys.stdin:
-    (what,) = json.loads(line)
-    print(json.dumps({"event": "at work", "pid": os.getpid()}), flush=True)
-    if what == "crash":
-        print("out of memory", file=sys.stderr, flush=True)
-        os.abort()
-    if what == "hang":
-        time.sleep(600)
-    print(json.dumps({"event": "ended", "exit_code": int(what)}), flush=True)
-"""
-
-
-def test_a_worker_takes_scan_after_scan_and_another_one_follows_a_failure(tmp_path: Path) -> None:
-    lines: list[str] = []
-    given, log = ("0", "0", "6", "0", "5", "0", "crash", "0", "hang", "0"), tmp_path / "log.txt"
-    with Worker(log, (sys.executable, "-c", WORKS), silence=1.5) as worker:
-        found = [worker.run([what], lines.append) for what in given]
-    codes = [code for code, _ in found]
-    assert codes[:6] == [0, 0, 6, 0, 5, 0]
-    assert (codes[6] not in (0, 5, 6), codes[7:]) == (True, [0, None, 0])
-    assert found[6][1] == "out of memory"
-    assert "no output from the worker" in found[8][1]
-    pids = [json.loads(line)["pid"] for line in lines]
-    changes = [n for n in range(1, len(given)) if pids[n] != pids[n - 1]]
-    assert changes == [5, 7, 9]  # after a failure, a crash, a scan that hung
-    assert not log.exists()
-
-
-def test_the_worker_gives_the_exit_codes_of_the_command(tmp_path: Path) -> None:
-    assert recon_worker.run(["info", str(tmp_path / "none.h5")]) == 5
-    assert recon_worker.run(["info", "--no-such-option"]) == 2
-    assert recon_worker.run(["config", "init"]) == 0
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("import os, sys; print('out of memory', file=sys.stderr, flush=True); os.abort()", "out of memory"),
+        ("import time; time.sleep(600)", "no output from its process for 1.5 s; it was ended"),
+        ("", "its process ended with code 0"),
+    ],
+)
+def test_a_scan_whose_process_crashes_or_hangs_or_leaves_no_volume_fails_with_the_reason(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
+) -> None:
+    monkeypatch.setattr(batch, "COMMAND", (sys.executable, "-c", program))
+    monkeypatch.setattr(batch, "_SILENCE", 1.5)
+    (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), lambda _: None, SystemClock())
+    assert row.state == "failed" and reason in row.message
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml"}
 
 
 @pytest.mark.slow

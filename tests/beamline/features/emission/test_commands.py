@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -16,8 +17,8 @@ from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
 from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan
-from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, split
+from beamline.features.trials.runner import ComparedScan, run_comparison
+from beamline.features.trials.tradeoff import planned_tradeoff, split
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.features.trials.worker import run
@@ -28,7 +29,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared
-from simulators.scenes.emission.counts import events, load_emission
+from simulators.scenes.emission import events, load_emission
 
 SCENE = "emission: {radius: 24}\nscanner: {trues: 2.0e+5}\nlines: {views: 24, shape: [3, 32], pitch: 2.0}\n"
 
@@ -146,7 +147,7 @@ def test_a_trial_gives_what_the_function_gives_of_the_same_counts(pet: Path, tmp
         data.save(tmp_path / f"views{views}")
         loaded = TrialData.load(tmp_path / f"views{views}")
         trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3}, halves=True)
-        found = run(trial, loaded, 0, lambda _: None, keep=tmp_path / "volume.npy")
+        found = run(trial, loaded, 0, keep=tmp_path / "volume.npy")
         ids = (prepared if given is not None else hold_out(prepared, 8, advice="")).projections.view_ids
         some = ids[np.arange(views) * len(ids) // views]
         emission = prepared.emission.summed(some[:, None], prepared.geometry.select(some))
@@ -197,7 +198,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     data = TrialData(prepared, None)
     settings: dict[str, int] = {"iterations": 2, "subsets": 3}
     row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups.tolist()))
-    run(row, data, 0, print, keep=tmp_path / "volume.npy")
+    run(row, data, 0, keep=tmp_path / "volume.npy")
     expected = recon.mlem(prepared.emission.summed(groups, views), recon.Grid.matching(views), 2, 3).data
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), expected)
 
@@ -250,6 +251,6 @@ def test_a_trade_off_without_names_tries_the_methods_of_counts(pet: Path, tmp_pa
     """And only there; those that take many times as long stay out."""
     plain, emitting = names_compared(), names_compared(emission=True)
     assert set(emitting) - set(plain) == {"mlem", "osem"} and set(plain) < set(emitting)
-    options = TradeoffOptions(ComparedScan(SourceOptions(pet), Selection(), tmp_path / "t"), (), max_seconds=1e-9)
-    table = run_tradeoff(options, lambda _: None, SystemClock())
+    scan = ComparedScan(SourceOptions(pet), Selection(), tmp_path / "t", max_seconds=1e-9)
+    table = run_comparison(partial(planned_tradeoff, scan), scan, lambda _: None, SystemClock())
     assert {outcome.trial.method for outcome in table.outcomes} == set(emitting)

@@ -18,7 +18,7 @@ from beamline import api
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
-from beamline.energies.scans import read_spectra
+from beamline.energies import read_spectra
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.job import progress_events
@@ -259,7 +259,7 @@ def test_an_output_of_another_format_is_refused(scans: list[Path], tmp_path: Pat
 def test_too_little_memory_is_said_before_a_scan_is_corrected(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beamline.energies.scans.prepare_projections", None)
+    monkeypatch.setattr("beamline.energies.prepare_projections", None)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--memory", "1M"
     for more in ((), ("--dry-run",)):
         done = run("materials", *scans, *words, *more)
@@ -306,7 +306,7 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
         made.append(replace(part, geometry=part.geometry.seen_with(RayWidth(arc=arc if made else 0.1))))
         return made[-1]
 
-    monkeypatch.setattr("beamline.energies.scans.prepare_projections", prepared)
+    monkeypatch.setattr("beamline.energies.prepare_projections", prepared)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--rows", "0:1"
     done = run("materials", *scans[:2], *words)
     assert done.exit_code == code, done.output

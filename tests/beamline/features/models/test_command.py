@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.features.models.made import write_views
-from beamline.gaussians.model import read_model
+from beamline.gaussians import read_model
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
-from recon.features.surfaces.marching import density_at
+from recon.features.surfaces import density_at
 from tests.beamline.cli.small_scan import beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")

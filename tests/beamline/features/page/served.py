@@ -9,8 +9,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from beamline.features.page.app import page, viewer
-from beamline.features.page.run_browser import RunBrowser
-from beamline.features.page.serve import Addresses, PageServer, open_port, start
+from beamline.features.page.serve import Addresses, PageServer, RunBrowser, open_port, start
 from beamline.page.run_files import Reader, watched
 from beamline.page.volume import HELD, ShownVolume
 

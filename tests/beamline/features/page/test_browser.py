@@ -12,8 +12,7 @@ import numpy as np
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
-from beamline.scan.control import state_of
-from beamline.scan.states import State
+from beamline.scan.control import State, state_of
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import write_reconstruction
 from recon.base.volume import VolumeSeries

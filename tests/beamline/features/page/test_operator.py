@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.scan.control import state_of
-from beamline.scan.states import State
+from beamline.scan.control import State, state_of
 from tests.beamline.features.page.chromium import (
     BEAMLINE,
     MARKS,

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from beamline.features.page import app, serve
-from beamline.features.page import run_browser as runs
+from beamline.features.page import serve as runs
 from beamline.page.run_files import EventLog
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.fakes import FakeInstrument

@@ -16,7 +16,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.core.shipped import shipped_scenes
+from beamline.core.installed import shipped_scenes
 from beamline.features.simulate import command as module
 from beamline.features.simulate import write
 from beamline.features.simulate.write import scan_of, write_scan

@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 
 from beamline.features.sweeps import sweep
 from beamline.features.sweeps.command import sweepable
-from beamline.features.sweeps.sweep import HeldOutViews, SweptSlice, _changes_most, middle_axis, scores_of
+from beamline.features.sweeps.sweep import SweptSlice, _changes_most, middle_axis, scores_of
 from beamline.features.sweeps.values import MOST, SweptOption, combinations, swept_option
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -25,6 +26,7 @@ from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.prepared_views import prepared_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PNG = b"\x89PNG"
@@ -127,18 +129,16 @@ def test_other_pixels_have_no_score(folder: Path) -> None:
     assert [row["residual_held_out"] for row in _table()] == ["", ""]
 
 
-def _slice(name: str, image: float, views: HeldOutViews) -> SweptSlice:
+def _slice(name: str, image: float, views: PreparedProjections) -> SweptSlice:
     projected = np.full((2, 1, 4), image, np.float32)
-    geometry = views.prepared.geometry
-    resolution = ViewResolution.of(geometry, Grid.matching(geometry))
+    resolution = ViewResolution.of(views.geometry, Grid.matching(views.geometry))
     return SweptSlice({"rings": name}, np.zeros((2, 2), np.float32), 0.0, views, projected, resolution)
 
 
-def _views(value: float, ids: tuple[int, int] = (1, 5)) -> HeldOutViews:
-    class Views:
-        geometry = Geometry.parallel(np.array([0.0, 1.0]), (1, 4), axis_col=1.5, pixel_pitch=1.0)
-
-    return HeldOutViews(np.array(ids), np.full((2, 1, 4), value, np.float32), Views())  # type: ignore[arg-type]
+def _views(value: float, ids: tuple[int, int] = (1, 5)) -> PreparedProjections:
+    geometry = Geometry.parallel(np.array([0.0, 1.0]), (1, 4), axis_col=1.5, pixel_pitch=1.0)
+    lines = np.full((2, 1, 4), value, np.float32)
+    return prepared_views(lines, geometry, held_out=(lines, geometry), held_out_ids=np.array(ids))
 
 
 def test_a_correction_that_agrees_with_itself_alone_does_not_win() -> None:

@@ -46,7 +46,7 @@ def test_each_plan_is_a_row_with_its_time_dose_and_blur(folder: Path, monkeypatc
 
     def trial(trial: Trial, work: Path, seed: int, limit: float | None, *, keep: Path) -> Outcome:
         prepared.append(data := TrialData.load(work / DATA))
-        return Outcome(trial, "done", **run(trial, data, seed, lambda line: None, keep=keep))
+        return Outcome(trial, "done", **run(trial, data, seed, keep=keep))
 
     monkeypatch.setattr(runner, "run_trial", trial)
     monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)

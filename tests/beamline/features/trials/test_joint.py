@@ -13,7 +13,7 @@ import pytest
 
 from beamline.features.trials import worker
 from beamline.features.trials.launch import TrialData, by_parts
-from beamline.features.trials.plans import plan_in_time, plan_of_energies
+from beamline.features.trials.tradeoff import plan_in_time, plan_of_energies
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import run, shown
 from beamline.projections.prepared import PreparedProjections, with_views_held_out
@@ -39,7 +39,7 @@ MATERIALS = Trial("one fit", "materials", VIEWS, settings={"materials": "a,b"})
 
 @pytest.fixture(autouse=True)
 def _nothing_is_compiled_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "ready", lambda trial, geometry: None)
+    monkeypatch.setattr(worker, "warm_up", lambda method, geometry: None)
 
 
 def discs() -> F32:
@@ -100,7 +100,7 @@ def test_parts_of_energies_are_one_an_energy(of_energies: TrialData) -> None:
 
 def kept(trial: Trial, data: TrialData, folder: Path) -> F32:
     """What the middle view shows of the trial's volumes."""
-    run(trial, data, 0, print, keep=folder / "volume.npy")
+    run(trial, data, 0, keep=folder / "volume.npy")
     volume: F32 = np.load(folder / "volume.npy")
     return volume
 
@@ -131,7 +131,7 @@ def test_rays_that_were_not_measured_do_not_count(in_time: TrialData) -> None:
         given = replace(
             in_time.prepared, projections=replace(views, data=used), measured=measured, held_out=(held, geometry)
         )
-        figures.append(run(SERIES, replace(in_time, prepared=given), 0, print)["squared_residuals"])
+        figures.append(run(SERIES, replace(in_time, prepared=given), 0)["squared_residuals"])
     np.testing.assert_array_equal(*figures)
 
 
@@ -152,14 +152,14 @@ def test_each_view_held_out_is_compared_with_the_volume_of_its_time(in_time: Tri
 def test_what_changes_is_explained_better_by_one_fit_than_by_parts_or_one_volume(in_time: TrialData) -> None:
     one_volume = Trial("method", "fista-tv", VIEWS)
     trials = one_volume, replace(one_volume, group="parts", parts=2), SERIES
-    ignoring, parts, joint = (run(trial, in_time, 0, print)["metrics"]["residual_held_out"] for trial in trials)
+    ignoring, parts, joint = (run(trial, in_time, 0)["metrics"]["residual_held_out"] for trial in trials)
     assert joint < 0.5 * parts < 0.5 * ignoring
 
 
 def test_a_share_of_states_is_explained_from_few_views(of_energies: TrialData) -> None:
-    apart = run(Trial("parts", "fbp", VIEWS, parts=2), of_energies, 0, print)["metrics"]["residual_held_out"]
+    apart = run(Trial("parts", "fbp", VIEWS, parts=2), of_energies, 0)["metrics"]["residual_held_out"]
     for trial in (MATERIALS, replace(MATERIALS, settings={"materials": "a,b", "states": "a,b"})):
-        found = run(trial, of_energies, 0, print)
+        found = run(trial, of_energies, 0)
         assert found["metrics"]["residual_held_out"] < 0.5 * apart
         assert found["gaussians"] is None and "sweep" in found["reached"] and found["cpu_seconds"] > 0
 
@@ -169,7 +169,7 @@ def test_times_and_energies_come_through_the_file(
 ) -> None:
     assert done(of_energies, tmp_path, MATERIALS) == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert said["squared_residuals"] == pytest.approx(run(MATERIALS, of_energies, 0, print)["squared_residuals"])
+    assert said["squared_residuals"] == pytest.approx(run(MATERIALS, of_energies, 0)["squared_residuals"])
 
 
 def test_too_few_views_are_a_failed_trial(

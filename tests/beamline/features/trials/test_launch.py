@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -18,10 +17,9 @@ from beamline.features.trials.launch import (
     TrialJob,
     compile_kernels,
     run_trial,
-    write_reference,
-    write_regions,
+    write_array,
 )
-from beamline.features.trials.plans import plan
+from beamline.features.trials.tradeoff import plan
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.geometry import Geometry
@@ -46,18 +44,15 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
 def test_what_becomes_of_a_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float | None, status: str, said: str
 ) -> None:
-    def fake(job: Path) -> Sequence[str]:
-        return [sys.executable, "-c", program]
-
-    monkeypatch.setattr(trial_run, "command", fake)
+    monkeypatch.setattr(trial_run, "COMMAND", [sys.executable, "-c", program])
     outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
     assert (outcome.status, said in outcome.message) == (status, True)
-    assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
+    assert (outcome.seconds == 2.5 and outcome.curve == [[1, 2]]) is (status == "done")
 
 
 def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = 'import sys; print(\'{"event": "failed", "message": "v.npy: the disk is full"}\'); sys.exit(5)'
-    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", program])
+    monkeypatch.setattr(trial_run, "COMMAND", [sys.executable, "-c", program])
     with pytest.raises(DataError, match=r"v\.npy:"):
         run_trial(Trial("method", "fbp", 10), tmp_path, 0)
 
@@ -65,7 +60,7 @@ def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", ""])
+    monkeypatch.setattr(trial_run, "COMMAND", [sys.executable, "-c", ""])
     compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
     job = JOB.validate_json((tmp_path / "job.json").read_bytes())
     words = ("start", "fit.loss", "fit.kernel")
@@ -113,8 +108,8 @@ def test_values_survive_the_file(tmp_path: Path) -> None:
     whole = replace(whole, emission=Emission(images, views, survival=images), energies=energies, stretch=1.5)
     prepared = replace(whole.of_views(np.arange(3)), held_out=(images[3:], views.select(range(3, 9))))
     TrialData(prepared, images, np.arange(6.0)).save(tmp_path / "data")
-    write_reference(tmp_path / "data", "os-sirt-tv", images[:1])
-    write_regions(tmp_path / "data", np.ones((1, 2, 3), np.int8))
+    write_array(tmp_path / "data" / "reference.os-sirt-tv.npy", images[:1])
+    write_array(tmp_path / "data" / "data.regions.npy", np.ones((1, 2, 3), np.int8))
     back = TrialData.load(tmp_path / "data")
     assert prepared.held_out is not None and back.prepared.held_out is not None
     for one, other in ((back.geometry, prepared.geometry), (back.prepared.held_out[1], prepared.held_out[1])):

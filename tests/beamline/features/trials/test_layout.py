@@ -18,8 +18,8 @@ from beamline.features.trials import figures as tradeoff_figures
 from beamline.features.trials.figures import colour_of, cost_curves, pareto_plot
 from beamline.features.trials.front import TRADEOFF, conclusions
 from beamline.features.trials.layout import finite, text, to_csv, to_html, write_page, write_table
-from beamline.features.trials.plans import plan, plan_in_equal_time
 from beamline.features.trials.table import TrialTable
+from beamline.features.trials.tradeoff import plan, plan_in_equal_time
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.report.html import Picture
 from beamline.report.sheets import SliceSheet
@@ -88,7 +88,7 @@ def test_a_held_out_residual_is_told_in_decibels_below_the_data() -> None:
     assert table.qualities == [pytest.approx(20.0)]
     assert "−20 log₁₀ of the held-out residual" in conclusions(table)[1]
     row = next(line for line in text(table, TRADEOFF).splitlines() if line.startswith("* fbp"))
-    assert row.split()[-4:] == ["1.00", "n/a", "n/a", "0.1000"]  # s, CPU s, MB, residual: two are not known
+    assert row.split()[-4:] == ["1.00", "n/a", "–", "0.1000"]  # s, CPU s, MB, residual: two are not known
 
 
 def test_csv_and_json_hold_what_was_measured_and_nothing_where_nothing_was(tmp_path: Path) -> None:

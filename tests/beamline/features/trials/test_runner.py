@@ -8,7 +8,8 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,9 @@ from beamline.core.events import Event
 from beamline.features.trials import runner, tradeoff
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.layout import text
-from beamline.features.trials.runner import ComparedScan
-from beamline.features.trials.table import TIME
-from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff
+from beamline.features.trials.runner import ComparedScan, run_comparison
+from beamline.features.trials.table import TIME, TrialTable
+from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
@@ -38,13 +39,15 @@ FIGURES = {"quality_seconds.png", "quality_memory.png", "quality_dose.png"}
 TABLES = {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
 
 
-def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
+def _options(tmp_path: Path, **changes: Any) -> ComparedScan:
     if not (tmp_path / "scan.h5").exists():
         write_exchange(tmp_path / "scan.h5", SCAN)
     scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
-    of_scan = {field.name: changes.pop(field.name) for field in fields(ComparedScan) if field.name in changes}
-    options = TradeoffOptions(replace(scan, **of_scan), ("r2", "fbp"), command="beamline tradeoff scan.h5")
-    return replace(options, **changes)
+    return replace(scan, **{"methods": ("r2", "fbp"), "command": "beamline tradeoff scan.h5", **changes})
+
+
+def run_tradeoff(scan: ComparedScan, *how: Any, **more: Any) -> TrialTable:
+    return run_comparison(partial(planned_tradeoff, scan), scan, *how, **more)
 
 
 def _made_up(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
@@ -105,7 +108,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
 def test_each_trial_has_the_photons_of_its_views(tmp_path: Path, made_up: object) -> None:
     options = _options(tmp_path, light=LightAsked(2.0))
     table = run_tradeoff(options, lambda e: None, SystemClock())
-    with options.scan.source.open() as source:
+    with options.source.open() as source:
         counts = source.read(range(len(source.image_key))).astype(float)
         flats, darks = (counts[source.image_key == kind].mean() for kind in (FrameKind.FLAT, FrameKind.DARK))
     photons = 2 * (flats - darks)

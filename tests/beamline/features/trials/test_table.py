@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.machine import machine
+from beamline.features.trials.forecast import Timed, trials_left
 from beamline.features.trials.front import conclusions
-from beamline.features.trials.plans import Timed, plan, plan_in_equal_time, quick_first, trials_left
-from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialTable, front, rounded, steps
+from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialTable, front, rounded
+from beamline.features.trials.tradeoff import plan, plan_in_equal_time, quick_first
 from beamline.features.trials.trial import QUALITIES, Outcome, Trial
 from recon.base.method import BoundedMethod
 from recon.methods import by_name, names_of_one_volume
@@ -103,10 +105,7 @@ def test_the_best_of_each_axis_is_on_it_and_both_rise_along_it(points: list[tupl
     if finite:
         assert costs[kept[0]] == min(p[0] for p in finite)
         assert qualities[kept[-1]] == max(p[1] for p in finite)
-    stretches = steps(kept, costs, qualities)
-    assert all(s.cost > 0 and s.gain > 0 for s in stretches)
-    if stretches:
-        assert sum(s.gain for s in stretches) == pytest.approx(qualities[kept[-1]] - qualities[kept[0]], abs=1e-6)
+    assert all(costs[a] < costs[b] and qualities[a] < qualities[b] for a, b in pairwise(kept))
 
 
 @given(POINTS, st.randoms(use_true_random=False))
@@ -117,14 +116,6 @@ def test_neither_order_nor_beaten_points_matter(points: list[tuple[float, float]
     shuffled = list(points)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
     assert found(shuffled) == found(points) == found(found(points))
-
-
-def test_what_the_next_decibel_costs() -> None:
-    costs, qualities = [1.0, 10.0, 5.0, 40.0], [25.0, 29.0, 24.0, 29.5]
-    kept = front(costs, qualities)
-    assert kept == [0, 1, 3]
-    assert [s.per_decibel for s in steps(kept, costs, qualities)] == pytest.approx([9 / 4, 60.0])
-    assert steps([2], costs, qualities) == []
 
 
 @given(st.floats(1e-9, 1e12), st.floats(1e-9, 1e12))

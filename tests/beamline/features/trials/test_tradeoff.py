@@ -15,12 +15,12 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
-from beamline.energies.scans import EnergyScans, read_spectra
+from beamline.energies import EnergyScans, read_spectra
 from beamline.features.trials import runner
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.table import TrialTable
-from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff
+from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
@@ -33,18 +33,18 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
 
 
 def asked(path: Path, axis_col: float) -> ComparedScan:
-    return ComparedScan(SourceOptions(path), Selection(axis_col=axis_col), path.parent / "out")
+    return ComparedScan(SourceOptions(path), Selection(axis_col=axis_col), path.parent / "out", ("fbp",))
 
 
-def planned(scan: ComparedScan, several: SeveralVolumes, warn: Callable[[str], None]) -> tuple[TrialData, TrialTable]:
-    data, planned = planned_tradeoff(TradeoffOptions(scan, ("fbp",), several), warn)
-    return data, planned.table
+def planned(scan: ComparedScan, warn: Callable[[str], None], **several: Any) -> tuple[TrialData, TrialTable]:
+    planned = planned_tradeoff(scan, warn, **several)
+    return planned.data, planned.table
 
 
 def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     """The file states no times: views follow each other evenly, which a warning says."""
     path, said = write_exchange(tmp_path / "scan.h5", SCAN), list[str]()
-    data, table = planned(asked(path, SCAN.axis_col), SeveralVolumes(volumes=2), said.append)
+    data, table = planned(asked(path, SCAN.axis_col), said.append, volumes=2)
     assert data.prepared.held_out is not None and data.truth is None and data.shown_held_out is not None
     angles = np.concatenate((data.geometry.angles, data.prepared.held_out[1].angles))
     shown = np.concatenate((data.shown, data.shown_held_out))
@@ -61,8 +61,8 @@ def at_energies(files: list[Path], table: Path) -> EnergyScans:
 
 def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
     pytest.importorskip("xraylib")
-    several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "charged"))
-    data, table = planned(asked(scans[0], 31.5), several, lambda said: None)
+    several: dict[str, Any] = {"scans": at_energies(scans, spectra(tmp_path)), "states": ("fresh", "charged")}
+    data, table = planned(asked(scans[0], 31.5), lambda said: None, **several)
     prepared, unseen = data.prepared, data.shown_held_out
     assert prepared.held_out is not None and prepared.energies is not None and unseen is not None
     assert data.geometry.n_views == 84 and prepared.held_out[1].n_views == 12
@@ -79,15 +79,15 @@ def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path
 def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -> None:
     pytest.importorskip("xraylib")
     (tmp_path / "out").mkdir()
-    several = SeveralVolumes(scans=at_energies([tmp_path / "none.h5"], spectra(tmp_path)))
+    several = {"scans": at_energies([tmp_path / "none.h5"], spectra(tmp_path))}
     with pytest.raises(Exception, match="never overwritten"):
-        planned(asked(tmp_path / "none.h5", 1.0), several, print)
+        planned(asked(tmp_path / "none.h5", 1.0), print, **several)
 
 
 def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
-    several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "full"))
+    several: dict[str, Any] = {"scans": at_energies(scans, spectra(tmp_path)), "states": ("fresh", "full")}
     with pytest.raises(ConfigError, match="materials fresh, charged"):
-        planned(asked(scans[0], 31.5), several, print)
+        planned(asked(scans[0], 31.5), print, **several)
 
 
 @pytest.fixture(autouse=True)

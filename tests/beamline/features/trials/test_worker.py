@@ -44,10 +44,6 @@ def data() -> TrialData:
     return TrialData(prepared, half.truth(Grid.matching(views)))
 
 
-def _silent(line: object) -> None:
-    pass
-
-
 def done(data: TrialData, folder: Path, trial: Trial | None = None, **more: Any) -> int:
     """The exit code of a process that runs the trial."""
     folder.mkdir(exist_ok=True)
@@ -70,15 +66,15 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str, 
         held = np.where(measured, held, np.float32(filled))
         given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
         trial = Trial("method", method, data.geometry.n_views, binning, halves=True)
-        found = run(trial, replace(data, prepared=given), 0, _silent)
+        found = run(trial, replace(data, prepared=given), 0)
         figures.append([*found["metrics"].values(), *found["squared_residuals"]])
     np.testing.assert_array_equal(*figures)
-    blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0, _silent)
+    blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0)
     assert blind["metrics"]["residual_held_out"] > 1.2 * found["metrics"]["residual_held_out"]
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
-    found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0, _silent)
+    found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0)
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
     assert data.truth is not None and data.prepared.held_out is not None
     assert found["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
@@ -112,7 +108,7 @@ def test_a_disk_that_is_full_is_no_trial_that_failed(data: TrialData, tmp_path: 
 
 
 def test_fewer_views_are_worse_and_spread_over_all_angles(data: TrialData) -> None:
-    all_views, few = (run(Trial("views", "fbp", n, halves=False), data, 0, _silent)["metrics"] for n in (27, 9))
+    all_views, few = (run(Trial("views", "fbp", n, halves=False), data, 0)["metrics"] for n in (27, 9))
     assert few["psnr"] < all_views["psnr"] - 1
     assert "resolution" not in few
 
@@ -123,14 +119,12 @@ def test_fewer_views_are_worse_and_spread_over_all_angles(data: TrialData) -> No
      {"fit.truncation.sigmas": 2.5}, {"start": "tv"}],
 )  # fmt: skip
 def test_a_fit_with_each_setting(data: TrialData, change: dict[str, Any]) -> None:
-    said: list[Any] = []
     binning = change.pop("binning", 1)
     trial = Trial("method", "r2", 27, binning, {"steps": 120, "gaussians": 150, **change})
-    found = run(trial, data, 0, said.append)
+    found = run(trial, data, 0)
     assert found["metrics"]["psnr"] > 15
     assert found["gaussians"] >= 100 and found["curve_of"] == "views held out"
     assert found["curve"][-1][1] > 15
-    assert said and said[0]["steps"] == 120
     json.dumps(found)
 
 
@@ -140,14 +134,14 @@ def test_a_fit_is_judged_by_views_that_it_does_not_see(data: TrialData) -> None:
     assert data.prepared.held_out is not None
     unseen, geometry = data.prepared.held_out
     spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
-    kept, other = (run(trial, d, 0, _silent) for d in (data, spoilt))
+    kept, other = (run(trial, d, 0) for d in (data, spoilt))
     assert kept["metrics"]["psnr"] == other["metrics"]["psnr"]
     assert kept["curve"][-1][1] > other["curve"][-1][1] + 5
 
 
 @pytest.mark.parametrize("method", ["sirt", "sart", "cgls", "asd-pocs", "fista-tv", "os-sirt-tv"])
 def test_iterations(data: TrialData, method: str) -> None:
-    few, more = (run(Trial("iterations", method, 27, settings={"iterations": n}), data, 0, _silent) for n in (1, 4))
+    few, more = (run(Trial("iterations", method, 27, settings={"iterations": n}), data, 0) for n in (1, 4))
     assert more["metrics"]["residual_held_out"] < few["metrics"]["residual_held_out"]
     assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
 
@@ -164,7 +158,7 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     ticks = itertools.count()
     trial = Trial("method", method, 27, seconds_asked=8.0)
     alone = replace(data, prepared=replace(data.prepared, held_out=None))
-    found = run(trial, alone, 0, _silent, lambda: 0.1 * next(ticks))
+    found = run(trial, alone, 0, lambda: 0.1 * next(ticks))
     own_length = by_name(method).traits.own_length
     assert (0 if own_length else 0.6 * 8) < found["seconds"] < 1.1 * 8
     number, word = found["reached"].split(", ")[0].split()
@@ -214,7 +208,7 @@ def test_trials_of_a_cone(data: TrialData) -> None:
     cone = _cone(data)
     views = cone.geometry.n_views
     for trial in (Trial("method", "fbp", views), Trial("method", "r2", views, settings={"steps": 5, "gaussians": 50})):
-        assert np.isfinite(run(trial, cone, 0, _silent)["metrics"]["psnr"])
+        assert np.isfinite(run(trial, cone, 0)["metrics"]["psnr"])
 
 
 def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,7 +220,7 @@ def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, mo
     plain = module.reconstruct
     monkeypatch.setattr(module, "warm_up", lambda *_: None)
     monkeypatch.setattr(module, "reconstruct", lambda *said: seen.append(said[1].geometry.angles) or plain(*said))
-    run(Trial("method", "fbp", 8, halves=True), around, 0, _silent)
+    run(Trial("method", "fbp", 8, halves=True), around, 0)
     for angles in seen:
         gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
         assert gaps.max() < 1.6 * 2 * np.pi / angles.size

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
-from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation

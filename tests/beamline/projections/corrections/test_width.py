@@ -142,4 +142,4 @@ def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:
     np.testing.assert_allclose(views.angles(100.0, ids), source.angles[ids] + turned)
     geometry, done = views.geometry(100.0, ids)
     assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
-    assert done["width"].parameters["exposure_arc_deg"] == pytest.approx(1.6)
+    assert done.parameters["exposure_arc_deg"] == pytest.approx(1.6)

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.features.models.command import write_mesh
-from beamline.storage.meshes.reading import read_mesh
-from recon.features.surfaces.marching import Mesh
+from beamline.storage.meshes import read_mesh
+from recon.features.surfaces import Mesh
 from tests.simulators.samples.voxels.test_files import sphere
 
 TEXT = {

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from beamline.storage.rules import Finding
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_seen, coarse_views
-from beamline.storage.rules.finding import Finding
 from tests.beamline.array_source import ArraySource
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0

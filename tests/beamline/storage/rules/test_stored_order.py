@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules import Finding
 from beamline.storage.rules.scan import pixels_as_labelled, views_first
 from tests.beamline.array_source import ArraySource
 from tests.recon.prep.balls import Balls

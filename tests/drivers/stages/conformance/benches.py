@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from drivers.testing.stages import Build, StageBench, StageKind
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.rig import NAMES, StageRig

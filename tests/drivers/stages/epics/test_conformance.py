@@ -13,7 +13,7 @@ import pytest
 from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from drivers.testing.stages import Build, StageBench, StageKind, StepStageConformance
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.drivers.stages.flat_settings import flat
 

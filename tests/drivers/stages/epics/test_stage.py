@@ -13,7 +13,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat

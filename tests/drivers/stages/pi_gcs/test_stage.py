@@ -10,7 +10,7 @@ import pytest
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import RotationStage
 from drivers.testing.stages.bench import LONG, SPEED
-from simulators.wires.serial_url import register
+from simulators.wires.wire import register
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
 from tests.drivers.stages.rig import NAMES
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 import recon
 from recon.base.geometry import Geometry
 from recon.features.calibration.gains import NEAR_AXIS, gains_memory, learn_gains
-from recon.features.rings.rings import remove_rings_in_place
+from recon.features.rings import remove_rings_in_place
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid

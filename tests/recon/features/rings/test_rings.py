@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.features.rings.rings import (
+from recon.features.rings import (
     REMOVERS,
     _analysed,
     _synthesised,

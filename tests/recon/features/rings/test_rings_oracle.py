@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.features.rings.rings import REMOVERS, width_for
+from recon.features.rings import REMOVERS, width_for
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder

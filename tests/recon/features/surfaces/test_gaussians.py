@@ -8,8 +8,8 @@ import torch
 
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
-from recon.features.surfaces import marching as module
-from recon.features.surfaces.marching import density_at, on_level
+from recon.features import surfaces as module
+from recon.features.surfaces import density_at, on_level
 from recon.kernels import reference
 from recon.splatting.gaussians import Gaussians
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.base.volume import Grid
-from recon.features.surfaces import marching as module
-from recon.features.surfaces.marching import Mesh, half_way, surface
+from recon.features import surfaces as module
+from recon.features.surfaces import Mesh, half_way, surface
 
 pytest.importorskip("skimage")
 GRID = Grid((40, 44, 48), 0.02, (0.3, 0.0, 0.0))

@@ -13,7 +13,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.compiled.level import V3
+from recon.compiled import V3
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.picks import NEAR_STEP, bilinear, bilinear_near, lanes_per_window, least, pick, pick_near, whole
 

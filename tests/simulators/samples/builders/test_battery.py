@@ -14,7 +14,7 @@ from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Ellipsoid, Polyhedron
 from simulators.samples.builders.battery import ELECTROLYTE, PARTICLE, battery
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 from tests.simulators.bodies import volume
 
 

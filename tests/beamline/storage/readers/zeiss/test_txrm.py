@@ -21,7 +21,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import BEAM, TwoCylinders
 from tests.beamline.storage.compound import write_compound

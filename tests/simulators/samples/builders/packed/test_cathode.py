@@ -25,7 +25,7 @@ from simulators.samples.builders.packed.cathode import (
     grains,
     inner_radius,
 )
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 from simulators.samples.materials.materials import known
 from tests.simulators.bodies import volume
 from tests.simulators.samples.builders.packed.test_arrangement import corners, overlapping, spread

@@ -14,7 +14,7 @@ from simulators.light.beam import Beam
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.builders.packed.foam import Foam
 from simulators.samples.builders.packed.pieces import Charge, Settle
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 from simulators.samples.sample import sample_at
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import load_scene

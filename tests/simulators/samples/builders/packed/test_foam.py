@@ -13,7 +13,7 @@ from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.builders.packed.foam import Foam, holes
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 
 SETTINGS = {"n_holes": 400, "candidates": 20_000, "gap_um": 2.0}
 

@@ -14,7 +14,7 @@ from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.builders.packed.resolution import Resolution
-from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.composed import build_sample
 from tests.simulators.bodies import volume
 
 SETTINGS = {"widths_um": (20.0, 10.0), "bars": 3, "star_um": 200.0, "spokes": 12, "balls_um": (40.0, 20.0, 10.0)}

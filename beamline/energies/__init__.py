@@ -1,1 +1,0 @@
-"""Scans of one sample at several energies as one source of views."""

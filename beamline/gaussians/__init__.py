@@ -1,1 +1,0 @@
-"""The Gaussians behind a volume."""

@@ -1,1 +1,0 @@
-"""Simulate: a scene becomes a scan file with labels and truth, without an instrument."""

@@ -1,1 +1,0 @@
-"""Beam monitors: read over a serial line or from a web page."""

@@ -1,1 +1,0 @@
-"""Jumps of the sample: in which of them it moved, and the views that show it."""

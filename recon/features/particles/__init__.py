@@ -1,1 +1,0 @@
-"""Particles of a segmented volume: parted at their necks, and measured."""

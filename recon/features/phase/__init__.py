@@ -1,1 +1,0 @@
-"""Phase: contrast from the bright rims of a propagated wave."""

@@ -1,1 +1,0 @@
-"""Rings: stripes that unequal pixels make in sinograms, seen and removed."""

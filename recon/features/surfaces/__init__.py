@@ -1,1 +1,0 @@
-"""Surfaces where a volume, or the Gaussians behind it, cross a level."""

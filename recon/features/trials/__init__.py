@@ -1,1 +1,0 @@
-"""Figures of merit that trials of methods compare."""

@@ -1,1 +1,0 @@
-"""A pair of opposite views: axis, tilt and sharpness."""

@@ -1,1 +1,0 @@
-"""After reconstruction: enhancement, clusters of grey values, and particles with their sizes."""

@@ -1,1 +1,0 @@
-"""Composed samples: bodies with their materials, as a scene names them."""

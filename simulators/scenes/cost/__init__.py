@@ -1,1 +1,0 @@
-"""What a frame of a scene costs."""
