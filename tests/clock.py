@@ -1,7 +1,6 @@
 """The clock of tests: the same number of steps on any machine."""
 
-from __future__ import annotations
-
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -30,3 +29,11 @@ class SteppedClock:
             self.due.pop(0)[1]()
 
     __call__ = now
+
+
+def wait_until(done: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait in real time for another thread or process; it must be done within so many s."""
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -1,7 +1,5 @@
 """Dummies of each kind of extension: files, lines of registries, and a program that proves that it works."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ What goes through a memory map is not seen but for its msync. Writes are counted
     done = faulty_disk.run(command, "scan.h5", fail_at=7, torn=True)                # half of it does, as on a full disk
 """
 
-from __future__ import annotations
-
 import errno as errors
 import functools
 import os

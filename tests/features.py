@@ -3,8 +3,6 @@
 python -m tests.features [ROOT]
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 import tomllib

@@ -4,8 +4,6 @@ python -m tests.licences        # in an environment with all extras
 
 """
 
-from __future__ import annotations
-
 import fnmatch
 import re
 import tomllib

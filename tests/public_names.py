@@ -4,8 +4,6 @@ python -m tests.public_names        # in an environment with all extras
 
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Cases of a law that take long: the first ones are quick tests, the others slow."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

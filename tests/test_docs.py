@@ -1,7 +1,5 @@
 """The pages of the docs site: in the navigation, and with links that lead somewhere."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -5,8 +5,6 @@ The copy holds the packages and nothing else. For each kind, the files outside t
 counted, and the lines in them; without these lines the dummy is unknown.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

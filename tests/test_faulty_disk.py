@@ -1,7 +1,5 @@
 """The disk that fails: it counts every way to write, and fails where it is told to."""
 
-from __future__ import annotations
-
 import errno
 import signal
 import sys

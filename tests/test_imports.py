@@ -1,7 +1,5 @@
 """The product's modules import each other in one direction only, also within functions and for types alone."""
 
-from __future__ import annotations
-
 import re
 from graphlib import TopologicalSorter
 

@@ -1,7 +1,5 @@
 """Each package of an installation has its row in docs/licences.md, and none that users need is under the GPL."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.licences import ELSEWHERE, FOR_DEVELOPERS, FOR_USERS, brought, gpl, key, licence, row_of, rows, wanted

@@ -4,8 +4,6 @@ All modules are imported as on the other system: Python, its libraries and paths
 what the functions call, by the stubs of the other system. What they do there is not seen here.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

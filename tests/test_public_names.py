@@ -1,7 +1,5 @@
 """The public names are those of docs/public_names.md, and need the same parameters."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.public_names import FOR_BLUESKY, FOR_PACKAGES, FOR_SCRIPTS, lines, recorded, required

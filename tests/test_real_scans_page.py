@@ -1,7 +1,5 @@
 """The page on real scans has the commands that made its pictures, and these pictures."""
 
-from __future__ import annotations
-
 from tests.bench.real_scans import FURTHER, ROOT, SCANS
 
 

@@ -1,7 +1,5 @@
 """Version, changelog, citation and the page of releases say the same."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

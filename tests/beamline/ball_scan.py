@@ -1,7 +1,5 @@
 """A small scan of a ball off the axis by any simulated stage, on a virtual clock: its pictures show its angles."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A device that can only be closed: it stands in for one on a port that this computer has not."""
 
-from __future__ import annotations
-
 
 class Closable:
     """It counts how often it was closed."""

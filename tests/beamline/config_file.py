@@ -1,7 +1,5 @@
 """The smallest configuration that is good, written to a file and loaded; and what is said of one that is not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

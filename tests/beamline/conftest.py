@@ -1,7 +1,5 @@
 """Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time."""
 
-from __future__ import annotations
-
 import base64
 from typing import IO
 

@@ -1,19 +1,18 @@
 """A fake instrument on a virtual clock; it writes what it was doing into its pixels: frames prove the choreography."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import work_out
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.base.frame import Frame
+from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import (
     CameraFrame,
     CameraSettings,
@@ -59,12 +58,18 @@ class FakeInstrument:
     """Stage, camera, shutter and sample mover in one; `devices` is how acquisition sees it.
 
     Pixels hold the level of light and noise; in row 0, on top of the level, digits of the stage's count at the
-    trigger, whether the shutter was open and the sample in, and digits of the trigger's number; see `seen`.
-    `log` holds what the devices were told; `on_frame(number)` is called when a frame is taken.
+    trigger, whether the shutter was open and the sample in, and digits of the trigger's number; see `decode`.
+    `log` holds what the devices were told; when a frame is taken, `on_frame(number)` is called, and what stands in
+    `at` for its number.
     """
 
-    def __init__(self, faults: Faults | None = None, on_frame: Callable[[int], None] = lambda number: None) -> None:
-        self.faults, self.on_frame = faults or Faults(), on_frame
+    def __init__(
+        self,
+        faults: Faults | None = None,
+        on_frame: Callable[[int], None] = lambda number: None,
+        at: Mapping[int, Callable[[], object]] | None = None,
+    ) -> None:
+        self.faults, self.on_frame, self.at = faults or Faults(), on_frame, at or {}
         self.clock = VirtualClock()
         self.period = 1.0
         self.log: list[str] = []
@@ -79,7 +84,9 @@ class FakeInstrument:
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0
     ) -> Timeline:
         """Work out `n` views over half a turn at `speed` (degrees/s, one pass) with 3 darks and 2 flats."""
-        plan = self.plan(n, mode, passes, at, speed)
+        return self.worked_out(self.plan(n, mode, passes, at, speed))
+
+    def worked_out(self, plan: ScanPlan) -> Timeline:
         timeline = work_out(plan, self.stage.limits, self.stage.to_counts, self.camera.timing)
         assert timeline.violations == ()
         return timeline
@@ -275,6 +282,7 @@ class Camera:
             counts = self.last.copy()
         self.last = counts
         self.instrument.on_frame(frame.number)
+        self.instrument.at.get(frame.number, lambda: None)()
         return CameraFrame(counts, frame.framestamp, frame.time)
 
     def disarm(self) -> None:
@@ -324,13 +332,18 @@ def digits(value: int) -> list[int]:
     return [value // 4096 % 64, value // 64 % 64, value % 64]
 
 
-def seen(frame: Frame) -> tuple[int, bool, bool, int]:
-    """What the instrument was doing: stage count, shutter open, sample in, trigger number."""
-    return decode(frame.counts)
-
-
 def decode(counts: NDArray[np.uint16]) -> tuple[int, bool, bool, int]:
+    """What the instrument was doing: stage count, shutter open, sample in, trigger number."""
     level = LEVEL[bool(counts[-1].mean() > 1000)]
     row = [int(v) - level for v in counts[0, :8]]
     count = row[0] * 4096 + row[1] * 64 + row[2]
     return count - 32768, bool(row[3]), bool(row[4]), row[5] * 4096 + row[6] * 64 + row[7]
+
+
+def assert_true(frames: Iterable[Frame], within: float = COUNT) -> None:
+    """Each frame has the kind and the angle, to so many radians, that the camera wrote into its pixels."""
+    for frame in frames:
+        count, is_open, is_in, _ = decode(frame.counts)
+        assert (is_open, is_in) == (frame.kind is not FrameKind.DARK, frame.kind is not FrameKind.FLAT)
+        if frame.kind is not FrameKind.INVALID:
+            assert frame.angle == pytest.approx(count * COUNT, abs=within)

@@ -1,7 +1,5 @@
 """Commands on hostile inputs, one after the other in a process of their own, which is killed where one does not end."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys

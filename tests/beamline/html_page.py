@@ -1,7 +1,5 @@
 """Parses a page of a report and fails if it is not well-formed or not self-contained."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

@@ -1,7 +1,5 @@
 """Damaged, altered and malicious inputs, made at random from good ones: scan files, and YAML by its values."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from contextlib import suppress

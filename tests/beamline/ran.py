@@ -1,8 +1,9 @@
 """A run of the fake instrument and everything that it left, for tests of the run and of what runs beside it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
-from drivers.base.frame import FrameKind
-from tests.beamline.fakes import COUNT, FakeInstrument, decode
+from beamline.storage.writer_lock import QUIET
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from tests.beamline.fakes import FakeInstrument, assert_true
 
 SMALL = (
     "scan.angles.views=12",
@@ -48,21 +50,35 @@ class Ran:
         heard: Callable[[Event], None] = lambda event: None,
     ) -> None:
         self.events: list[Event] = []
-        self.result: RunResult | None = None
+        self._result: RunResult | None = None
         self.error: BaseException | None = None
-        self.instrument = instrument
+        self.instrument, self._runs = instrument, runs
         try:
             devices = instrument.connected()
-            self.result = run_scan(
+            self._result = run_scan(
                 small(*overrides), runs, [self.events.append, heard], stop, live=live, instrument=devices
             )
         except BaseException as error:
             self.error = error
-        folders = list(runs.iterdir()) if runs.exists() else []
-        self.folder = folders[0] if folders else None
+
+    @property
+    def result(self) -> RunResult:
+        """What it came to; what it failed with is raised."""
+        if self.error is not None:
+            raise self.error
+        assert self._result is not None
+        return self._result
+
+    @property
+    def folder(self) -> Path:
+        return next(self._runs.iterdir())
 
     def of(self, name: str) -> list[Event]:
         return [event for event in self.events if event.event == name]
+
+    @property
+    def warnings(self) -> list[str]:
+        return [event.data["message"] for event in self.of("warning")]
 
     @property
     def states(self) -> list[str]:
@@ -70,17 +86,11 @@ class Ran:
 
     def assert_good_file(self, n: int, status: str, missing: Sequence[int] = ()) -> None:
         """`n` rows, each with the angle that the fake camera wrote into its pixels, and nothing else."""
-        assert self.folder is not None
         with open_scan(self.folder / "scan.h5") as source:
             assert source.finished
             frames = list(source.frames())
             assert len(frames) == len(source.image_key) == n
-            for frame in frames:
-                count, is_open, is_in, _ = decode(frame.counts)
-                assert is_open is (frame.kind is not FrameKind.DARK)
-                assert is_in is (frame.kind is not FrameKind.FLAT)
-                if frame.kind is not FrameKind.INVALID:
-                    assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
+            assert_true(frames)
         with h5py.File(self.folder / "scan.h5") as file:
             progress = file["entry/progress"]
             assert progress["status"][()].decode() == status
@@ -91,3 +101,22 @@ class Ran:
         assert not self.instrument.is_open
         assert not self.instrument.camera.armed
         assert not self.instrument.stage.moving()
+
+
+@contextmanager
+def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a scan in the block writes is left as kill -9 would have, a while ago: marked as being written."""
+    died, close = list[Path](), NXtomoWriter.close
+
+    def die(writer: NXtomoWriter, *_: object) -> None:
+        died.append(writer.path)
+        shutil.copy(writer.path, writer.path.with_name("died.h5"))
+        close(writer)
+
+    with patch.context() as within:
+        within.setattr(NXtomoWriter, "close", die)
+        yield
+    for path in died:
+        path.with_name("died.h5").replace(path)
+        when = path.stat().st_mtime - 2 * QUIET
+        os.utime(path, (when, when))

@@ -1,7 +1,5 @@
 """Small scans with a known answer: two cylinders along the rotation axis, seen by exact chords."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field

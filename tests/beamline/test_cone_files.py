@@ -1,7 +1,5 @@
 """A scan of a cone beam, from its file to a volume: distances are kept, rows and bins keep the central ray."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +92,7 @@ def test_an_axis_that_is_not_stated_or_wrong_is_found_by_views_held_out(
     tmp_path: Path, stated: float | None, told: list[str]
 ) -> None:
     path, warnings = tmp_path / "axis.h5", list[str]()
-    _write(path, replace(INFO, axis_col=stated), views=36)
+    _write(path, replace(INFO, axis_col=stated), views=24)
     with open_scan(path) as source:
         prepared = prepare_projections(source, PLAIN, warnings.append)
         given = prepare_projections(source, replace(PLAIN, axis_col=20.2), _never)
@@ -141,7 +139,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
         assert prepare_projections(source, told, _never).geometry.is_cone
 
 
-@pytest.mark.parametrize("row", [19, 24])
+@pytest.mark.parametrize("row", [24])
 def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path, row: int) -> None:
     with closing(ShownScan(open_scan(scan))) as shown:
         assert shown.axis(row) == {"axis": AXIS, "said": "as the file states", "leans": False}

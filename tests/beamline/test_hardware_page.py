@@ -1,7 +1,5 @@
 """docs/hardware.md names commands, keys and values; each of them must exist."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import shlex

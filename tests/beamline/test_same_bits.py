@@ -10,8 +10,6 @@ Digests are of one environment (versions and processor); elsewhere the test is s
 the checkout are skipped one by one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform

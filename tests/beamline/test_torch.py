@@ -1,12 +1,11 @@
 """torch is loaded where it is needed: by fits of Gaussians and networks, and by nothing that computes on voxels."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
 
 import grimp
+import numpy as np
 
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -63,7 +62,7 @@ def test_modules_that_load_torch_are_these() -> None:
 
 
 def test_methods_on_voxels_looks_at_files_and_pages_work_without_torch(tmp_path: Path) -> None:
-    write_exchange(tmp_path / "scan.h5", TwoCylinders())
+    write_exchange(tmp_path / "scan.h5", TwoCylinders(np.radians(np.arange(0, 180, 12.0)), shape=(1, 40)))
     lines = ["info scan.h5", "validate scan.h5", "recon scan.h5 -m fbp --dry-run", "recon scan.h5 -m fbp -o fbp.h5"]
     lines += [f"recon scan.h5 -m {name} -o {name}.h5 --no-report --iterations 1" for name in ON_VOXELS]
     done = subprocess.run(

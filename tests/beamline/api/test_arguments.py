@@ -1,7 +1,5 @@
 """Arguments of the wrong type: a ConfigError that names the argument, the value and what is expected."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scripts of docs/examples run as they stand, with the simulated instrument on a virtual clock."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Scans from Python: devices stay open, each scan has its own values, Ctrl-C ends the loop and keeps the data."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -79,7 +77,7 @@ def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(
 
 
 def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: list[FakeInstrument]) -> None:
-    fake = FakeInstrument(on_frame=lambda number: signal.raise_signal(signal.SIGINT) if number == 8 else None)
+    fake = FakeInstrument(at={8: lambda: signal.raise_signal(signal.SIGINT)})
     before, taken = signal.getsignal(signal.SIGINT), []
     with pytest.raises(api.ScanStopped), connected(fake) as instrument:
         for sample in ("a", "b", "c"):
@@ -93,19 +91,15 @@ def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: l
 
 
 def test_a_second_ctrl_c_aborts(connected: Connected) -> None:
-    def twice(number: int) -> None:
-        if number == 8:
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(api.ScanAborted), connected(FakeInstrument(on_frame=twice)) as instrument:
+    fake = FakeInstrument(at={8: lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)]})
+    with pytest.raises(api.ScanAborted), connected(fake) as instrument:
         instrument.scan()
     assert instrument.last is not None and instrument.last.frames == 9
 
 
 def test_in_another_thread_a_request_stops_it_and_no_signal_is_caught(connected: Connected) -> None:
     stop, raised = api.StopRequest(), []
-    fake = FakeInstrument(on_frame=lambda number: stop.stop("the button") if number == 8 else None)
+    fake = FakeInstrument(at={8: lambda: stop.stop("the button")})
 
     def work() -> None:
         with connected(fake) as instrument:
@@ -154,13 +148,12 @@ def test_a_wrong_value_starts_nothing(
 def test_a_closed_instrument_and_a_second_scan_at_a_time_are_refused(connected: Connected) -> None:
     said: list[str] = []
 
-    def another(number: int) -> None:
-        if number == 3:
-            with pytest.raises(api.ConfigError, match="still runs"):
-                instrument.scan(sample="second")
-            said.append("refused")
+    def another() -> None:
+        with pytest.raises(api.ConfigError, match="still runs"):
+            instrument.scan(sample="second")
+        said.append("refused")
 
-    with connected(FakeInstrument(on_frame=another)) as instrument:
+    with connected(FakeInstrument(at={3: another})) as instrument:
         assert instrument.scan().clean and said == ["refused"]
     with pytest.raises(api.ConfigError, match="was closed"):
         instrument.scan()
@@ -215,12 +208,8 @@ def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeIns
 
 
 def test_a_device_that_does_not_answer_is_the_projects_own_error(tmp_path: Path) -> None:
-    port = str(tmp_path / "no-port")
-    text = (config_folder() / "instrument.yaml").read_text()
-    config = tmp_path / "my.yaml"
-    config.write_text(text)
     with pytest.raises(DeviceError, match="no-port"):
-        api.connect(config, set={"devices.stage.port": port})
+        api.connect(config_folder() / "instrument.yaml", set={"devices.stage.port": str(tmp_path / "no-port")})
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
@@ -239,19 +228,15 @@ def test_every_name_is_there_and_typed() -> None:
 
 
 def test_an_energy_moves_the_monochromator_that_there_is(tmp_path: Path) -> None:
-    with api.connect(
-        config_folder() / "simulated.yaml",
-        say=None,
-        set={
-            "devices.monochromator": {"kind": "simulated"},
-            "simulation.clock": "virtual",
-            "storage.folder": tmp_path,
-            "scan.angles.views": 4,
-            "scan.mode": "step",
-            "scan.darks.count": 2,
-            "scan.flats.count": 2,
-        },
-    ) as instrument:
+    values = {
+        **SMALL,
+        "devices.monochromator": {"kind": "simulated"},
+        "simulation.clock": "virtual",
+        "storage.folder": tmp_path,
+        "scan.angles.views": 4,
+        "scan.mode": "step",
+    }
+    with api.connect(SIMULATED, say=None, set=values) as instrument:
         result = instrument.scan(energy_kev=8.34, live=False)
         with open_scan(result.path) as source:
             assert source.energy_kev == 8.34

@@ -1,7 +1,5 @@
 """Scans and volumes from Python: verdict, frames, the live volume, and a reconstruction without files."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -39,7 +37,6 @@ def scan(tmp_path: Path) -> Path:
 def run(tmp_path: Path) -> Path:
     """The folder of a run of 19 frames."""
     ran = Ran(tmp_path / "runs", FakeInstrument())
-    assert ran.folder is not None
     return ran.folder
 
 
@@ -79,11 +76,8 @@ def test_frames_come_to_another_program_while_the_scan_runs(tmp_path: Path) -> N
         assert readers[0].stdout is not None
         return map(int, readers[0].stdout)
 
-    def wait(number: int) -> None:
-        if number == 8:
-            came.extend(islice(indices(), 5))
-
-    ran = Ran(tmp_path / "runs", FakeInstrument(on_frame=wait), heard=begin)
+    instrument = FakeInstrument(at={8: lambda: came.extend(islice(indices(), 5))})
+    ran = Ran(tmp_path / "runs", instrument, heard=begin)
     assert ran.error is None
     with readers[0]:
         came.extend(indices())

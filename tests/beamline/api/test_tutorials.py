@@ -3,8 +3,6 @@
 `python -m tests.beamline.api.test_tutorials` writes texts and pictures of the page anew; look at them.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import runpy

@@ -1,7 +1,5 @@
 """A RunEngine with a loop of its own."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Iterator
 from typing import Any

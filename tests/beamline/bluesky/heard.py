@@ -1,7 +1,5 @@
 """Documents as a subscriber gets them."""
 
-from __future__ import annotations
-
 from typing import Any
 from urllib.parse import unquote, urlsplit
 

@@ -1,7 +1,5 @@
 """A short scan, and where the keys of its documents lie in its file."""
 
-from __future__ import annotations
-
 SHORT = (
     "scan.angles={scheme: fixed, views: 40}",
     "scan.period_s=0.5",

@@ -1,7 +1,5 @@
 """The camera alone in plans of bluesky: frames in a file of ours, documents that are valid, lost frames named."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Generator

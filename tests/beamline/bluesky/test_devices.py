@@ -1,7 +1,5 @@
 """A RunEngine flies a simulated scan; its documents are valid, and lead to every frame of the file."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import threading

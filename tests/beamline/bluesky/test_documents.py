@@ -1,7 +1,5 @@
 """Documents follow the events of the scan, and not those of its live reconstruction."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

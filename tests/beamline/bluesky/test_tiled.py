@@ -1,7 +1,5 @@
 """Documents of a scan through tiled: its client reads every frame, by what the RunEngine emitted alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

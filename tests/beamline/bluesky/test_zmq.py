@@ -1,7 +1,5 @@
 """Documents by 0MQ reach bluesky's own dispatcher, and a proxy that is gone or hangs holds nobody up."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """A proxy of 0MQ and a dispatcher behind it, a program of its own: prints a line for each document that arrives."""
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Commands are tested as from a terminal, wherever the tests themselves run."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ and the files in them that are cut off. Trials of `tradeoff` and `study` are mad
 process. Figures are blank: they are drawn in memory, which no disk spoils.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import gc

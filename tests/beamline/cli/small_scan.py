@@ -1,7 +1,5 @@
 """What the tests of `beamline recon` share: a small scan, the command as its user calls it, what is left."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,13 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pi
 
 def beamline(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def succeeds(*arguments: str) -> Result:
+    """A command that ends well."""
+    result = beamline(*arguments)
+    assert result.exit_code == 0, result.output
+    return result
 
 
 def left(folder: Path) -> set[str]:

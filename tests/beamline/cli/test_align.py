@@ -1,22 +1,19 @@
 """`beamline align`: what is printed, and its exit code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import pytest
 
 from beamline.config.load import config_folder
-from tests.beamline.cli.small_scan import beamline
+from tests.beamline.cli.small_scan import beamline, succeeds
 
 DEMO = (str(config_folder() / "demo.yaml"), "--set", "simulation.clock=virtual")
 
 
 def test_axis_tilt_and_detail_with_their_corrections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = beamline("align", *DEMO)
-    assert result.exit_code == 0, result.output
+    result = succeeds("align", *DEMO)
     assert [line.split()[0] for line in result.stdout.splitlines()] == ["axis", "tilt", "detail"]
     assert "right of the middle; move the axis 0.01" in result.stdout
     assert list(tmp_path.iterdir()) == []  # nothing is written

@@ -1,11 +1,6 @@
 """`beamline check`: the verdict, the figures, and exit code 2 with nothing moved or written."""
 
-from __future__ import annotations
-
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -84,19 +79,3 @@ def test_configuration_faults(tmp_path: Path) -> None:
     assert result.stdout == ""
     event = json.loads(run(str(path), "--json").stdout)
     assert (event["event"], event["exit_code"]) == ("failed", 2)
-
-
-def test_usage() -> None:
-    assert run().exit_code == 2
-
-
-def test_as_a_process_without_devices() -> None:
-    """The instrument's configuration is checked where there is neither a port nor a camera."""
-    path = config.config_folder() / "instrument.yaml"
-    command = [sys.executable, "-m", "beamline.cli.main", "check", str(path), "--set", "scan.exposure_s=-1"]
-    done = subprocess.run(
-        command, cwd=REPOSITORY, capture_output=True, text=True, timeout=60, env={**os.environ, "PYTHONUTF8": "1"}
-    )
-    assert done.returncode == 2
-    assert done.stderr.startswith("beamline: --set scan.exposure_s=-1: scan.exposure_s is -1; expected a number > 0")
-    assert "Traceback" not in done.stderr

@@ -1,7 +1,5 @@
 """Commands of other packages: by the name that the package announces, whatever theirs is there."""
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint
 
 import click

@@ -1,7 +1,5 @@
 """`beamline config`: what it prints can be used as it is."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Laws of all commands: a wrong file ends in a sentence with its name and a documented exit code, as JSON, too, and
 leaves nothing."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Series in time are read in tests/recon/features/joint/test_command.py.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from beamline.page.volume import ShownVolume
 from beamline.reconstruct.measure import read_truth
 from beamline.simulate import volumes_beside
 from beamline.storage.volumes.files import opened_volume
-from tests.beamline.cli.small_scan import beamline
+from tests.beamline.cli.small_scan import beamline, succeeds
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
 pytestmark = pytest.mark.slow  # half a minute for all pairs
@@ -48,25 +46,11 @@ FLOATS: dict[str, tuple[str, ...]] = {
     "fine.h5": ("voxelise", "fit.h5", "-o"),
     "fine.nrrd": ("voxelise", "fit.h5", "-o"),
     "truth.h5": ("simulate", "scene.yaml", "--truth"),
-    "copy.h5": ("export", "fbp.h5", "-o"),
-    "copy.tif": ("export", "fbp.h5", "-o"),
-    "copy.npy": ("export", "fbp.h5", "-o"),
-    "copy.nrrd": ("export", "fbp.h5", "-o"),
-    "copy.zarr": ("export", "fbp.h5", "-o"),
-    "copy": ("export", "fbp.h5", "-o"),
+    **{f"copy{suffix}": ("export", "fbp.h5", "-o") for suffix in (".h5", ".tif", ".npy", ".nrrd", ".zarr", "")},
 }
-GREYS: dict[str, tuple[str, ...]] = {
-    "grey.tif": ("export", "fbp.h5", *WINDOW, "-o"),
-    "grey.npy": ("export", "fbp.h5", *WINDOW, "-o"),
-    "grey.nrrd": ("export", "fbp.h5", *WINDOW, "-o"),
-    "grey.zarr": ("export", "fbp.h5", *WINDOW, "-o"),
-    "grey": ("export", "fbp.h5", *WINDOW, "-o"),
-}
+GREYS = {f"grey{suffix}": ("export", "fbp.h5", *WINDOW, "-o") for suffix in (".tif", ".npy", ".nrrd", ".zarr", "")}
 LABELS = {"labels.h5": ("segment", "fbp.h5", "--crop", "none", "-o")}
-SERIES, FIT = (
-    "series.h5",
-    ("recon", "simulated.h5", "-m", "r2", "--steps", "20", "--gaussians", "60", "--no-report", "-o"),
-)
+FIT = ("recon", "simulated.h5", "-m", "r2", "--steps", "20", "--gaussians", "60", "--no-report", "-o")
 
 
 @pytest.fixture(scope="module")
@@ -164,8 +148,7 @@ def test_the_voxel_of_every_copy_is_that_of_the_volume(written: Path) -> None:
 
 def test_views_of_a_model_give_its_volume_again(written: Path, tmp_path: Path) -> None:
     """Nothing is stated on the way: quantity, axis and pixel size are in the file."""
-    done = beamline("recon", "rendered_else.h5", "-m", "fbp", "--no-report", "-o", str(tmp_path / "v.h5"))
-    assert done.exit_code == 0, done.output
+    succeeds("recon", "rendered_else.h5", "-m", "fbp", "--no-report", "-o", str(tmp_path / "v.h5"))
     with opened_volume(tmp_path / "v.h5") as again, opened_volume(Path("fine.h5")) as model:
         assert again.length_unit == "mm" and again.volume.grid.spacing == pytest.approx(model.volume.grid.spacing)
         pair = np.ravel(again.volume.data[:]), np.ravel(model.volume.data[:])

@@ -1,7 +1,5 @@
 """A scan in a layout of its own gives, by the names of its datasets, what the same scan gives in ours."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 
@@ -11,7 +9,7 @@ import pytest
 
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
-from tests.beamline.cli.small_scan import SCAN, beamline
+from tests.beamline.cli.small_scan import SCAN, beamline, succeeds
 from tests.beamline.scans import BEAM, DARK, frames_of, write_flagged
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -32,8 +30,7 @@ def foreign(folder: Path) -> Path:
 
 
 def _volume(*arguments: str) -> np.ndarray:
-    result = beamline("recon", *arguments, "-o", "v.h5")
-    assert result.exit_code == 0, result.output
+    succeeds("recon", *arguments, "-o", "v.h5")
     record = read_reconstruction(Path("v.h5"))
     Path("v.h5").unlink()
     return record.volume.data
@@ -44,26 +41,23 @@ def test_recon_by_paths_recipe_and_line_to_repeat(foreign: Path) -> None:
     assert np.abs(expected).max() > 0.03
     np.testing.assert_array_equal(_volume("f.h5", *LAYOUT, *FBP), expected)
 
-    assert beamline("recon", "f.h5", *LAYOUT, *FBP, "--write-config", "layout.yaml").exit_code == 0
+    succeeds("recon", "f.h5", *LAYOUT, *FBP, "--write-config", "layout.yaml")
     assert 'data-path: "/p/a"' in Path("layout.yaml").read_text()
     np.testing.assert_array_equal(_volume("f.h5", "--config", "layout.yaml", "--no-report"), expected)
 
-    assert beamline("recon", "f.h5", *LAYOUT, *FBP, "-o", "w.h5").exit_code == 0
+    succeeds("recon", "f.h5", *LAYOUT, *FBP, "-o", "w.h5")
     _, *line = shlex.split(str(read_reconstruction(Path("w.h5")).parameters["command"]))
-    assert beamline(*line).exit_code == 0
+    succeeds(*line)
     np.testing.assert_array_equal(read_reconstruction(Path("w_again.h5")).volume.data, expected)
 
 
 def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
-    info = beamline("info", "f.h5", *LAYOUT)
-    assert info.exit_code == 0, info.output
+    info = succeeds("info", "f.h5", *LAYOUT)
     assert "hdf5_stacks" in info.stdout
-    validated = beamline("validate", "f.h5", *LAYOUT)
-    assert validated.exit_code == 0, validated.output
+    succeeds("validate", "f.h5", *LAYOUT)
     looked = beamline("monitor", "f.h5", *LAYOUT)
     assert f"{4 + SCAN.angles.size} frames" in looked.stdout
-    taken = beamline("ingest", "f.h5", "in.h5", *LAYOUT, "--pixel-size-um", "500")
-    assert taken.exit_code == 0, taken.output
+    succeeds("ingest", "f.h5", "in.h5", *LAYOUT, "--pixel-size-um", "500")
     with open_scan(Path("in.h5")) as ours:
         assert ours.quantity == "counts"
         np.testing.assert_array_equal(ours.angles[4:], np.radians(np.degrees(SCAN.angles)))

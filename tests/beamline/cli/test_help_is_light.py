@@ -1,7 +1,5 @@
 """Help and refusals come at once: nothing loads a library that computes, or that only other work needs."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`beamline home`: asks before the stage turns, says where it stands, and stops it when it is cut off."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

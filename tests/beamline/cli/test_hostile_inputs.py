@@ -1,7 +1,5 @@
 """Every command on damaged and malicious inputs ends in time, with a documented exit code and without a traceback."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,9 +22,8 @@ CPU_SECONDS = 15.0
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a scan that was stopped."""
     stop = StopRequest()
-    instrument = FakeInstrument(on_frame=lambda n: stop.stop() if n == 10 else None)
+    instrument = FakeInstrument(at={10: stop.stop})
     ran = Ran(tmp_path_factory.mktemp("runs"), instrument, "scan.mode=step", stop=stop)
-    assert ran.folder is not None
     return ran.folder
 
 
@@ -37,7 +34,7 @@ def worker(run: Path) -> Iterator[Worker]:
         yield worker
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_altered_scan_files(worker: Worker, run: Path, tmp_path: Path, seed: int) -> None:
     folder = tmp_path / "run"
     shutil.copytree(run, folder)
@@ -56,7 +53,7 @@ def test_altered_scan_files(worker: Worker, run: Path, tmp_path: Path, seed: int
         assert ended.good, (did, command, ended)
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(20))
 def test_altered_configurations(worker: Worker, run: Path, tmp_path: Path, seed: int) -> None:
     text, did = mutate_yaml(GOOD, np.random.default_rng(seed))
     (tmp_path / "c.yaml").write_text(text, encoding="utf-8")

@@ -1,7 +1,5 @@
 """A terminal or a disk that takes no output ends no command, and changes no exit code of one that leaves files."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`beamline monitor`: what is printed, for people and for programs, and its exit code."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder
-from tests.beamline.cli.small_scan import beamline
+from tests.beamline.cli.small_scan import beamline, succeeds
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(8, 40))
@@ -42,8 +40,7 @@ def test_flags_are_listed_with_frames_score_limit_and_advice(here: Path) -> None
 
 def test_a_clean_scan_of_another_format(here: Path) -> None:
     write_exchange(here / "clean.h5", SCAN)
-    result = beamline("monitor", "clean.h5")
-    assert result.exit_code == 0, result.output
+    result = succeeds("monitor", "clean.h5")
     assert result.stdout.splitlines() == ["clean.h5: 34 frames, flagged: none"]
 
 

@@ -1,7 +1,5 @@
 """One name, one number: a figure is the same wherever it is shown."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -24,7 +22,7 @@ from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
 from tests.beamline.array_source import ArraySource
-from tests.beamline.cli.small_scan import SCAN, beamline
+from tests.beamline.cli.small_scan import SCAN, beamline, succeeds
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import write_exchange
 from tests.clock import SteppedClock
@@ -59,8 +57,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
 
 
 def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
-    shown = beamline("recon", "scan.h5", "-m", "cgls", "--axis", "20.7", "-o", "shown.h5")
-    assert shown.exit_code == 0, shown.output
+    shown = succeeds("recon", "scan.h5", "-m", "cgls", "--axis", "20.7", "-o", "shown.h5")
     page = re.sub(r"<[^>]*>|\s+", " ", (folder / "shown.html").read_text(encoding="utf-8"))
     for label in ("Time of reconstruction", "Time of the whole command"):
         on_page, on_terminal = (
@@ -86,7 +83,7 @@ def test_times_of_a_followed_scan_on_the_terminal_and_the_page_and_in_events(fol
         "scan": {"views": 24, "darks": 2, "flats": 2},
     }
     (folder / "scene.yaml").write_text(json.dumps(scene), encoding="utf-8")
-    assert beamline("simulate", "scene.yaml", "--out", "own.h5").exit_code == 0
+    succeeds("simulate", "scene.yaml", "--out", "own.h5")
     followed = "recon", "own.h5", "--follow", "--seconds", "1", "--gaussians", "200", "--axis", "15.5"
     shown, told = beamline(*followed, "-o", "shown.h5"), beamline(*followed, "-o", "told.h5", "--json")
     assert shown.exit_code == told.exit_code == 0, shown.output + told.output
@@ -106,8 +103,7 @@ def test_times_of_a_followed_scan_on_the_terminal_and_the_page_and_in_events(fol
 def test_a_study_names_what_its_figures_are_of(folder: Path) -> None:
     """Rows are compared with the volume of all views by their own method; contrast with rims has another name."""
     write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 2.0))))
-    result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "-m", "cgls", "-o", "study")
-    assert result.exit_code == 0, result.output
+    result = succeeds("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "-m", "cgls", "-o", "study")
     with (folder / "study" / "study.csv").open(encoding="utf-8", newline="") as file:
         assert {"psnr_all", "ssim_all"} <= set(next(csv.DictReader(file)))
     assert "by the same method" in result.stdout

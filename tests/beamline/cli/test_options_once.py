@@ -1,7 +1,5 @@
 """An option of a reconstruction is the same on the command line, in a recipe and in Python, with what it excludes."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 from typing import Any

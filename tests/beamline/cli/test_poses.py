@@ -1,7 +1,5 @@
 """recon --poses, what its volume keeps of the poses, and their export as a table that --poses reads again."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

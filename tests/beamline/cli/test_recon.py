@@ -1,7 +1,5 @@
 """`beamline recon`: options, what is printed and what is left."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -17,7 +15,7 @@ from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr
 from recon.base.empirical import DEFAULT_STEPS
-from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
 from tests.beamline.scans import frames_of, write_exchange, write_flagged
 from tests.recon.prep.ring_score import ring_score
 from tests.slow_cases import others_slow
@@ -26,8 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_defaults_and_results(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "-m", "fbp")
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines()[:4])
     lines["report"], seconds = lines["report"].split(maxsplit=1)
@@ -48,15 +45,14 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """The volume of a file of ours."""
     folder = tmp_path_factory.mktemp("reference")
     scan, out = write_exchange(folder / "scan.h5", SCAN), folder / "reference.h5"
-    assert beamline("recon", str(scan), "-m", "fbp", "-o", str(out), "--no-report").exit_code == 0
+    succeeds("recon", str(scan), "-m", "fbp", "-o", str(out), "--no-report")
     with opened_volume(out) as record:
         return np.array(record.volume.data[:])
 
 
-@pytest.mark.parametrize("name", others_slow(["v.h5", "v", "v.tif", "v.npy", "v.nrrd"], 2))
+@pytest.mark.parametrize("name", others_slow(["v", "v.h5", "v.tif", "v.npy", "v.nrrd"]))
 def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndarray, name: str) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp", "-o", name)
-    assert result.exit_code == 0, result.output
+    succeeds("recon", "scan.h5", "-m", "fbp", "-o", name)
     assert left(folder) == {"scan.h5", name, "v.html"}
     with opened_volume(folder / name) as read:
         np.testing.assert_array_equal(read.volume.data[:], reference)
@@ -65,7 +61,7 @@ def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndar
     assert "volume that this program wrote" in refused.stderr or name not in ("v.tif", "v")
     said = beamline("info", name)
     assert said.exit_code == 0 and "2 x 40 x 40" in said.stdout
-    assert beamline("validate", name).exit_code == 0
+    succeeds("validate", name)
 
 
 def test_a_report_that_fails_takes_the_folder_of_slices_with_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,8 +80,7 @@ def _axis(lines: dict[str, str]) -> dict[str, str]:
 
 def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
     options = ("--steps", "10", "--gaussians", "100", "--seed", "2", "--no-report", "-o", "out.h5", "--json")
-    result = beamline("recon", "scan.h5", *options, "--views", "fixed:10", "--axis", "20.7", "--bin", "2")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", *options, "--views", "fixed:10", "--axis", "20.7", "--bin", "2")
     events = [json.loads(line) for line in result.stdout.splitlines()]
     events = [event for event in events if event.get("stage") != "phase"]
     assert events[0]["event"] == "recon_started"
@@ -100,34 +95,20 @@ def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
 
 
 def test_settings_reach_the_file(folder: Path) -> None:
-    options = (
-        "-m",
-        "fbp",
-        "--rows",
-        "1:2",
-        "--air",
-        "3,4",
-        "--filter",
-        "hann",
-        "--pixel-size-um",
-        "250",
-        "--no-report",
-    )
-    assert beamline("recon", "scan.h5", *options, "--axis", "20.7").exit_code == 0
+    options = "-m fbp --rows 1:2 --air 3,4 --filter hann --pixel-size-um 250 --no-report --axis 20.7"
+    succeeds("recon", "scan.h5", *options.split())
     parameters = read_reconstruction(folder / "scan_fbp.h5").parameters
     said = {name: parameters[name] for name in ("rows", "correction_air", "filter", "pixel_pitch")}
     assert said == {"rows": "1:2", "correction_air": "(3, 4)", "filter": "hann", "pixel_pitch": 0.25}
 
 
 def test_a_filter_with_an_iterative_method_is_of_the_fbp_it_is_compared_with(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--filter", "ram-lak", "--no-report")
-    assert result.exit_code == 0, result.output
+    succeeds("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--filter", "ram-lak", "--no-report")
     assert read_reconstruction(folder / "scan_sirt.h5").parameters["iterations"] == 2
 
 
 def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
     start = int(read_reconstruction(folder / "scan_r2.h5").parameters["gaussians_at_start"])
     assert f"Warning: The fit started from {start} Gaussians, not from 99999999" in result.stderr
     few = ("--gaussians", "50", "--finish", "0", "-o", "few.h5")
@@ -142,8 +123,7 @@ def test_the_default_of_steps_is_told_as_it_is() -> None:
 
 
 def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "--steps", "60", "--gaussians", "50", "--early-stop", "--no-report")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "--steps", "60", "--gaussians", "50", "--early-stop", "--no-report")
     assert "3 of 30 views are held out to say when to stop" in result.stderr
 
 
@@ -152,8 +132,8 @@ def test_a_measured_scan_from_hdf5_and_from_its_tiffs(folder: Path, shared_data:
     options = ("-m", "fbp", "--bin", "2", "--no-report")
     scan = shared_data / "diamond_24737_parallel_91x135x160.h5"
     tiffs = shared_data / "diamond_24737_tiff_series.zip"
-    assert beamline("recon", str(scan), *options, "-o", "a.h5").exit_code == 0
-    assert beamline("recon", str(tiffs), *options, "--angle-rows", "10:101", "-o", "b.h5").exit_code == 0
+    succeeds("recon", str(scan), *options, "-o", "a.h5")
+    succeeds("recon", str(tiffs), *options, "--angle-rows", "10:101", "-o", "b.h5")
     a, b = (read_reconstruction(folder / name) for name in ("a.h5", "b.h5"))
     assert a.parameters["axis_col"] == pytest.approx(85.75, abs=0.5)
     assert b.parameters["axis_col"] == pytest.approx(85.75, abs=0.5)
@@ -172,8 +152,7 @@ def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path,
 
 @pytest.mark.slow
 def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "--axis", "20.7", "--budget", "1s", "--no-report")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "--axis", "20.7", "--budget", "1s", "--no-report")
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
     assert "of 1 s; " in lines["chosen"]
     assert any(line.startswith("longer    ") for line in result.stdout.splitlines())
@@ -191,7 +170,7 @@ def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None
     levels = {4 + i: Level.ALARM for i in range(8, 18)}
     frames = [replace(f, counts=101 + f.counts // 25) if f.index in levels else f for f in frames_of(SCAN)]
     write_flagged(folder / "flagged.h5", frames, levels, SCAN.pixel_size_mm)
-    plain = ("-m", "sirt", "--iterations", "40", "--axis", "20.7", "--air", "none")
+    plain = ("-m", "sirt", "--iterations", "20", "--axis", "20.7", "--air", "none")
     for name in ("use", "ignore"):
         result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")  # with the report
         assert result.exit_code == 0, result.output
@@ -209,8 +188,7 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
     scan, options = str(shared_data / "diamond_24737_parallel_91x135x160.h5"), ("--axis", "85.75", "--rows", "60:64")
     scores, middle = {}, 79.5
     for rings in ("none", "auto"):
-        result = beamline("recon", scan, "-m", "fbp", "--rings", rings, *options, "--no-report", "-o", f"{rings}.h5")
-        assert result.exit_code == 0, result.output
+        result = succeeds("recon", scan, "-m", "fbp", "--rings", rings, *options, "--no-report", "-o", f"{rings}.h5")
         record = read_reconstruction(folder / f"{rings}.h5")
         scores[rings] = ring_score(record.volume.data[0], (middle, middle))
         assert record.parameters["rings"] == rings
@@ -227,8 +205,7 @@ def test_rings_need_columns(folder: Path) -> None:
 
 def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     way = ("--phase", "paganin:Al", "--energy-kev", "20", "--pixel-size-um", "1", "--no-report")
-    result = beamline("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
     said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["phase"])
     assert said in result.stderr and said.startswith("Phase: Paganin's filter over 5.4") and "delta/beta 295.8" in said
     for options, code, error in (
@@ -249,11 +226,9 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
     lens = "xcenter = 20.0\nycenter = 0.5\nfactor0 = 1.0\nfactor1 = 1e-5\n"
     (folder / "lens.txt").write_text(lens, encoding="utf-8")
     options = ("-m", "fbp", "--tilt", "-0.5", "--distortion", "lens.txt")
-    assert beamline("recon", "scan.h5", *options, "--dry-run").exit_code == 0
-    recipe = beamline("recon", "scan.h5", *options, "--write-config", "recipe.yaml")
-    assert recipe.exit_code == 0, recipe.output
-    result = beamline("recon", "scan.h5", "--config", "recipe.yaml")
-    assert result.exit_code == 0, result.output
+    succeeds("recon", "scan.h5", *options, "--dry-run")
+    succeeds("recon", "scan.h5", *options, "--write-config", "recipe.yaml")
+    result = succeeds("recon", "scan.h5", "--config", "recipe.yaml")
     found = read_reconstruction(folder / "scan_fbp.h5").parameters
     assert (found["tilt_deg"], found["distortion_col"], found["distortion_factors"]) == (-0.5, 20.0, "(1.0, 1e-05)")
     assert "Views are turned by -0.5 degrees." in result.stderr
@@ -273,8 +248,7 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
 
 
 def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--hardening", "Al:60kV,Al=1", "--no-report")
-    assert result.exit_code == 0, result.output
+    result = succeeds("recon", "scan.h5", "-m", "fbp", "--hardening", "Al:60kV,Al=1", "--no-report")
     said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["hardening"])
     assert said in result.stderr and said.startswith("Hardening: corrected by the curve of Al:60kV,Al=1")
     for options, error in (

@@ -1,13 +1,11 @@
 """Wrong commands of new users: the sentence names what the file or the word is, and what to type instead."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.cli.small_scan import beamline, left, succeeds
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -42,7 +40,7 @@ def test_the_sentence_names_what_it_is_and_what_to_type(case: str, folder: Path)
 
 
 def test_a_volume_to_reconstruct_is_named_with_its_method(folder: Path) -> None:
-    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "volume.h5", "--no-report").exit_code == 0
+    succeeds("recon", "scan.h5", "-m", "fbp", "-o", "volume.h5", "--no-report")
     result = beamline("recon", "volume.h5")
     assert result.exit_code == 5
     assert "is a volume, made by fbp" in " ".join(result.stderr.split()) and "beamline view" in result.stderr

@@ -1,7 +1,5 @@
 """What no single value's type can say is refused with its line: files, regions, outputs, triggers, controllers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Configuration: precedence, defaults, round trip, its plan, and its scenes."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The shipped templates: every key there is stands in them, and every alternative in a comment is one."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict
 from pathlib import Path

@@ -1,13 +1,10 @@
 """Section monitor: every limit of every check is a key with a type, a range and a default, and nothing else is."""
 
-from __future__ import annotations
-
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 
-from beamline.config.load import config_folder, load, resolved_yaml, schema
+from beamline.config.load import config_folder, load, schema
 from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
 from beamline.monitor.beam import BeamCheck
@@ -55,13 +52,6 @@ def test_a_limit_that_cannot_be_is_refused_with_the_legal_ones(word: str, messag
 def test_each_check_has_a_policy_and_by_default_its_own() -> None:
     read = policies(load(config_folder() / "demo.yaml", ["monitor.policy.beam=pause"], {}).monitor)
     assert read == {check.name: check.policy for check in CHECKS} | {"beam": Policy.PAUSE}
-
-
-def test_a_resolved_file_gives_the_same_checks(tmp_path: Path) -> None:
-    path = tmp_path / "resolved.yaml"
-    config = load(config_folder() / "demo.yaml", ["monitor.dark.drift=2"], {})
-    path.write_text(resolved_yaml(config), encoding="utf-8")
-    assert load(path, (), {}).monitor == config.monitor
 
 
 def test_the_schema_describes_every_limit() -> None:

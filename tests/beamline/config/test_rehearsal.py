@@ -1,7 +1,5 @@
 """A real configuration runs as it is with simulated devices, whatever its devices are; faults name their line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Rates of this machine are measured once, kept for a month, and only for the machine that they are of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """JSON lines of events keep their names and values: lines recorded from commands before events were classes."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every sink hears everything in order, and one that breaks or dawdles is nobody else's trouble."""
 
-from __future__ import annotations
-
 import threading
 
 from beamline.core.events import Event, KernelsCompiled, StateEntered
@@ -19,23 +17,6 @@ def test_all_sinks_hear_all_events_in_order_with_their_time() -> None:
             clock.sleep(1.0)
     assert [(e.event, e.time, e.data["n"]) for e in first] == [("progress", 100.0 + i, i) for i in range(50)]
     assert first == second
-
-
-def test_a_sink_that_breaks_is_given_up_and_the_others_are_told() -> None:
-    heard: list[Event] = []
-    calls = 0
-
-    def broken(event: Event) -> None:
-        nonlocal calls
-        calls += 1
-        raise BrokenPipeError("reader is gone")
-
-    with Announcer([broken, heard.append], VirtualClock()) as sink:
-        sink(StateEntered("idle", "a"))
-        sink(StateEntered("idle", "b"))
-    assert calls == 1
-    assert [e.event for e in heard] == ["warning", "state", "state"]
-    assert "reader is gone" in heard[0].data["message"]
 
 
 def test_a_sink_that_hangs_does_not_hold_up_who_speaks() -> None:
@@ -88,4 +69,6 @@ def test_two_sinks_that_break_at_once_are_each_given_up_once() -> None:
         sink(StateEntered("idle", "b"))
     assert [log.calls for log in logs] == [1, 1]
     assert [e.data["message"] for e in heard if e.event == "state"] == ["a", "b"]
-    assert sum("gets no further events" in e.data["message"] for e in heard) == 2
+    warnings = [e.data["message"] for e in heard if e.event == "warning"]
+    assert len(warnings) == 2
+    assert all("gets no further events" in text and "No space left" in text for text in warnings)

@@ -1,7 +1,5 @@
 """Only regular files of a sane size are read as text."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

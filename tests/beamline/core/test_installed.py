@@ -1,7 +1,5 @@
 """Other modules by the names of our packages are reported in one line, before anything else is imported."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

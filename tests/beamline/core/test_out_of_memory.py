@@ -1,7 +1,5 @@
 """Memory that is not there is no defect: under a limit of address space (ulimit -v), in the words of each library."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

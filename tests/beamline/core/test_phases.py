@@ -1,7 +1,5 @@
 """Phases: their seconds add up to the time since the start, whatever was done."""
 
-from __future__ import annotations
-
 import pytest
 
 from beamline.core.durations import Phases

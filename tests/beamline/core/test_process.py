@@ -1,7 +1,5 @@
 """A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -14,6 +12,7 @@ import pytest
 
 from beamline.core import process as module
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
+from tests.clock import wait_until
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 
@@ -30,7 +29,7 @@ time.sleep(100)
 WORKS = """
 import signal, sys, time
 def deliver(*_):
-    while time.process_time() < 2.0:
+    while time.process_time() < 1.2:
         pass
     print("delivered", flush=True)
     sys.exit(4)
@@ -46,7 +45,7 @@ time.sleep(100)
 """
 CHATTERS = """
 import time
-for n in range(8):
+for n in range(6):
     print(n, flush=True)
     time.sleep(0.1)
 """
@@ -75,8 +74,8 @@ def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
 
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
-    assert child.process.wait(seconds=0.5, grace=100.0) is ProcessEnd.OUT_OF_TIME
-    assert 0.5 <= time.monotonic() - begin < 30.0
+    assert child.process.wait(seconds=0.2, grace=100.0) is ProcessEnd.OUT_OF_TIME
+    assert 0.2 <= time.monotonic() - begin < 30.0
     assert not child.process.running
 
 
@@ -88,7 +87,7 @@ def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
 
 
 @posix
-@pytest.mark.parametrize(("grace", "hurry"), [(0.5, False), (100.0, True)])
+@pytest.mark.parametrize(("grace", "hurry"), [(0.2, False), (100.0, True)])
 def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hurry: bool) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
     assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is ProcessEnd.STOPPED
@@ -100,13 +99,12 @@ def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hur
 def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silence_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "FROZEN_AFTER", 1.5)  # so long may a busy machine give it no time
+    monkeypatch.setattr(module, "FROZEN_AFTER", 0.8)  # so long may a busy machine give it no time
     frozen, begin = _Child(tmp_path, DELIVERS), time.monotonic()
-    while not frozen.begun():
-        time.sleep(0.01)
+    wait_until(frozen.begun)
     psutil.Process(frozen.process._process.pid).suspend()
     assert frozen.process.wait(stop=frozen.begun, grace=100.0) is ProcessEnd.STOPPED
-    assert 1.5 <= time.monotonic() - begin < 30.0 and frozen.lines == ["begun"]
+    assert 0.8 <= time.monotonic() - begin < 30.0 and frozen.lines == ["begun"]
     works = _Child(tmp_path, WORKS)
     assert works.process.wait(stop=works.begun, grace=100.0) is ProcessEnd.STOPPED
     assert (works.lines, works.process.code) == (["begun", "delivered"], 4)
@@ -115,10 +113,9 @@ def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silenc
 def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) -> None:
     assert _Child(tmp_path, SLEEPS).process.wait(silence=0.5) is ProcessEnd.SILENT
     chatter = _Child(tmp_path, CHATTERS)
-    while not chatter.begun():  # the start of an interpreter is silent, too
-        time.sleep(0.01)
+    wait_until(chatter.begun)  # the start of an interpreter is silent, too
     assert chatter.process.wait(silence=0.5) is ProcessEnd.EXITED
-    assert len(chatter.lines) == 8
+    assert len(chatter.lines) == 6
 
 
 def test_silence_counts_from_the_wait(tmp_path: Path) -> None:
@@ -145,15 +142,12 @@ os._exit(0)
 """
     noticed = tmp_path / "noticed"
     subprocess.run([sys.executable, "-c", parent, str(noticed)], check=True, timeout=60)
-    until = time.monotonic() + 30
-    while not noticed.exists() and time.monotonic() < until:
-        time.sleep(0.05)
-    assert noticed.exists()
+    wait_until(noticed.exists)
 
 
 def test_the_end_of_a_process_that_is_tethered_leaves_no_open_pipe(tmp_path: Path) -> None:
     child = _Child(tmp_path, "import sys; print(sys.stdin.readline() == '')", tether=True)
-    assert child.process.wait(seconds=0.5) is ProcessEnd.OUT_OF_TIME  # stdin is open as long as we live
+    assert child.process.wait(seconds=0.2) is ProcessEnd.OUT_OF_TIME  # stdin is open as long as we live
     assert child.lines == []
 
 

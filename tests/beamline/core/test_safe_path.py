@@ -1,7 +1,5 @@
 """Files in the working folder with names of our modules, or of Python's own, are no part of any process we start."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Text of files is shown, and does nothing to a terminal; an advised number has three digits and keeps its side."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

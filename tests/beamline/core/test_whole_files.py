@@ -1,7 +1,5 @@
 """Whole files: what the disk refuses, or gives back otherwise, leaves nothing, and the older file untouched."""
 
-from __future__ import annotations
-
 import errno
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Composition root: a configuration becomes devices whose figures are those predicted; what cannot be is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Ask: a request is put to stderr and waits for Enter; where nobody sits, it says so."""
 
-from __future__ import annotations
-
 import io
 import sys
 

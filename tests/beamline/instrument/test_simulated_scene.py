@@ -1,7 +1,5 @@
 """What a simulator knows of its scene reaches the run: labels beside the file, a cone in it, or a refusal."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

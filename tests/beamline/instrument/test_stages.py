@@ -1,7 +1,5 @@
 """A stage from its configuration: its limits, its transcript, and the outputs that it has for a shutter."""
 
-from __future__ import annotations
-
 import math
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A turning sample of Gaussian blobs, as previews of 32 x 128 blocks: fast enough for scans of hundreds of views."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

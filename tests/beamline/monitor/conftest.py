@@ -1,7 +1,5 @@
 """Frames for the monitor's tests: discs in closed form, photon noise, offset; and faults put in by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any

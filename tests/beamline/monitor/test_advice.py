@@ -1,7 +1,5 @@
 """Every command, option and key of the configuration in the monitor's advice exists, and takes its value."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

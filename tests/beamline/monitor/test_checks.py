@@ -1,7 +1,5 @@
 """The registry of checks: bits that never move, limits that are values, and a check that needs only its line."""
 
-from __future__ import annotations
-
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every fault of the scene early_acquisition is found by its own check, and no check cries for the rest of the scan."""
 
-from __future__ import annotations
-
 import pytest
 import yaml
 

@@ -3,8 +3,6 @@
 Scans of balls by the formula of a sphere's chord, with photon noise, a beam with a profile, and stripes that drift.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

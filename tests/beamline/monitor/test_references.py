@@ -1,7 +1,5 @@
 """Groups of darks and flats with one fault each: the fault is found with its figure, and good groups have none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Frames whose neighbour in the file is none in angle: no check compares them with it, and true alarms stay."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What checks could not look at is said, with the number of views; a whole scan of even steps has nothing of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A view is the frame's line integrals on a grid of cells, and knows where there is light."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The checks together: silent on clean scans, several flags on one frame, means of the latest references."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -22,13 +20,13 @@ CONTEXT = ScanContext(saturation=65535, pixels=100)
 
 
 def test_a_clean_scan_raises_no_flag(fake: Any) -> None:
-    frames = fake.references() + fake.views(400) + fake.flats() + fake.darks()
+    frames = fake.references() + fake.views(250) + fake.flats() + fake.darks()
     assert fake.flags(frames) == []
 
 
 def test_a_clean_scan_in_jumping_order_raises_no_flag(fake: Any) -> None:
     frames = fake.references()
-    for i in range(200):
+    for i in range(120):
         frames += [replace(frame, trigger=i) for frame in fake.views(1, first=i * 77 % 360)]
     assert fake.flags(frames, period=None) == []
 

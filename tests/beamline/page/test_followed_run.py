@@ -1,7 +1,5 @@
 """Values of a run: what its log says, event by event."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from pathlib import Path

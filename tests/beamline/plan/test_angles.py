@@ -1,7 +1,5 @@
 """Angle plans: laws that hold for every number of views, passes and span."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Timeline: rows, pulses, times and limits against hand-worked figures and brute force."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Trigger trains: every view gets its pulse, at a whole count, whatever the plan and the stage's direction."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The report: valid, self-contained, escaped; its pictures show what their labels say."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re

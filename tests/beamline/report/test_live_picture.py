@@ -1,7 +1,5 @@
 """The picture of a growing volume: where things are in it, and that the difference is in units of the noise."""
 
-from __future__ import annotations
-
 import io
 import time
 

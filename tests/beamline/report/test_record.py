@@ -1,7 +1,5 @@
 """A fit's record goes into a file and comes back; the residual that judges it is that of views held out, if any."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Acquisition over the real stage driver and the simulated camera: what they lose is what is found missing."""
 
-from __future__ import annotations
-
 import math
 from uuid import uuid4
 
@@ -104,7 +102,7 @@ def test_lost_pulses_ignored_triggers_and_lost_frames_are_all_named(
     instrument.stage.close()
 
 
-@pytest.mark.parametrize("silent", [7, 12, 20])
+@pytest.mark.parametrize("silent", [12, 20])
 def test_a_camera_that_is_silent_at_the_end_of_a_pass_has_its_missing_frames_named(silent: int) -> None:
     """Up to the patience for a frame (2 s, 13 periods); a camera that is silent for longer ends the scan."""
     last = set(range(N - silent, N))
@@ -120,7 +118,7 @@ def test_a_camera_that_is_silent_at_the_end_of_a_pass_has_its_missing_frames_nam
     instrument.stage.close()
 
 
-@pytest.mark.parametrize("after", [1, 5, 12])
+@pytest.mark.parametrize("after", [1, 12])
 def test_a_stop_while_turning_keeps_the_angles_of_the_frames_on_their_way(after: int) -> None:
     instrument = FaultyInstrument(set(), set(), set())
     acquisition, frames, error = instrument.scan(StopRequest(), stop_after=after)

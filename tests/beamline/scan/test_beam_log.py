@@ -1,7 +1,5 @@
 """Beam log: every reading is kept and told, an outage is told once, and nothing that a monitor does touches a scan."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Mapping
 from dataclasses import replace

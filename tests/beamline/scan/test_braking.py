@@ -1,7 +1,5 @@
 """Frames of a stage that brakes: its motion confirms their triggers, or their number does, or nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

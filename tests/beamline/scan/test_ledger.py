@@ -1,7 +1,5 @@
 """Whatever is lost, ignored or added between trigger and file is named exactly, and every kept frame has its angle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from random import Random
 
@@ -10,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.core.errors import DataError
 from beamline.core.text import spans
 from beamline.scan.ledger import (
     EXTRA,
@@ -18,7 +15,6 @@ from beamline.scan.ledger import (
     DeliveredFrame,
     Ledger,
     LedgerEntry,
-    LedgerError,
     Train,
     assign,
     enter,
@@ -149,20 +145,12 @@ def test_the_stage_may_turn_a_little_faster_than_planned() -> None:
     assert [e.trigger for e in entries] == [i for i in range(n) if i not in (17, 300)]
 
 
-def test_an_ignored_first_trigger_is_found_from_the_expected_time() -> None:
-    fates = [IGNORED, IGNORED, OK, OK, OK]
-    _, account = book(Train(angles(5), PERIOD, FIRST, tolerance=0.4 * PERIOD), camera(fates, [0.3] * 5, PERIOD))
-    assert account.missing == (0, 1)
-    assert account.ignored == 2
-    assert account.shift == 0
-
-
 @pytest.mark.parametrize(("tolerance", "shift"), [(0.0, 0), (0.9, 0), (1.1, 1), (5.0, 2)])
 def test_a_vague_start_says_how_far_the_angles_may_be_off(tolerance: float, shift: int) -> None:
     fates = [OK, OK, OK, LOST, LOST]
     entries, account = book(Train(angles(5), PERIOD, FIRST, tolerance * PERIOD), camera(fates, [0.0] * 5, PERIOD))
     assert [e.trigger for e in entries] == [0, 1, 2]
-    assert account.shift == shift
+    assert account.shift == shift and not account.complete
 
 
 def test_an_angle_lost_at_the_start_could_be_lost_at_the_end() -> None:
@@ -196,20 +184,12 @@ def with_noise(n: int, *at: float, taken: float = 0.0) -> list[Sent]:
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 0.2, 0.7, 2.5], ids="start known to {} periods".format)
-@pytest.mark.parametrize("noise", [-3.4, -0.7, -0.6, -0.4, -0.3, -0.15, 0.2, 0.4])
-def test_noise_around_the_first_trigger_costs_no_view(tolerance: float, noise: float) -> None:
-    sent = with_noise(12, noise)
+@pytest.mark.parametrize("noise", [(-3.4,), (-0.7,), (-0.6,), (-0.4,), (-0.3,), (-0.15,), (0.2,), (0.4,), (-2.6, -0.3)])
+def test_noise_around_the_first_trigger_costs_no_view(tolerance: float, noise: tuple[float, ...]) -> None:
+    sent = with_noise(12, *noise)
     entries, account = book(Train(angles(12), PERIOD, FIRST, tolerance * PERIOD), sent)
     assert [entry.trigger for entry in entries] == [frame.trigger for frame in sent]
-    assert account.missing == () and len(account.extra) == 1
-
-
-@pytest.mark.parametrize("tolerance", [0.2, 2.5])
-def test_two_pulses_of_noise_before_the_first_trigger_cost_no_view(tolerance: float) -> None:
-    sent = with_noise(12, -2.6, -0.3)
-    entries, account = book(Train(angles(12), PERIOD, FIRST, tolerance * PERIOD), sent)
-    assert [entry.trigger for entry in entries] == [frame.trigger for frame in sent]
-    assert account.missing == () and len(account.extra) == 2
+    assert account.missing == () and len(account.extra) == len(noise)
 
 
 @given(st.lists(st.integers(1, 28), min_size=1, max_size=4, unique=True), st.floats(0.12, 0.49))
@@ -245,11 +225,6 @@ def test_a_spurious_exposure_that_is_lost_too_is_no_lost_trigger() -> None:
     assert (account.lost, account.ignored, account.missing) == (0, 0, ())
 
 
-def test_a_silent_camera_misses_everything() -> None:
-    account = settle(Ledger(Train(angles(4), PERIOD, FIRST)))
-    assert (account.missing, account.lost, account.ignored, account.extra, account.shift) == ((0, 1, 2, 3), 0, 0, (), 0)
-
-
 def test_a_frame_delivered_twice_is_extra() -> None:
     ledger, _ = assign(Ledger(Train(angles(4), PERIOD, FIRST)), 0, FIRST)
     ledger, entry = assign(ledger, 0, FIRST)
@@ -257,14 +232,6 @@ def test_a_frame_delivered_twice_is_extra() -> None:
     ledger, entry = assign(ledger, 1, FIRST + PERIOD)
     assert entry.trigger == 1
     assert settle(ledger).extra == (0,)
-
-
-def test_complete_after_the_last_trigger() -> None:
-    ledger = Ledger(Train(angles(2), PERIOD, FIRST))
-    ledger, _ = assign(ledger, 0, FIRST)
-    assert not ledger.complete
-    ledger, _ = assign(ledger, 1, FIRST + PERIOD)
-    assert ledger.complete
 
 
 @given(st.sets(st.integers(0, 50)))
@@ -281,13 +248,6 @@ def test_spans_name_each_index_once(indices: set[int]) -> None:
 def test_spans_of_many_groups_end_with_the_number() -> None:
     assert spans([3, 7, 8, 9, 12]) == "3, 7-9, 12"
     assert spans(range(0, 40, 2), limit=3) == "0, 2, 4, ... (20 in all)"
-
-
-def test_the_error_carries_the_missing_rows_and_the_code_for_bad_data() -> None:
-    error = LedgerError("2 frames missing", [3, 4])
-    assert error.missing == (3, 4)
-    assert isinstance(error, DataError)
-    assert error.exit_code == 5
 
 
 @pytest.mark.parametrize(("n", "period"), [(0, 1.0), (3, 0.0), (3, float("nan"))])

@@ -1,7 +1,5 @@
 """Kill -9 of a scan while its live reconstruction works: the reconstruction ends, and the run has one whole volume."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

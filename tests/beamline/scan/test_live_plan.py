@@ -1,7 +1,5 @@
 """The live volume that fits beside a scan, and what is said of it."""
 
-from __future__ import annotations
-
 import pytest
 
 from beamline.config.load import config_folder, load, plan_of

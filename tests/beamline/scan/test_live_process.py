@@ -1,9 +1,6 @@
 """The live reconstruction beside a scan: its story is told among ours; neither its life nor its death costs a frame."""
 
-from __future__ import annotations
-
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +19,7 @@ from beamline.scan.live_process import LiveReconstruction, follow_command
 from beamline.scan.run import run_scan
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
+from tests.clock import wait_until
 
 
 def test_what_it_leaves_out_is_told_to_the_follower() -> None:
@@ -35,8 +33,8 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
 READY = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
 
 
-def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
-    return lambda scan, output: [sys.executable, "-c", READY + code, str(scan), str(output)]
+def script(code: str, ready: str = READY) -> Callable[[Path, Path], Sequence[str]]:
+    return lambda scan, output: [sys.executable, "-c", ready + code, str(scan), str(output)]
 
 
 def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
@@ -49,9 +47,6 @@ pathlib.Path(sys.argv[2]).write_text("volume")
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
 """
     ran = Ran(tmp_path, FakeInstrument(), live=script(code))
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.folder is not None
     recon = [(e.event, e.data["source"]) for e in ran.events if "source" in e.data]
     assert recon == [("state", "recon"), ("snapshot", "recon"), ("recon_done", "recon")]
     assert ran.result.recon is not None
@@ -76,14 +71,12 @@ while "{waits_for}" not in events.read_text():
 """
         + READY
     )
-    ran = Ran(
-        tmp_path, FakeInstrument(), live=lambda scan, output: [sys.executable, "-c", compiles, str(scan), str(output)]
-    )
+    ran = Ran(tmp_path, FakeInstrument(), live=script(compiles, ready=""))
     assert ran.error is None
     names = [(event.event, event.data.get("state")) for event in ran.events]
     blocks = [i for i, (name, _) in enumerate(names) if name == "block_started"]
     views = next(i for i in blocks if ran.events[i].data["kind"] == "projection")
-    warned = any("not ready after 0 s" in event.data["message"] for event in ran.of("warning"))
+    warned = any("not ready after 0 s" in text for text in ran.warnings)
     assert warned == (patience == 0)
     assert warned or names.index(("state", "ready")) < views
     assert blocks[0] < views  # darks and flats of a simulated instrument are taken meanwhile
@@ -91,37 +84,39 @@ while "{waits_for}" not in events.read_text():
         assert blocks[0] < names.index(("state", "ready"))
 
 
-def test_a_stop_ends_the_wait_for_it(tmp_path: Path) -> None:
+def test_a_stop_ends_the_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.0)
     stop, idle = StopRequest(), "import time; time.sleep(100)"
 
     def stop_after_flats(event: Event) -> None:
         if event.event == "block_done" and event.data["kind"] == "flat":
             stop.stop()
 
-    ran = Ran(
-        tmp_path, FakeInstrument(), stop=stop, live=lambda scan, output: [sys.executable, "-c", idle],
-        heard=stop_after_flats,
-    )  # fmt: skip
+    live = script(idle, ready="")
+    ran = Ran(tmp_path, FakeInstrument(), stop=stop, live=live, heard=stop_after_flats)
     assert type(ran.error) is ScanStopped and "Stopped after 0 of 12 projections" in str(ran.error)
 
 
 @pytest.mark.parametrize(
-    ("code", "says"),
+    ("live", "says"),
     [
-        ("import sys; sys.exit('out of memory')", "ended with code 1"),
-        ("pass", "ended with code 0"),
-        ('print(\'{"event": "failed", "message": "no axis", "exit_code": 5}\'); raise SystemExit(5)', "no axis"),
+        (script("import sys; sys.exit('out of memory')"), "ended with code 1"),
+        (script("pass"), "ended with code 0"),
+        (
+            script("""print('{"event": "failed", "message": "no axis", "exit_code": 5}'); raise SystemExit(5)"""),
+            "no axis",
+        ),
+        (lambda scan, output: [str(output / "no such program")], "could not be started"),
     ],
 )
-def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: str, says: str) -> None:
-    ran = Ran(tmp_path, FakeInstrument(), live=script(code))
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.folder is not None
+def test_a_live_reconstruction_that_dies_touches_nothing(
+    tmp_path: Path, live: Callable[[Path, Path], Sequence[str]], says: str
+) -> None:
+    ran = Ran(tmp_path, FakeInstrument(), live=live)
     assert ran.result.recon is None
-    assert any(says in event.data["message"] for event in ran.of("warning"))
+    assert any(says in text for text in ran.warnings)
     ran.assert_good_file(19, "complete")
-    if "memory" in code:
+    if says.endswith("1"):
         assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
 
 
@@ -138,17 +133,11 @@ pathlib.Path(sys.argv[2]).write_text("volume")
 print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}}))
 """
 
-    def wait(number: int) -> None:
-        deadline = time.monotonic() + 60
-        while (
-            number == 10
-            and time.monotonic() < deadline
-            and not ("recon_done" in said or sum("again" not in text for text in said if "has ended" in text))
-        ):
-            time.sleep(0.02)
+    def wait() -> None:
+        wait_until(lambda: "recon_done" in said or any("again" not in text for text in said if "has ended" in text))
 
     said: list[str] = []
-    instrument = FakeInstrument(on_frame=wait)
+    instrument = FakeInstrument(at={10: wait})
     result = run_scan(
         small(), tmp_path, [lambda event: said.append(str(event.data.get("message", event.event)))],
         live=script(code), instrument=instrument.connected(),
@@ -159,38 +148,16 @@ print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_co
     assert (result.recon is not None) == (times == 1)
 
 
-def test_one_that_dies_in_the_scan_is_told_at_once(tmp_path: Path) -> None:
-    def wait_for_the_warning(number: int) -> None:
-        deadline = time.monotonic() + 20
-        while number == 10 and "warning" not in said and time.monotonic() < deadline:
-            time.sleep(0.02)
-
-    said: list[str] = []
-    instrument = FakeInstrument(on_frame=wait_for_the_warning)
-    live = script("raise SystemExit(1)")
-    result = run_scan(
-        small(), tmp_path, [lambda event: said.append(event.event)], live=live, instrument=instrument.connected()
-    )
-    assert result.n_frames == 19 and said.index("warning") < said.index("scan_done")
-
-
-def test_a_live_reconstruction_that_cannot_start_is_a_warning(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, FakeInstrument(), live=lambda scan, output: [str(tmp_path / "no such program")])
-    assert ran.error is None
-    assert any("could not be started" in event.data["message"] for event in ran.of("warning"))
-    ran.assert_good_file(19, "complete")
-
-
 def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:
     stop = StopRequest()
     ran = Ran(
         tmp_path,
-        FakeInstrument(on_frame=lambda number: stop.abort() if number == 10 else None),
+        FakeInstrument(at={10: stop.abort}),
         stop=stop,
         live=script("import time; time.sleep(100)"),
     )
     assert type(ran.error) is ScanAborted
-    assert any("it was stopped" in event.data["message"] for event in ran.of("warning"))
+    assert any("it was stopped" in text for text in ran.warnings)
 
 
 def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
@@ -248,19 +215,10 @@ time.sleep(100)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
-def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: Path) -> None:
-    live = _Live(tmp_path, DELIVERS)
-    done = live.process.finish(stop=lambda: "progress" in live.said, hurry=lambda: False)
-    assert done is not None
-    assert done["output"] == str(tmp_path / "recon.h5")
-    assert "warning" not in live.said
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 def test_after_a_stopped_scan_the_volume_comes_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.5)
     stop = StopRequest()
-    instrument = FakeInstrument(on_frame=lambda number: stop.stop() if number == 10 else None)
+    instrument = FakeInstrument(at={10: stop.stop})
     ran = Ran(tmp_path, instrument, stop=stop, live=script(DELIVERS))
     assert type(ran.error) is ScanStopped
     assert [event.data["output"] for event in ran.of("recon_done")] == [str(ran.folder / "recon.h5")]  # type: ignore[operator]
@@ -287,11 +245,11 @@ def test_a_scan_with_enough_views_waits_for_its_volume(tmp_path: Path, monkeypat
     monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.0)
     fits = """
 import json, sys, time
-time.sleep(1)
+time.sleep(0.5)
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=True)
 """
     stop = StopRequest()
-    instrument = FakeInstrument(on_frame=lambda number: stop.stop_as_enough("enough") if number == 10 else None)
+    instrument = FakeInstrument(at={10: lambda: stop.stop_as_enough("enough")})
     ran = Ran(tmp_path, instrument, stop=stop, live=script(fits))
     assert type(ran.error) is ScanStopped and "enough" in str(ran.error)
     assert len(ran.of("recon_done")) == 1 and stop.enough
@@ -353,16 +311,16 @@ with h5py.File(sys.argv[1]) as file:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
-def test_in_a_hurry_it_is_not_waited_for(tmp_path: Path) -> None:
-    live = _Live(tmp_path, DELIVERS.replace("sys.exit(4)", "time.sleep(100)").replace('"done"', '"progress"'))
-    assert live.process.finish(stop=lambda: "progress" in live.said, hurry=lambda: True) is None
-    assert live.said[-1] == "warning"
-
-
-class _Live:
-    """A live reconstruction without a scan, and the events that it passed on."""
-
-    def __init__(self, folder: Path, code: str) -> None:
-        self.said: list[str] = []
-        command = script(code)(folder / "scan.h5", folder / "recon.h5")
-        self.process = LiveReconstruction(command, folder / "recon.log", lambda event: self.said.append(event.event))
+@pytest.mark.parametrize("hurry", [False, True])
+def test_one_that_is_ended_may_deliver_what_it_has_but_in_a_hurry_it_is_not_waited_for(
+    tmp_path: Path, hurry: bool
+) -> None:
+    said: list[str] = []
+    code = DELIVERS.replace("sys.exit(4)", "time.sleep(100)").replace('"done"', '"progress"') if hurry else DELIVERS
+    command = script(code)(tmp_path / "scan.h5", tmp_path / "recon.h5")
+    live = LiveReconstruction(command, tmp_path / "recon.log", lambda event: said.append(event.event))
+    done = live.finish(stop=lambda: "progress" in said, hurry=lambda: hurry)
+    if hurry:
+        assert done is None and said[-1] == "warning"
+    else:
+        assert done is not None and done["output"] == str(tmp_path / "recon.h5") and "warning" not in said

@@ -1,7 +1,5 @@
 """Scans with a sample that a motor moves, and with a stage behind a motor record, on the simulated instrument."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bad darks and flats stop a scan before its first projection: a named end, a safe instrument, a readable file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +22,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline import fakes
+from tests.beamline.ball_scan import shipped
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran
 
@@ -55,39 +54,27 @@ def test_no_projection_is_taken_after_references_that_cannot_be_used(
         assert source.finished and len(list(source.frames())) == done.data["n_frames"]
 
 
-def test_the_operator_may_want_the_scan_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("wanted", "told"), [("references.on_fault=log", 1), ("references.light_in_darks=0.9", 0)])
+def test_the_operator_may_want_the_scan_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: str, told: int
+) -> None:
     monkeypatch.setitem(fakes.LEVEL, False, 15000)
-    ran = Ran(tmp_path, FakeInstrument(), "references.on_fault=log")
-    assert ran.error is None and ran.result is not None and ran.result.n_frames == 19
-    assert len([event for event in ran.of("warning") if "there is light" in event.data["message"]]) == 1
-
-
-def test_a_limit_of_the_configuration_is_the_one_that_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(fakes.LEVEL, False, 15000)
-    ran = Ran(tmp_path, FakeInstrument(), "references.light_in_darks=0.9")
-    assert ran.error is None and ran.of("warning") == []
+    ran = Ran(tmp_path, FakeInstrument(), wanted)
+    assert ran.result.n_frames == 19
+    assert ["there is light" in text for text in ran.warnings] == [True] * told
 
 
 def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def lose_the_beam(number: int) -> None:
-        if number == 16:  # three darks, two flats, twelve views
-            monkeypatch.setitem(fakes.LEVEL, True, 210)
-
-    ran = Ran(tmp_path, FakeInstrument(on_frame=lose_the_beam))
-    assert ran.error is None and ran.result is not None
-    assert ran.result.reference_faults == tuple(event.data["message"] for event in ran.of("warning"))
-    assert [e.data["message"][:46] for e in ran.of("warning")] == ["The flats 17-18: there is no beam in them: the"]
+    last_view = 16  # after three darks and two flats
+    ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
+    assert ran.result.reference_faults == tuple(ran.warnings)
+    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: there is no beam in them: the"]
 
 
 def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fakes.LEVEL, True, 2000)
-
-    def find_the_beam(number: int) -> None:
-        if number == 5:  # three darks, two flats
-            monkeypatch.setitem(fakes.LEVEL, True, 20000)
-
-    ran = Ran(tmp_path, FakeInstrument(on_frame=find_the_beam), "scan.flats.at=start")
-    assert ran.error is None and ran.result is not None
+    instrument = FakeInstrument(at={5: lambda: monkeypatch.setitem(fakes.LEVEL, True, 20000)})  # the first view
+    ran = Ran(tmp_path, instrument, "scan.flats.at=start")
     (fault,) = ran.result.reference_faults
     assert fault.startswith("The flats 3-4: they have 9.09% of the light of the views (limit 50%)")
     assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
@@ -96,13 +83,9 @@ def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypat
 def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> None:
     """Its flats are saturated everywhere with 95 ms: the electrolyte would read 0.14 instead of 0.48 1/mm."""
     words = [
-        "scan.exposure_s=0.095",
-        "scan.period_s=0.1",
-        "simulation.clock=virtual",
-        "scan.darks.count=3",
-        "scan.flats={count: 3, at: start}",
-    ]
-    words += ["devices.camera.roi=[1140, 1968, 24, 160]"]
+        "scan.exposure_s=0.095", "scan.period_s=0.1", "simulation.clock=virtual", "scan.darks.count=3",
+        "scan.flats={count: 3, at: start}", "devices.camera.roi=[1140, 1968, 24, 160]",
+    ]  # fmt: skip
     events: list[Event] = []
     with pytest.raises(ReferencesError, match=r"flats 3-5: 100\.00%"):
         run_scan(load(config_folder() / "demo.yaml", words, {}), tmp_path, [events.append])
@@ -181,18 +164,10 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
     scene = tmp_path / "scene.yaml"
     scene.write_text((config_folder() / "scenes" / "low_dose.yaml").read_text().replace("s: 300.0", "s: 290.0"))
     events: list[Event] = []
-    config = load(
-        config_folder() / "simulated.yaml",
-        [
-            f"simulation.scene={scene}",
-            "simulation.clock=virtual",
-            "scan.angles.views=4",
-            "scan.mode=step",
-            "recon.live=false",
-            "scan.exposure_s=0.05",
-        ],
-        environment={},
-    )
+    config = shipped(
+        "simulated", f"simulation.scene={scene}", "simulation.clock=virtual", "scan.angles.views=4", "scan.mode=step",
+        "recon.live=false", "scan.exposure_s=0.05",
+    )  # fmt: skip
     run_scan(config, tmp_path / "runs", [events.append])
     told = [i for i, event in enumerate(events) if "Too little light" in str(event.data.get("message"))]
     views = [i for i, e in enumerate(events) if e.event == "block_started" and e.data["kind"] == "projection"]

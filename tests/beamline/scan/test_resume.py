@@ -1,10 +1,7 @@
 """A run that ended early goes on: its missing views, and no others, join those that it has, whose files stay as they
 are."""
 
-from __future__ import annotations
-
 import hashlib
-import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -33,12 +30,11 @@ from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.changed import OverlaidSource
 from beamline.storage.readers.open import open_scan
-from beamline.storage.writer_lock import QUIET, WriterLock
+from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
-from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import FrameKind
-from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
-from tests.beamline.ran import Ran, small
+from tests.beamline.fakes import FakeInstrument, Faults, assert_true
+from tests.beamline.ran import Ran, killed, small
 
 FIRST = 5  # 3 darks and 2 flats
 VIEWS = 12
@@ -53,32 +49,30 @@ MODES = {
 def _stopped(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int, abort: bool) -> Path:
     stop = StopRequest()
     act = stop.abort if abort else stop.stop
-    ran = Ran(runs, FakeInstrument(on_frame=lambda n: act() if n == at else None), *overrides, stop=stop)
-    assert ran.folder is not None
+    ran = Ran(runs, FakeInstrument(at={at: act}), *overrides, stop=stop)
     return ran.folder
 
 
 def _killed(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
-    """As kill -9 leaves it: with the frames so far, marked as being written, a while ago."""
+    with killed(monkeypatch):
+        return _stopped(runs, monkeypatch, *overrides, at=at, abort=True)
 
-    def die(writer: NXtomoWriter, *_: object) -> None:
-        shutil.copy(writer.path, writer.path.with_name("died.h5"))
-        close(writer)
 
-    close = NXtomoWriter.close
-    with monkeypatch.context() as patch:
-        patch.setattr(NXtomoWriter, "close", die)
-        folder = _stopped(runs, monkeypatch, *overrides, at=at, abort=True)
-    (folder / "died.h5").replace(folder / "scan.h5")
-    when = (folder / "scan.h5").stat().st_mtime - 2 * QUIET
-    os.utime(folder / "scan.h5", (when, when))
-    return folder
+@pytest.fixture(scope="module")
+def aborted_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        return _stopped(tmp_path_factory.mktemp("runs"), patch, at=FIRST + 4, abort=True)
+
+
+@pytest.fixture
+def run(aborted_once: Path, tmp_path: Path) -> Path:
+    """A run with four views."""
+    return shutil.copytree(aborted_once, tmp_path / "runs" / aborted_once.name)
 
 
 def _lossy(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
     """To its end, with three views lost, two of them side by side, one the last."""
     ran = Ran(runs, FakeInstrument(Faults(lost={FIRST + 2}, ignored={FIRST + 3, FIRST + VIEWS - 1})), *overrides)
-    assert ran.folder is not None
     return ran.folder
 
 
@@ -108,16 +102,12 @@ def _assert_whole(path: Path, references: int) -> None:
     views = [frame for frame in frames if frame.kind is FrameKind.PROJECTION]
     assert sorted(frame.trigger for frame in views) == list(range(VIEWS))
     assert sum(frame.kind in (FrameKind.DARK, FrameKind.FLAT) for frame in frames) == references
-    for frame in frames:
-        count, is_open, is_in, _ = decode(frame.counts)
-        assert is_open is (frame.kind is not FrameKind.DARK)
-        assert is_in is (frame.kind is not FrameKind.FLAT)
-        assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
+    assert_true(frames)
 
 
 @pytest.mark.parametrize(
     ("end", "mode"),
-    [("killed", "fly"), ("killed", "step"), ("stopped", "interlaced"), ("aborted", "backwards"), ("lossy", "fly")],
+    [("killed", "step"), ("stopped", "interlaced"), ("aborted", "backwards"), ("lossy", "fly")],
 )
 def test_only_the_missing_views_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, mode: str) -> None:
     run = ENDS[end](tmp_path, monkeypatch, *MODES[mode], at=FIRST + 4)
@@ -148,7 +138,7 @@ def test_a_killed_run_is_recovered_by_the_way_and_can_be_resumed_again(
     run = _killed(tmp_path, monkeypatch, at=FIRST + 3)
     stop = StopRequest()
     with pytest.raises(BeamlineError, match="Stopped after 8 of 12 projections"):
-        _go_on(run, FakeInstrument(on_frame=lambda n: stop.stop() if n == FIRST + 3 else None), stop=stop)
+        _go_on(run, FakeInstrument(at={FIRST + 3: stop.stop}), stop=stop)
     with open_for_resume(run) as series:
         assert (len(series.parts), series.views) == (2, frozenset(range(8)))
     assert _go_on(run).path == run / "joined.h5"
@@ -185,8 +175,7 @@ def _assert_told_of_parts(run: Path) -> None:
     assert (facts["missing_triggers"], facts["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
 
 
-def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path) -> None:
     _go_on(run)
     _assert_told_of_parts(run)
     ingest(run / "joined.h5", tmp_path / "ingested.h5")
@@ -205,14 +194,12 @@ def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypat
 
 def _without_a_flat(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
     ran = Ran(runs, FakeInstrument(Faults(lost={at + 1})), *overrides)
-    assert ran.folder is not None
     return ran.folder
 
 
 @pytest.mark.parametrize(
     ("end", "taken", "overrides"),
     [
-        (_killed, "FF", ()),
         (_without_a_flat, "FF", ()),
         (ENDS["aborted"], "FFDDD", ("scan.darks.at=both", "scan.mode=step")),
         (ENDS["aborted"], "FF", ("scan.flats.at=end",)),
@@ -261,17 +248,12 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(
     assert _go_on(run).n_frames == FIRST + VIEWS + 1 + 2
 
 
-def test_verbs_reach_the_newest_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_verbs_reach_the_newest_part(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "EFFECT_WITHIN", 0.2)
     told: list[tuple[list[Path], str]] = []
 
-    def stop(number: int) -> None:
-        if number == FIRST:
-            told.append((running(tmp_path), tell(run, Verb.ABORT)))
-
     with pytest.raises(BeamlineError, match="Aborted"):
-        _go_on(run, FakeInstrument(on_frame=stop))
+        _go_on(run, FakeInstrument(at={FIRST: lambda: told.append((running(run.parent), tell(run, Verb.ABORT)))}))
     assert told == [([run], State.ACQUIRING)]
 
 
@@ -282,6 +264,11 @@ def _unreadable(run: Path) -> None:
 def _other_exposure(run: Path) -> None:
     said = (run / "config.resolved.yaml").read_text()
     (run / "config.resolved.yaml").write_text(said.replace("exposure_s: 0.02", "exposure_s: 0.03"))
+
+
+def _without_plan(run: Path) -> None:
+    with h5py.File(run / "scan.h5", "r+", libver=layout.LIBVER) as file:
+        file["/entry/record/plan"][()] = "{}"
 
 
 def _other_camera(run: Path) -> None:
@@ -295,13 +282,11 @@ def _other_camera(run: Path) -> None:
     [
         (_unreadable, "not the folder of a run"),
         (_other_exposure, "another configuration: `exposure_s: 0.02`, not `exposure_s: 0.03`"),
+        (_without_plan, "has no plan"),
         (_other_camera, "another camera: model another one; now there is model fake camera"),
     ],
 )
-def test_what_cannot_go_on_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Path], None], said: str
-) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_what_cannot_go_on_is_refused_in_one_line(run: Path, change: Callable[[Path], None], said: str) -> None:
     change(run)
     before = {path: _digest(path) for path in run.rglob("*") if path.is_file()}
     with pytest.raises(BeamlineError, match=said) as refused:
@@ -311,8 +296,7 @@ def test_what_cannot_go_on_is_refused_in_one_line(
     assert {path: _digest(path) for path in run.rglob("*") if path.is_file()} == before
 
 
-def test_a_run_that_another_process_holds_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_a_run_that_another_process_holds_is_refused(run: Path) -> None:
     lock = WriterLock(run / "scan.h5")
     with pytest.raises(ConfigError, match="open in another process"):
         _go_on(run)
@@ -327,8 +311,7 @@ def test_a_run_that_another_process_holds_is_refused(tmp_path: Path, monkeypatch
     assert not (run / "part-2").exists()
 
 
-def test_a_new_part_that_took_nothing_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_a_new_part_that_took_nothing_does_not_matter(run: Path) -> None:
     stop = StopRequest()
 
     def began(series: ResumableRun) -> None:
@@ -351,32 +334,16 @@ def test_a_new_part_that_took_nothing_does_not_matter(tmp_path: Path, monkeypatc
         assert (source.image_key == FrameKind.PROJECTION).sum() == VIEWS
 
 
-def test_a_run_that_ended_in_its_darks_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _killed(tmp_path, monkeypatch, at=1)
-    _go_on(run)
-    _assert_whole(run / "joined.h5", 2 + 7)
-    assert [finding for finding in validate(run / "joined.h5") if finding.severity == "error"] == []
-
-
-def test_a_part_counts_by_its_file_where_its_events_were_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+def test_a_part_counts_by_its_file_where_its_events_were_lost(run: Path) -> None:
     stop = StopRequest()
     with pytest.raises(BeamlineError):
-        _go_on(run, FakeInstrument(on_frame=lambda n: stop.abort() if n == FIRST + 3 else None), stop=stop)
+        _go_on(run, FakeInstrument(at={FIRST + 3: stop.abort}), stop=stop)
     with open_for_resume(run) as series:
         views = series.views
     (run / "part-2" / "events.jsonl").write_bytes(b"")
     with open_for_resume(run) as series:
         assert (len(series.parts), series.views, series.left_out) == (2, views, ())
     assert [done.path.parent.name for done in recover_run(run)[0]] == [run.name, "part-2", run.name]
-
-
-def test_a_file_without_its_plan_is_not_taken_for_a_whole_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
-    with h5py.File(run / "scan.h5", "r+", libver=layout.LIBVER) as file:
-        file["/entry/record/plan"][()] = "{}"
-    with pytest.raises(BeamlineError, match="has no plan"):
-        _go_on(run)
 
 
 def test_only_a_file_that_is_drawn_from_is_a_part(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """A run's folder is its own, and so are its logs: nothing that is there is taken over or written over."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -28,7 +26,6 @@ def _run(runs: Path, at: int | None = None, *, abort: bool = True) -> Path:
             (stop.abort if abort else stop.stop)()
 
     ran = Ran(runs, FakeInstrument(on_frame=end), stop=stop)
-    assert ran.folder is not None
     return ran.folder
 
 

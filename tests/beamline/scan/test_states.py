@@ -1,7 +1,5 @@
 """The table of states is closed, and the page draws it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

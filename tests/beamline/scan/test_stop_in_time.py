@@ -1,7 +1,5 @@
 """Stop and abort from every surface, in every state of a scan, while other verbs are under way: within 2 s."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import sys

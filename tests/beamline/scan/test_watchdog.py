@@ -1,7 +1,5 @@
 """A scan whose process is killed or frozen leaves a stage that stands and a closed shutter."""
 
-from __future__ import annotations
-
 import io
 import os
 import re
@@ -27,6 +25,7 @@ from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
 from simulators.wires.registry import WIRES
 from tests.beamline.ball_scan import COMMON
+from tests.clock import wait_until
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.simulators.wires.transports import serve_tcp
 
@@ -88,28 +87,18 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
         command = [sys.executable, "-c", SCAN, str(tmp_path), *([HASTY] if frozen == "scan" else [])]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as scan:
             assert scan.stdout is not None and scan.stdout.readline().strip() == b"it turns"
-            time.sleep(0.5)
+            time.sleep(0.2)
             assert line.angle_at(clock.now()) > 0
             assert controller.output_is_high(2) is outputs
             if frozen == "watchdog":
                 (first,) = children_with("beamline.scan.watchdog", scan.pid)
                 first.suspend()
-                deadline = time.monotonic() + 60
-                while first in children_with("beamline.scan.watchdog", scan.pid) or not children_with(
-                    "beamline.scan.watchdog", scan.pid
-                ):
-                    assert time.monotonic() < deadline
-                    time.sleep(0.02)
+                wait_until(lambda: children_with("beamline.scan.watchdog", scan.pid) not in ([], [first]))
             scan.send_signal(signal.SIGSTOP) if frozen == "scan" else scan.kill()
-        deadline, text = time.monotonic() + 60, ""
-        while time.monotonic() < deadline and "disarmed" not in text:
-            time.sleep(0.1)
-            text = log.read_text(encoding="utf-8") if log.exists() else ""
-        assert (
-            ("did nothing for 6 s and counts as dead" if frozen == "scan" else "has died") in text
-            and "told to stop" in text
-            and "disarmed" in text
-        )
+        wait_until(lambda: log.exists() and "disarmed" in log.read_text(encoding="utf-8"))
+        text = log.read_text(encoding="utf-8")
+        assert ("did nothing for 6 s and counts as dead" if frozen == "scan" else "has died") in text
+        assert "told to stop" in text
         assert ("Close the beam shutter." in text) is ("moved by hand" in text) is not outputs
         assert ("its shutter is closed" in text) is outputs
         stood = line.angle_at(clock.now())
@@ -200,7 +189,7 @@ def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: 
         (process,) = children_with("beamline.scan.watchdog")
         for request in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
             process.send_signal(request)
-        time.sleep(1.0)
+        time.sleep(0.3)
         assert process.is_running() and process.status() != psutil.STATUS_ZOMBIE
     assert told == [] and not (tmp_path / WATCHDOG_LOG).exists()
 
@@ -217,9 +206,7 @@ def test_a_watchdog_that_died_or_froze_is_told_and_replaced_or_the_scan_pauses(
     monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", f"print('ready', flush=True); {then}"))
     told, stop, pause = list[str](), StopRequest(), PauseRequest()
     with watched(tmp_path, lambda event: told.append(event.data["message"]), stop, pause if paused else None):
-        deadline = time.monotonic() + 60
-        while not any(", too" in text for text in told) and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: any(", too" in text for text in told))
     assert sum(what in text and "another one is started" in text for text in told) == watchdog.AGAIN
     assert ("no watchdog runs" in pause.reason) is paused and not stop.stopping
 
@@ -231,9 +218,7 @@ def test_a_scan_that_was_taken_for_dead_ends_and_says_so(tmp_path: Path, monkeyp
     )
     told, stop = list[str](), StopRequest()
     with watched(tmp_path, lambda event: told.append(event.data["message"]), stop):
-        deadline = time.monotonic() + 60
-        while not stop.aborting and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(lambda: stop.aborting)
     assert "the watchdog made the instrument safe" in stop.reason and "The scan ends" in told[-1]
 
 
@@ -244,9 +229,7 @@ def test_the_system_is_asked_not_to_shut_down_where_it_can_be(tmp_path: Path, mo
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with inhibited():
-        deadline = time.monotonic() + 60
-        while not asked.exists() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_until(asked.exists)
         assert "--what=shutdown:sleep" in asked.read_text() and "--mode=block" in asked.read_text()
         (process,) = children_with("systemd-inhibit")
     assert not process.is_running()

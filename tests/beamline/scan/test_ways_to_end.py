@@ -1,7 +1,5 @@
 """However a scan ends: with all its frames, or with an exit code that is not 0. A check or an output ends none."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 import time
@@ -161,6 +159,6 @@ def test_a_check_that_hangs_costs_no_frame_and_holds_up_no_end(
     n = 12 if aborted else FRAMES
     assert type(ran.error) is (ScanAborted if aborted else type(None))
     ran.assert_good_file(n, "stopped" if aborted else "complete")
-    off, unjudged = (event.data["message"] for event in ran.of("warning"))
+    off, unjudged = ran.warnings
     assert "The check mass has not come back from frame 7" in off
     assert f"The monitor did not look at {n - 7} frames (7-{n - 1})" in unjudged

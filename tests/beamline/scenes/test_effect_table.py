@@ -1,7 +1,5 @@
 """The effects with their parameters, without a look at the source."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import pytest

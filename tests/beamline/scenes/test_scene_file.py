@@ -1,7 +1,5 @@
 """Scene files: volumes are sought beside the scene, wherever it is opened from, by the simulated instrument too."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The labels of a simulated scan, read back."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Labels of anomalies: runs of frames, kept in JSON and read back."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

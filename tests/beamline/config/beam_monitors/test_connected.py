@@ -1,7 +1,5 @@
 """A beam monitor of a configuration is connected with the instrument, or its simulated counterpart is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The figure of sharpness is that of an edge in closed form; views that lose detail are flagged, others are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import erf, pi
 
@@ -29,7 +27,7 @@ def rise(distance: int, sigma: float) -> float:
     return distance * erf(distance / s) - s / pi**0.5 * (1 - np.exp(-((distance / s) ** 2)))
 
 
-@pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("sigma", [0.7, 4.0])
 def test_the_figure_of_an_edge_is_that_of_its_blur(sigma: float) -> None:
     cols = np.arange(COLS) - 60 - np.repeat(np.linspace(0, 1, 8, endpoint=False), STRIP)[:, None]
     edge = (0.7 + 0.15 * erf_of(cols / sigma / 2**0.5)) * 1e4
@@ -77,7 +75,7 @@ def blurred(first: int, last: int, sigma: float | tuple[float, float]) -> Change
     return lambda view, light: gaussian_filter(light, sigma) if first <= view < last else light
 
 
-@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("sigma", [1.0, 3.0])
 def test_views_out_of_focus_are_flagged_and_no_others(sigma: float) -> None:
     flags = scan(blurred(40, 45, sigma))
     assert [flag.frame for flag in flags] == [46, 47, 48, 49, 50]

@@ -1,7 +1,5 @@
 """A step of the light is flagged in its view, with its size; spots of single frames are counted. Nothing else is."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +11,7 @@ from beamline.monitor.detector.light import VIEWS, GainCheck, ZingersCheck
 from beamline.monitor.digest import digest
 from beamline.monitor.view import Spots, spots_of
 from drivers.base.frame import Frame
-from tests.beamline.monitor.blobs import COLS, Blobs
+from tests.beamline.monitor.blobs import COLS, Blobs, Change
 
 
 def of_gain(scan: Blobs) -> list[Flag]:
@@ -32,18 +30,17 @@ def test_a_single_dim_view_is_two_steps() -> None:
     assert [(flag.frame, round(flag.score, 2)) for flag in flags] == [(40, -0.05), (41, 0.05)]
 
 
-def test_drift_top_up_and_half_a_percent_are_no_step() -> None:
-    def light(view: int, image: np.ndarray) -> np.ndarray:
-        return image * np.exp(-view / 500) * (1 + 0.005 * (view >= 40))
-
-    assert of_gain(Blobs(80, counts=light)) == []
+def drift_and_half_a_percent(view: int, light: np.ndarray) -> np.ndarray:
+    return light * np.exp(-view / 500) * (1 + 0.005 * (view >= 40))
 
 
-def test_fog_is_no_step() -> None:
-    def fog(view: int, light: np.ndarray) -> np.ndarray:
-        return light * (1 + 0.3 * np.exp(-0.5 * ((np.arange(COLS) - 128 + 8 * (view - 40)) / 20) ** 2))
+def fog(view: int, light: np.ndarray) -> np.ndarray:
+    return light * (1 + 0.3 * np.exp(-0.5 * ((np.arange(COLS) - 128 + 8 * (view - 40)) / 20) ** 2))
 
-    assert of_gain(Blobs(80, counts=fog)) == []
+
+@pytest.mark.parametrize("counts", [drift_and_half_a_percent, fog])
+def test_other_changes_of_the_light_are_no_step(counts: Change) -> None:
+    assert of_gain(Blobs(80, counts=counts)) == []
 
 
 SATURATION, BIN = 65535, 4
@@ -72,19 +69,14 @@ def test_every_spot_is_counted_with_its_saturated_pixels(
     assert spots(frame, before) == Spots(n, saturated)
 
 
-def test_what_stays_is_none(fake: Any, rng: np.random.Generator) -> None:
-    before, frame = fake.views(2)
+def test_what_stays_and_few_photons_are_none(fake: Any, rng: np.random.Generator) -> None:
+    before, frame, *scarce = fake.views(4)
     for each in (before, frame):
         each.counts[10, 20] = each.counts[31, 50] = 60_000  # hot
         each.counts[:, 70:72] = 30_000  # a gap
-    assert spots(frame, before).n == 0
-
-
-def test_few_photons_are_none(rng: np.random.Generator, fake: Any) -> None:
-    before, frame = fake.views(2)
-    for each in (before, frame):
+    for each in scarce:
         each.counts[:] = 200 + 40 * rng.poisson(5, each.counts.shape)
-    assert spots(frame, before).n == 0
+    assert spots(frame, before).n == spots(*scarce[::-1]).n == 0
 
 
 def only(fake: Any, frames: Sequence[Frame]) -> list[Flag]:

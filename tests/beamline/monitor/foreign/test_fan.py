@@ -1,7 +1,5 @@
 """The filters see what is faster than the sample, and neither what turns with it, nor rings, nor the beam."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What crosses the field faster than the sample turns is a floater; what turns with the sample never is."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any
@@ -14,7 +12,7 @@ from beamline.monitor import watch
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.foreign.floater import FloaterCheck
 from beamline.monitor.foreign.track import SLOWEST
-from tests.beamline.monitor.blobs import BLOCK, COLS, STEP, Blobs, blob
+from tests.beamline.monitor.blobs import BLOCK, COLS, STEP, Blobs, blob, unchanged
 
 BEGINS = 40
 
@@ -30,10 +28,6 @@ def crossing(speed: float, depth: float = 0.05, row: float = 12.0, size: float =
         return image + blob(row, speed * (view - BEGINS), size, depth) if view >= BEGINS - 5 else image
 
     return change
-
-
-def test_a_sample_that_turns_has_none() -> None:
-    assert only(Blobs(120)) == []
 
 
 def raised(scan: Blobs) -> list[tuple[int, Flag]]:
@@ -104,15 +98,6 @@ def test_a_crumb_that_comes_and_goes_within_the_field_is_flagged_there_only() ->
     assert len(marked & shown) >= 15 and len(marked - shown) <= 2
 
 
-def test_what_changes_its_depth_on_the_way_is_none() -> None:
-    """Texture that lies on a line by chance."""
-
-    def change(view: int, image: NDArray[np.float64]) -> NDArray[np.float64]:
-        return image + blob(12, 3.0 * (view - BEGINS), 0.75, 0.3 * (view % 3 == 0))
-
-    assert only(Blobs(100, depth=change)) == []
-
-
 def test_it_is_flagged_in_most_of_the_views_that_show_it() -> None:
     flags = only(Blobs(120, depth=crossing(2.0)))
     marked = {row for flag in flags for row in range(flag.first or flag.frame, flag.frame + 1)}
@@ -123,17 +108,20 @@ def test_it_is_flagged_in_most_of_the_views_that_show_it() -> None:
 @pytest.mark.parametrize(
     "change",
     [
+        unchanged,
         lambda view, image: image + blob(12, 63.5 + 60 * np.cos(view * STEP - 1.5), 0.75, 0.5),  # turns at the rim
         lambda view, image: image + 0.3 * (np.arange(COLS) == 50),  # a ring
         lambda view, image: image + 0.03 * (view % 2),  # the beam flickers
+        lambda view, image: image + blob(12, 3.0 * (view - BEGINS), 0.75, 0.3 * (view % 3 == 0)),  # chance texture
+        lambda view, image: Blobs().line_integrals(view, (0.0, 1.0)) if view >= 50 else image,
     ],
-    ids=["rim", "ring", "flicker"],
+    ids=["nothing", "rim", "ring", "flicker", "texture", "jump"],
 )
 def test_what_stays_or_turns_is_none(change: Any) -> None:
     assert only(Blobs(90, depth=change)) == []
 
 
-def test_zingers_are_none() -> None:
+def test_zingers_and_what_is_seen_at_uneven_angles_are_none() -> None:
     rng = np.random.default_rng(8)
 
     def zingers(view: int, light: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -141,18 +129,8 @@ def test_zingers_are_none() -> None:
         light[rows, cols] += rng.exponential(5_000, 2)
         return light
 
-    assert only(Blobs(200, counts=zingers)) == []
-
-
-def test_a_jump_of_the_sample_is_none() -> None:
-    scan = Blobs(90)
-    scan.depth = lambda view, image: scan.line_integrals(view, (0.0, 1.0)) if view >= 50 else image
-    assert only(scan) == []
-
-
-def test_uneven_angles_are_left_alone() -> None:
-    scan = Blobs(60, depth=crossing(2.0), step=float(np.radians(77)))
-    assert only(scan) == []
+    assert only(Blobs(120, counts=zingers)) == []
+    assert only(Blobs(60, depth=crossing(2.0), step=float(np.radians(77)))) == []
 
 
 def test_steps_of_any_size_overflow_nothing() -> None:

@@ -1,7 +1,5 @@
 """Fog crosses all rows of the field; neither the sample, nor a crumb, nor the beam looks like it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Views against what a volume lets expect: differences are flagged with their place, misfits that stay are not."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

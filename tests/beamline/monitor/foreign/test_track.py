@@ -1,10 +1,9 @@
 """The statistic of a track: its false alarms follow from noise, and it finds a line that no single view shows."""
 
-from __future__ import annotations
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from beamline.monitor.foreign.track import MEMORY, Octave, SampleMotion, Track, tracks_of, with_view
 
@@ -12,18 +11,24 @@ SHAPE, NOISE, LIGHT = (32, 128), 0.004, 0.4
 SAMPLE = SampleMotion(np.radians(0.2), (63.5,), 70.0)
 
 
-def played(views: int, depth: float, speed: float, least: float, octave: int = 1, seed: int = 5) -> list[Track]:
-    """Tracks with a score above `least` in views of noise, with a blob that moves `speed` cells a view in row 16."""
-    rng, state, found = np.random.default_rng(seed), Octave(octave), list[Track]()
+def looks(
+    views: int, depth: float, col: Callable[[int], float], least: float, octave: int = 1, sample: SampleMotion = SAMPLE
+) -> Iterator[list[Track]]:
+    """Tracks with a score above `least` after each of some views of noise, with a blob at a column of row 16."""
+    rng, state = np.random.default_rng(5), Octave(octave)
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
     weight = np.full(SHAPE, LIGHT, np.float32)
     for view in range(views):
-        blob = depth * np.exp(-0.5 * (((rows - 16) ** 2 + (cols - speed * (view - 20)) ** 2) / 0.8**2))
+        blob = depth * np.exp(-0.5 * (((rows - 16) ** 2 + (cols - col(view)) ** 2) / 0.8**2))
         image = (1 + blob + rng.normal(0, NOISE / np.sqrt(LIGHT), SHAPE)).astype(np.float32)
         before = state.n
         state = with_view(state, view, float(view), image, weight)
-        found += tracks_of(state, SAMPLE, least) if state.n > before else []
-    return found
+        yield tracks_of(state, sample, least) if state.n > before else []
+
+
+def played(views: int, depth: float, speed: float, least: float, octave: int = 1) -> list[Track]:
+    """All of them, of a blob that moves `speed` cells a view."""
+    return [track for look in looks(views, depth, lambda view: speed * (view - 20), least, octave) for track in look]
 
 
 @pytest.mark.parametrize("octave", [1, 2])
@@ -47,14 +52,7 @@ def test_a_crumb_far_below_the_peak_of_any_view_is_found_by_all_of_them() -> Non
 
 @pytest.mark.parametrize("speed", [-4.0, 2.0, 6.0])
 def test_the_score_grows_as_the_root_of_the_views(speed: float) -> None:
-    rng = np.random.default_rng(1)
-    weight, state, tracks = np.full(SHAPE, LIGHT, np.float32), Octave(1), list[Track]()
-    rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    for view in range(45):
-        at: NDArray[np.float64] = (cols - (64 + speed * (view - 22))) ** 2
-        image = 1 + 0.02 * np.exp(-0.5 * ((rows - 16) ** 2 + at) / 0.8**2) + rng.normal(0, 0.006, SHAPE)
-        state = with_view(state, view, float(view), image.astype(np.float32), weight)
-        tracks += tracks_of(state, SAMPLE, 6.0)[:1]
+    tracks = [look[0] for look in looks(45, 0.02, lambda view: 64 + speed * (view - 22), 6.0) if look]
     lengths = [len(track.steps) for track in tracks]
     assert max(lengths) <= MEMORY and max(lengths) > 1.5 * min(lengths)
     ratios = [track.score / np.sqrt(len(track.steps)) for track in tracks]
@@ -62,14 +60,8 @@ def test_the_score_grows_as_the_root_of_the_views(speed: float) -> None:
 
 
 def test_a_point_of_the_sample_has_itself_as_rival() -> None:
-    rng = np.random.default_rng(4)
-    sample = SampleMotion(np.radians(2.0), (63.5,), 66.0)
-    weight, state, tracks = np.full(SHAPE, LIGHT, np.float32), Octave(1), list[Track]()
-    rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    for view in range(90):
-        at = (cols - (63.5 + 60 * np.sin(np.radians(2.0) * (view - 45)))) ** 2
-        image = 1 + 0.2 * np.exp(-0.5 * ((rows - 16) ** 2 + at) / 0.8**2) + rng.normal(0, 0.006, SHAPE)
-        state = with_view(state, view, float(view), image.astype(np.float32), weight)
-        tracks += tracks_of(state, sample, 7.0)
+    turn, sample = np.radians(2.0), SampleMotion(np.radians(2.0), (63.5,), 66.0)
+    seen = looks(90, 0.2, lambda view: 63.5 + 60 * np.sin(turn * (view - 45)), 7.0, sample=sample)
+    tracks = [track for look in seen for track in look]
     assert tracks
     assert all(track.score**2 - track.rival**2 < 36 or track.rival > 0.85 * track.score for track in tracks)
