@@ -1,5 +1,7 @@
 """A scan in memory that notes what is read of it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
