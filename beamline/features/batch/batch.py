@@ -9,8 +9,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import TypeAdapter
-
 from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
@@ -53,9 +51,6 @@ class BatchRow:
     @property
     def has_volume(self) -> bool:
         return self.state in ("done", "poor")
-
-
-_ROWS = TypeAdapter(list[BatchRow])
 
 
 @dataclass(frozen=True)
@@ -281,10 +276,13 @@ def _read(folder: Path) -> list[BatchRow]:
     Raises:
         DataError: it cannot be read.
     """
+    from pydantic import TypeAdapter  # here, since help loads this module
+
     path = folder / TABLE
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return _ROWS.validate_python([{k: v for k, v in row.items() if v} for row in csv.DictReader(file)])
+            rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
+            return TypeAdapter(list[BatchRow]).validate_python(rows)
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
 

@@ -39,8 +39,8 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
     assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
     # With patches, where time is left for their 35 steps, for the trials of total variation and for those of patches.
-    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (857.0, 858.0)]
-    assert found == [(8, 350.0, True), (None, 857.5, True)]
+    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (1207.0, 1208.0)]
+    assert found == [(8, 350.0, True), (None, 1207.5, True)]
 
 
 def test_sweeps_that_are_given_keep_their_whole_share_of_the_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
