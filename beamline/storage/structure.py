@@ -112,9 +112,10 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                         groups.append((h5py.h5g.open(group, name), depth + 1))
                     elif info.type == h5py.h5o.TYPE_DATASET:
                         dataset = h5py.h5d.open(group, name)
-                        _refuse_empty_claim(dataset, f"{path}: {name.decode('utf-8', 'replace')}")
-                        _refuse_foreign_bytes(dataset, path, name.decode("utf-8", "replace"))
-                        yield from _drawn_on(dataset)
+                        made, text = dataset.get_create_plist(), name.decode("utf-8", "replace")
+                        _refuse_empty_claim(dataset, made, f"{path}: {text}")
+                        _refuse_foreign_bytes(dataset, made, path, text)
+                        yield from _drawn_on(made)
 
 
 def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
@@ -125,19 +126,18 @@ def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
     group.links.iterate(take, info=True)
 
 
-def _refuse_empty_claim(dataset: Any, what: str) -> None:
+def _refuse_empty_claim(dataset: Any, made: Any, what: str) -> None:
     """DataError for a dataset of more bytes than any compression makes of what is stored of it."""
     n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
-    if n < CLAIMED or dataset.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
+    if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()):
         raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
-def _refuse_foreign_bytes(dataset: Any, path: Path, name: str) -> None:
+def _refuse_foreign_bytes(dataset: Any, made: Any, path: Path, name: str) -> None:
     """DataError for values in a file of any kind (HDF5's external storage), unless they are numbers, and that file is
     below the folder of this one, is not hidden and is no text: so it may hold images, and it is no file of others."""
-    made = dataset.get_create_plist()
     for i in range(made.get_external_count()):
         other, root = os.fsdecode(made.get_external(i)[0]), path.resolve().parent
         for place in _places(other, path):
@@ -162,8 +162,7 @@ def _is_text(path: Path) -> bool:
     return bool(text) and all(c.isprintable() or c.isspace() for c in text)
 
 
-def _drawn_on(dataset: Any) -> Iterator[str]:
-    made = dataset.get_create_plist()
+def _drawn_on(made: Any) -> Iterator[str]:
     if made.get_layout() == h5py.h5d.VIRTUAL:
         for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
             if (name := made.get_virtual_filename(i)) != ".":
