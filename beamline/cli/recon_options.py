@@ -227,7 +227,7 @@ recon_options = together(
         repeated=False,
         is_flag=True,
         hidden=True,
-        help="Ends with its scan; its output is the run's.",
+        help="End when stdin does, with the process that started this one.",
     ),
     heading(OUTPUT),
     json_option,

@@ -263,7 +263,7 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
-    dense, empty = (int(np.count_nonzero(mask == kind)) for kind in (1, 0))
+    dense, empty = (sum(int(np.count_nonzero(part == kind)) for part in mask) for kind in (1, 0))
     if not dense or not empty:
         raise ValueError(f"the mask marks {dense} dense and {empty} empty voxels; both are needed")
 

@@ -204,7 +204,12 @@ class PnpDct(VoxelMethod):
     @property
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * self.iterations
+        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * self.trial_steps
+
+    @property
+    def trial_steps(self) -> int:
+        """Those of a volume, of which the usual number tells enough: noise enters with the first ones."""
+        return min(self.iterations, PnpDct.iterations)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         ended, sweeps = False, 0 if x.any() else self.first_sweeps
@@ -224,7 +229,7 @@ class PnpDct(VoxelMethod):
             return x
         share = self.patch_threshold
         if share is None:
-            strength = choose_patches(problem, weight, trial, self.iterations).strength
+            strength = choose_patches(problem, weight, trial, self.trial_steps).strength
         else:
             strength = problem.decide("threshold", lambda: share * density_unit(x))
         further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
@@ -232,7 +237,7 @@ class PnpDct(VoxelMethod):
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         first = FistaTv().costs(geometry, grid)
-        choice = patch_choice(geometry, grid, self.iterations) if self.patch_threshold is None else Work()
+        choice = patch_choice(geometry, grid, self.trial_steps) if self.patch_threshold is None else Work()
         work = first.volumes[FistaTv.name] + patch_steps(geometry, grid, self.iterations)
         return Costs({self.name: work}, first.choice + choice)
 

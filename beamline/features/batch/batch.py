@@ -267,7 +267,17 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
 
 def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
     recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-    return ["recon", scan, *recipe, "--output", str(work / RECON), "--log", str(work / "log.txt"), "--json"]
+    return [
+        "recon",
+        scan,
+        *recipe,
+        "--output",
+        str(work / RECON),
+        "--log",
+        str(work / "log.txt"),
+        "--beside-scan",
+        "--json",
+    ]
 
 
 def _read(folder: Path) -> list[BatchRow]:
@@ -276,13 +286,17 @@ def _read(folder: Path) -> list[BatchRow]:
     Raises:
         DataError: it cannot be read.
     """
-    from pydantic import TypeAdapter  # here, since help loads this module
+    from pydantic import TypeAdapter, ValidationError  # here, since help loads this module
 
     path = folder / TABLE
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [{name: value for name, value in row.items() if value} for row in csv.DictReader(file)]
-            return TypeAdapter(list[BatchRow]).validate_python(rows)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [{name: value for name, value in row.items() if name and value} for row in csv.DictReader(file)]
+        return TypeAdapter(list[BatchRow]).validate_python(rows)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"
+        raise DataError(f"{path} is no table of a batch ({place}: {first['msg']}). Nothing was touched.") from error
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
 

@@ -252,13 +252,14 @@ def _run(
     job: TrialJob, work: Path, max_seconds: float | None
 ) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
     """The last event of a process that does the job, and how it ended, see `run_to_end`."""
-    path, events = work / "job.json", [dict[str, Any]()]
+    path, last = work / "job.json", dict[str, Any]()
     with named_on_failure(path):
         path.write_bytes(JOB.dump_json(job))
 
     def on_line(line: str) -> None:
-        events.append(json_object(line) or events[-1])
+        nonlocal last
+        last = json_object(line) or last
 
     limit = math.inf if max_seconds is None else max_seconds
     ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=limit)
-    return events[-1], ended
+    return last, ended

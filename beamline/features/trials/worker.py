@@ -2,8 +2,8 @@
 
 `python -m beamline.features.trials.worker JOB` reads the job and its arrays, and prints the result as JSON. A job may
 also be to compile what trials will need, once for all of them: compiling takes memory that would otherwise count as
-the first trial's. Its stdin is a pipe that nothing is written to: when it ends,
-the parent process has ended, and this one ends, too.
+the first trial's. Its stdin is a pipe that nothing is written to: when it ends, the parent process has ended, and this
+one ends, too.
 """
 
 from __future__ import annotations

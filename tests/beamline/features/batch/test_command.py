@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from beamline.core.process import ProcessEnd
@@ -19,6 +20,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
+from tests.clock import wait_until
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,7 +38,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         command: Sequence[str], log: Path, on_line: Callable[[str], None], silence: float
     ) -> tuple[ProcessEnd, int, str]:
         log.touch()
-        result = beamline(*command[len(COMMAND) :])
+        result = beamline(*(word for word in command[len(COMMAND) :] if word != "--beside-scan"))  # there is no pipe
         for text in result.stdout.splitlines():
             on_line(text)
         return ProcessEnd.EXITED, result.exit_code, (result.stderr.splitlines() or [""])[-1]
@@ -190,3 +192,24 @@ def test_rows_of_an_earlier_call_keep_their_names() -> None:
     rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
     assert [row.name for row in rows] == ["scan", "run2_scan"]
     assert command.batch.name == "batch"
+
+
+def test_a_killed_batch_leaves_no_reconstruction_behind(folder: Path) -> None:
+    """It would go on in the folder of the next call."""
+    Path("recipe.yaml").write_text("method: sirt\niterations: 10000000\naxis: 19.5\n")
+    process = psutil.Popen([*COMMAND, "batch", "scan.h5", "--config", "recipe.yaml", "-o", "out"])
+    wait_until(lambda: any(Path("out").glob(".*.partial/log.txt")))
+    children = process.children(recursive=True)
+    process.kill()
+    process.wait()
+    assert children and not psutil.wait_procs(children, 30)[1]
+
+
+def test_a_table_that_somebody_changed_is_refused_with_the_place(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\n")
+    Path("out").mkdir()
+    Path("out/recipe.yaml").write_text("method: fbp\n")
+    Path("out/batch.csv").write_text("name,scan,state\na,a.h5,broken\n", encoding="utf-8-sig")
+    result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
+    assert result.exit_code == 5
+    assert "row 1, state" in result.stderr
