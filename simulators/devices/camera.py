@@ -21,7 +21,7 @@ from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, Tr
 from simulators.devices.in_beam import CameraView, Exposed
 from simulators.devices.trigger_line import TriggerLine
 from simulators.effects.chain import Label
-from simulators.effects.sensor import CONVERSION, OFFSET
+from simulators.frame.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError, Detector
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import CameraSettings
-from simulators.effects.sensor import CONVERSION
+from simulators.frame.sensor import CONVERSION
 from simulators.frame.shot import AngleAt, Detector, Shot
 from simulators.scenes.scene import Scene
 

@@ -18,7 +18,7 @@ from drivers.base.frame import FrameKind
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
 from simulators.effects.catalogue import Domain
 from simulators.effects.chain import StepHook
-from simulators.effects.sensor import CONVERSION, digitise, largest_count
+from simulators.frame.sensor import CONVERSION, digitise, largest_count
 from simulators.frame.shot import AngleAt, Detector, Image, Pose, Shot
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import Scene

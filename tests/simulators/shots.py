@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.sensor import CONVERSION
+from simulators.frame.sensor import CONVERSION
 from simulators.frame.shot import AngleAt, Detector, Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulators.effects.sensor import CONVERSION, OFFSET, READ_NOISE
+from simulators.frame.sensor import CONVERSION, OFFSET, READ_NOISE
 from simulators.scenes.scene import Scene
 from tests.simulators import chance, shots
 

@@ -16,8 +16,8 @@ from beamline.features.xafs.contrast import ContrastRegions
 from beamline.features.xafs.series import Series, line_integrals
 from beamline.scenes.scene_file import open_scene
 from beamline.simulate import volumes_beside
-from simulators.effects.sensor import largest_count
 from simulators.frame.mapping import SceneError
+from simulators.frame.sensor import largest_count
 from simulators.light.beam import Beam
 from simulators.samples.materials.parts import Mixture
 from simulators.samples.materials.spectrum import Attenuation, light

@@ -18,7 +18,7 @@ from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.effects.sensor import CONVERSION
+from simulators.frame.sensor import CONVERSION
 from simulators.scenes.scene import load_scene
 from tests.drivers.orca_bench import SETTINGS, orca_bench, says_what_an_orca_says
 from tests.simulators import chance

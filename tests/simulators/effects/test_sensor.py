@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.effects import sensor
 from simulators.effects.sensor import (
     FEW,
     Adc,
@@ -19,8 +18,9 @@ from simulators.effects.sensor import (
     PhotonNoise,
     ReadNoise,
     Saturation,
-    digitise,
 )
+from simulators.frame import sensor
+from simulators.frame.sensor import digitise
 from simulators.frame.shot import CannotExposeError
 from tests.simulators import chance, shots
 

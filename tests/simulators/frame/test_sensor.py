@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.orca_quest import LINE_TIME
-from simulators.effects.sensor import (
+from simulators.frame.sensor import (
     CONVERSION,
     FULL_WELL,
     LARGEST_PHOTON_NUMBER,

@@ -21,7 +21,7 @@ from beamline.instrument.connect import connect
 from beamline.monitor.references import ReferenceLimits
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import LightPath
-from simulators.effects.sensor import CONVERSION, OFFSET
+from simulators.frame.sensor import CONVERSION, OFFSET
 from tests.beamline.acquired import assert_safe
 from tests.beamline.ball_scan import shipped, with_scene
 from tests.beamline.cli.small_scan import beamline
