@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.effects import sensor
 from simulators.effects.exposure import BeamProfile, MotionBlur
+from simulators.frame import sensor
 from simulators.frame.shot import Detector
 from simulators.scenes.expose import expose
 from tests.simulators import shots

@@ -12,9 +12,9 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from simulators.effects import sensor
 from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
 from simulators.effects.chain import Chain
+from simulators.frame import sensor
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector, Shot
 from simulators.scenes.expose import expose

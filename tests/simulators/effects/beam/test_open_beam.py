@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from simulators.effects import sensor
 from simulators.effects.beam.open_beam import BeamBend, BlackBand, LostBeam, NarrowField, RingCurrent
 from simulators.effects.chain import Label
+from simulators.frame import sensor
 from simulators.frame.shot import Detector
 from tests.simulators import anomalies, shots
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from simulators.effects import sensor
 from simulators.effects.detector.optics import Afterglow, FlatStructure, ScintillatorBlur, discrete_gaussian, gauss_rule
+from simulators.frame import sensor
 from simulators.frame.shot import Detector, Moments, Shot, fixed_rng
 from tests.simulators import shots
 

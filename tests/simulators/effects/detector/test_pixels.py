@@ -10,8 +10,8 @@ from scipy import stats
 from drivers import orca_quest
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.effects import sensor
 from simulators.effects.detector.pixels import DeadPixels, HotPixels, Prnu, RollingShutter, Zingers
+from simulators.frame import sensor
 from simulators.frame.shot import CannotExposeError, Moments
 from tests.simulators import chance, shots
 

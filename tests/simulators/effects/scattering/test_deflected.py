@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from simulators.effects import sensor
 from simulators.effects.chain import VISIBLE
 from simulators.effects.scattering.deflected import Crumb, Floaters, Scatter
+from simulators.frame import sensor
 from simulators.frame.shot import Detector, Shot
 from tests.simulators import anomalies, shots
 
