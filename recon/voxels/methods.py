@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Count, Natural, NonNegative
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, WEAKER
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
@@ -283,7 +283,7 @@ def choose_patches(
         if found is None:
             return [first, 0]
         judge.remember("patches", found)
-        return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
+        return [WEAKER * found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))

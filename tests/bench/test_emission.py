@@ -68,8 +68,9 @@ CASES: dict[str, Method] = {
 
 @pytest.mark.bench
 @pytest.mark.timeout(900)
-def test_contrast_against_noise() -> None:
-    made = events(PHANTOM, Detector.centred(SHAPE, PITCH), GEOMETRY.angles, Scanner(TRUES), seed=0)
+@pytest.mark.parametrize("trues", [TRUES, TRUES / 10, TRUES / 100])
+def test_contrast_against_noise(trues: float) -> None:
+    made = events(PHANTOM, Detector.centred(SHAPE, PITCH), GEOMETRY.angles, Scanner(trues), seed=0)
     emission, scale = recon.Emission(made.counts, GEOMETRY, made.survival, made.background), made.scale
     found: dict[str, dict[str, float]] = {}
     for name, method in CASES.items():
@@ -82,7 +83,8 @@ def test_contrast_against_noise() -> None:
         print(f"| {name} | {' | '.join(f'{value:.3g}' for value in row.values())} |")
     assert found["OSEM"]["dB"] > max(found[name]["dB"] for name in CASES if "FBP" in name) + 1
     assert found["PnP-DCT"]["dB"] > found["OSEM"]["dB"] + 3
-    converged = found["OSEM, 20 iterations of 10 subsets"]
-    assert max(converged["air"], converged["teflon"], found["R²"]["air"], found["R²"]["teflon"]) < 0.05
-    assert converged["hot 11 mm"] > 0.9
-    assert found["R²"]["noise"] < 0.5 * min(row["noise"] for name, row in found.items() if "OSEM" in name)
+    if trues == TRUES:
+        converged = found["OSEM, 20 iterations of 10 subsets"]
+        assert max(converged["air"], converged["teflon"], found["R²"]["air"], found["R²"]["teflon"]) < 0.05
+        assert converged["hot 11 mm"] > 0.9
+        assert found["R²"]["noise"] < 0.5 * min(row["noise"] for name, row in found.items() if "OSEM" in name)
