@@ -107,7 +107,7 @@ def test_slabs_that_follow_fit_together(rng: np.random.Generator) -> None:
 
 
 def test_few_photons_get_the_strength_that_the_volume_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials of fewer steps let in less noise than the volume does, and preferred too little: 16 % beside twice that."""
+    """Trials of fewer steps let in less noise than the volume does, and preferred too little: 16 % beside twice it."""
     rng = np.random.default_rng(0)
     geometry = Geometry.parallel(np.linspace(0, np.pi, 36, endpoint=False), (4, 48), pixel_pitch=1.0)
     y, x = np.indices((48, 48)) - 23.5
