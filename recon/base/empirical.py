@@ -25,10 +25,6 @@ cement, +0.2, -0.3 of FISTA-TV; with all of it -0.2, 0.0 and -0.3, -0.3 (docs/nu
 
 # How do patches work?
 
-WEAKER = 0.8
-"""Of the strength that predicts views held out best, which noise of a volume troubles less than its edges do. Without:
--0.3 dB on the demo, -0.8 dB on a PET of 1.5e7 counts; at 100 photons it costs 0.2 dB."""
-
 FIRST_THRESHOLD = 8.0
 """Times the noise of a volume. Without: -0.4 dB of `pnp-dct` on 12 views, which prefer nothing; -0.3 on bone."""
 

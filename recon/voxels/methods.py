@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Count, Natural, NonNegative
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, WEAKER
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
@@ -208,7 +208,7 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_steps(self) -> int:
-        """Those of a volume, of which the usual number tells enough: noise enters with the first ones."""
+        """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
         return min(self.iterations, PnpDct.iterations)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -283,7 +283,8 @@ def choose_patches(
         if found is None:
             return [first, 0]
         judge.remember("patches", found)
-        return [WEAKER * found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
+        fewer = math.sqrt(1 - 1 / ONE_IN)  # noise of a volume falls with the root of the views: the trial had fewer
+        return [fewer * found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
