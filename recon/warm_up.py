@@ -64,12 +64,12 @@ def warm_up(
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
-            toy, on = warmed.toy(), device if warmed is method else "cpu"
+            toy = warmed.toy()
             where = str([value.tolist() for value in arrays_of(views).values()])
-            if (key := (type(toy), repr(toy), where, on, weighted)) not in _RECONSTRUCTED:
+            if (key := (type(toy), repr(toy), where, device, weighted)) not in _RECONSTRUCTED:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # of a toy nobody needs to be warned
-                    reconstruct(data, views, toy, device=on, use=DataUse(weights))
+                    reconstruct(data, views, toy, device=device, use=DataUse(weights))
                 _RECONSTRUCTED.add(key)
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()

@@ -149,7 +149,8 @@ class _Planning:
         part, whole = trial.problem, trial.all_columns.seen()
         seen, cols = whole.projector, trial.all_columns.cols
         weights = None if whole.weight is None else projection_images(whole.weight)
-        views = ReconProblem(projection_images(whole.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
+        data, use = projection_images(whole.views), DataUse(weights)
+        views = ReconProblem(data, seen.geometry, seen.grid, use, 0, seen.device)
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -234,7 +235,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
         return Candidates()
     watch, decide = _Watch(control, problem.geometry.n_views, fits=True), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
-    projector = Projector(problem.geometry, problem.grid)
+    projector = Projector(problem.geometry, problem.grid, device=problem.device)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
     tried = method.tried
     if watch.ended or tried.smooth is None:
@@ -310,7 +311,8 @@ def finish(
         return Finished(volume, 0)
     data, weights = prepared
     start = Volume(np.maximum(volume.data, 0), volume.grid)
-    projector, decide = Projector(problem.geometry, volume.grid), control.decide or Decisions(problem.seed)
+    projector = Projector(problem.geometry, volume.grid, device=problem.device)
+    decide = control.decide or Decisions(problem.seed)
     beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     if beyond is not None:
         data -= beyond

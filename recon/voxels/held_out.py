@@ -248,7 +248,7 @@ class HeldOutTrial:
 
             return replace(
                 problem,
-                projector=Projector(views.select(chosen), box),
+                projector=replace(problem.projector, geometry=views.select(chosen), grid=box),
                 data=cut(problem.data),
                 measured=None if problem.measured is None else cut(problem.measured),
                 weight=None if problem.weight is None else cut(problem.weight),

@@ -172,7 +172,7 @@ class VoxelMethod(Checked, ABC):
         filled, known = masked(problem.projections, problem.use.weights)
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
         volume = solve(
-            self, Projector(problem.geometry, problem.grid), filled, weight=known,
+            self, Projector(problem.geometry, problem.grid, device=problem.device), filled, weight=known,
             nonnegative=not settings["allow_negative"], watch=Watch(report, on_trial), decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}

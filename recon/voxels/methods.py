@@ -62,7 +62,7 @@ class FistaTv(VoxelMethod):
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    traits: ClassVar[Traits] = Traits(budget=True, halo=12, error_bars=(2.2, 0.1))
+    traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=12, error_bars=(2.2, 0.1))
 
     iterations: Count = 20
     tv_weight: NonNegative | None = None
@@ -193,7 +193,7 @@ class PnpDct(VoxelMethod):
 
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
-    traits: ClassVar[Traits] = Traits(halo=16, own_length=True, error_bars=(2.3, 0.25))
+    traits: ClassVar[Traits] = Traits(device=True, halo=16, own_length=True, error_bars=(2.3, 0.25))
 
     iterations: Count = 35
     patch_threshold: NonNegative | None = None

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,8 @@ from recon.base.empirical import (
 )
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure, noise_level
-from recon.kernels.cpu.patches import denoise, patch_scratch, pulled_step
 from recon.kernels.cpu.tv import total_variation
-from recon.kernels.cpu.vectors import combine, replace_by_residual
+from recon.voxels.devices import projector_on, voxel_device
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import (
@@ -166,23 +166,30 @@ def ordered_fista(
         weight: μ, or an object that chooses it after each sweep.
         tv_steps: dual steps of each proximal step, which continue from the last ones.
     """
-    parts, projectors, step, count = subsets.views, subsets.projectors, subsets.step, len(subsets.views)
-    prox = TotalVariationProx(x.shape, difference_weights(problem.projector.grid), problem.nonnegative, tv_steps)
-    gradient, ahead, scale = np.empty_like(x), Momentum(x, problem.decide), problem.scale
+    device, step, count = voxel_device(problem.projector.device), subsets.step, len(subsets.views)
+    prox = TotalVariationProx(
+        x.shape, difference_weights(problem.projector.grid), problem.nonnegative, tv_steps, device
+    )
+    scale, projectors = problem.scale, [projector_on(device, part) for part in subsets.projectors]
+    every, weights = device.array(problem.data), None if problem.weight is None else device.array(problem.weight)
+    x = device.array(x)
+    gradient, ahead = device.copy(x), Momentum(x, problem.decide, device)
     for k in range(sweeps):
         error, seen = 0.0, []
         for at, s in enumerate(problem.rng.permutation(count)):
-            part = problem.of_views(parts[s]) if count > 1 else problem
+            part = slice(None) if count == 1 else subsets.views[s]
+            data, rays = every[part], None if weights is None else weights[part]
             mu = weight.value if isinstance(weight, NoiseBalance) else weight
             residual = projectors[s].forward_lines(x)
-            error += replace_by_residual(part.data, residual, part.weight)
+            error += device.replace_by_residual(data, residual, rays)
             if isinstance(weight, NoiseBalance):
                 some = slice(None, None, max(1, count * len(residual) // _LOOKED_AT))
-                seen.append(whitened(residual[some].copy(), None if part.weight is None else part.weight[some]))
-            if part.weight is not None:
-                residual *= part.weight
+                unweighted = np.array(device.numpy(residual[some]))
+                seen.append(whitened(unweighted, None if rays is None else device.numpy(rays[some])))
+            if rays is not None:
+                residual *= rays
             projectors[s].adjoint_lines(residual, gradient)
-            combine(1.0, x, step, gradient, x)
+            device.combine(1.0, x, step, gradient, x)
             prox(x, mu * step / count)
             prox.turn()
             if at + 1 < count:
@@ -192,7 +199,7 @@ def ordered_fista(
         if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == sweeps:
             break
         ahead(x)
-    return x
+    return device.numpy(x)
 
 
 def subsets_of(geometry: Geometry, most: int, fewest: int = 1) -> int:
@@ -225,34 +232,40 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
         steps: towards the views, five a round.
     """
     bound = problem.decide("bound", lambda: problem.norm)
-    scratch, z, rounds = patch_scratch(x.shape), np.empty_like(x), -(-steps // STEPS)
+    device, rounds = voxel_device(problem.projector.device), -(-steps // STEPS)
+    scratch, x = device.patch_scratch(x.shape), device.array(x)
+    z = device.copy(x)
     for k in range(rounds):
         threshold = strength * FALL ** (k - rounds)
-        denoise(x, threshold, problem.nonnegative, scratch, z)
+        device.denoise(x, threshold, problem.nonnegative, scratch, z)
         done = k * STEPS
         if not towards_views(problem, x, z, bound, steps=min(STEPS, steps - done), done=done):
-            denoise(x, threshold, problem.nonnegative, scratch, x)
-            return x
-    denoise(x, strength, problem.nonnegative, scratch, x)
-    return x
+            break
+    else:
+        threshold = strength
+    device.denoise(x, threshold, problem.nonnegative, scratch, x)
+    return device.numpy(x)
 
 
-def towards_views(problem: VoxelProblem, x: F32, z: F32, bound: float, *, steps: int, done: int = 0) -> bool:
+def towards_views(problem: VoxelProblem, x: Any, z: Any, bound: float, *, steps: int, done: int = 0) -> bool:
     """Steps of Chebyshev's semi-iteration from x towards min ½||A x - p||² + m/2 |x - z|², in place.
 
     Golub & Varga 1961, Numer. Math. 3, 147. Whether `problem.go_on` was content, which is told `done` and more steps.
+    x and z [y, x, z] are arrays of the problem's device.
     """
-    pull = PULL * bound
+    device, pull = voxel_device(problem.projector.device), PULL * bound
+    projector, data = projector_on(device, problem.projector), device.array(problem.data)
+    rays = None if problem.weight is None else device.array(problem.weight)
     centre, half = pull + bound / 2, bound / 2
-    change, gradient = np.zeros_like(x), np.empty_like(x)
+    change, gradient = device.zeros(x.shape), device.copy(x)
     scale, momentum, pace = problem.scale, 0.0, 1 / centre
     for k in range(steps):
-        residual = problem.projector.forward_lines(x)
-        error = replace_by_residual(problem.data, residual, problem.weight)
-        if problem.weight is not None:
-            residual *= problem.weight
-        problem.projector.adjoint_lines(residual, gradient)
-        pulled_step(x, change, momentum, pace, gradient, pull, z, problem.nonnegative)
+        residual = projector.forward_lines(x)
+        error = device.replace_by_residual(data, residual, rays)
+        if rays is not None:
+            residual *= rays
+        projector.adjoint_lines(residual, gradient)
+        device.pulled_step(x, change, momentum, pace, gradient, pull, z, problem.nonnegative)
         if not problem.go_on(done + k + 1, math.sqrt(error) / scale):
             return False
         after = 1 / (centre - half**2 * pace / (2 if k == 0 else 4))
@@ -268,9 +281,12 @@ def noise_of_volume(problem: VoxelProblem) -> float:
         np.divide(data, np.sqrt(problem.weight), out=data, where=problem.weight > 0)
         data[problem.weight == 0] = 0
     data = smoothed(data, problem.projector.resolution, None if problem.weight is None else problem.weight > 0)
-    alone = replace(problem, data=data, nonnegative=False, go_on=lambda *_: True)
+    alone, device = (
+        replace(problem, data=data, nonnegative=False, go_on=lambda *_: True),
+        voxel_device(problem.projector.device),
+    )
     nz, ny, nx = problem.projector.grid.shape
-    x, z = (np.zeros((ny, nx, nz), np.float32) for _ in range(2))
+    x, z = (device.zeros((ny, nx, nz)) for _ in range(2))
     towards_views(alone, x, z, problem.norm, steps=STEPS)
     noise = noise_beside_structure(whitened(problem.views, problem.weight), problem.projector.geometry)
-    return noise * float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))
+    return noise * float(np.sqrt(np.mean(np.square(device.numpy(x), dtype=np.float64))))

@@ -56,6 +56,11 @@ class Projector:
     Joseph's interpolation (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192): a ray is sampled once in each plane
     of voxels, bilinearly. The volume is 0 outside the box. In mm times the volume's unit, float32.
 
+    Attributes:
+        matched: projections are sharpened to the resolution of the views.
+        device: that loops over it compute on, see `recon.voxels.devices`; its own methods take the CPU.
+        sharpened: [view, 2] px² of variance that this takes off along columns and rows; None: nothing.
+
     Raises:
         ValueError: for a box that reaches the source, or a wide cone seen under a large tilt (see `posed.ray_table`).
     """
@@ -63,8 +68,9 @@ class Projector:
     geometry: Geometry
     grid: Grid
     matched: bool = True
+    device: str = "cpu"
     resolution: ViewResolution = field(init=False, repr=False)
-    _sharpened: NDArray[np.float64] | None = field(init=False, repr=False)
+    sharpened: NDArray[np.float64] | None = field(init=False, repr=False)
     _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -82,12 +88,12 @@ class Projector:
         ]
         object.__setattr__(self, "_bands", found)
         object.__setattr__(self, "resolution", ViewResolution.of(self.geometry, self.grid))
-        sharpened = self.resolution.sharpened
+        variances = self.resolution.sharpened
         if not self.matched:
-            sharpened = np.minimum(sharpened, 0)
+            variances = np.minimum(variances, 0)
         if self.geometry.detector_shape[0] == 1:
-            sharpened[:, 1] = 0
-        object.__setattr__(self, "_sharpened", sharpened if sharpened.any() else None)
+            variances[:, 1] = 0
+        object.__setattr__(self, "sharpened", variances if variances.any() else None)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -106,9 +112,9 @@ class Projector:
         whose columns differ by less than a voxel at the edge of the field, and all see the largest eigenvector, unless
         few rays weigh more than the others.
         """
-        if self._sharpened is None:
+        if self.sharpened is None:
             return 1.0
-        cols, rows = ((1 + 2 * max(float(most), 0.0)) ** 2 for most in self._sharpened.max(0))
+        cols, rows = ((1 + 2 * max(float(most), 0.0)) ** 2 for most in self.sharpened.max(0))
         turned = 1 - np.square(np.sin(self.geometry.roll) * np.cos(self.geometry.tilt)).max()  # by a turn of the sample
         angles = np.sort(np.mod(self.geometry.angles, np.pi))
         turns, alike = np.concatenate((angles, angles + np.pi)), 2 / self.geometry.detector_shape[1]
@@ -200,9 +206,9 @@ class Projector:
 
     def _spread(self, lines: F32) -> F32:
         """Lines [view, col, row] at the resolution of the views, see `ViewResolution`; its own transpose."""
-        if self._sharpened is None:
+        if self.sharpened is None:
             return lines
-        return spread(lines, -self._sharpened[:, 0], -self._sharpened[:, 1])
+        return spread(lines, -self.sharpened[:, 0], -self.sharpened[:, 1])
 
     def _in_one_slice(self) -> bool:
         """All rays of straight views run in the plane of the only slice: a parallel beam, or a fan."""

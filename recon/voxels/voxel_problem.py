@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,9 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid
-from recon.kernels.cpu import tv as tv_cpu
-from recon.kernels.cpu.vectors import add_product, extrapolate, replace_by_residual, turn_of_steps
+from recon.kernels.cpu.tv import Weights
+from recon.kernels.cpu.vectors import add_product, replace_by_residual
+from recon.voxels.devices import CPU, VoxelDevice, projector_on, voxel_device
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
@@ -152,12 +154,6 @@ class VoxelProblem:
         """||p||, rays weighed."""
         return math.sqrt(replace_by_residual(self.data, np.zeros_like(self.data), self.weight))
 
-    def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
-        """Data and weights of some views; the projector remains that of all views."""
-        weight = None if self.weight is None else self.weight[views]
-        measured = None if self.measured is None else self.measured[views]
-        return replace(self, data=self.data[views], weight=weight, measured=measured)
-
     def filtered(self, filter: Filter) -> F32 | None:
         """FBP or FDK [y, x, z] of the weighted views, rays of weight 0 filled in; None if neither applies."""
         images, geometry = projection_images(self.views), self.projector.geometry
@@ -187,19 +183,19 @@ def density_unit(x: F32) -> float:
 class Momentum:
     """Nesterov's extrapolation between the steps of a descent; it starts anew when it points uphill.
 
-    O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes.
+    O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes. Arrays are those of a device.
     """
 
-    def __init__(self, start: F32, decide: Decisions) -> None:
-        self._decide = decide
-        self._last, self._from, self._t = start.copy(), start.copy(), 1.0
+    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU) -> None:
+        self._decide, self._device = decide, device
+        self._last, self._from, self._t = device.copy(start), device.copy(start), 1.0
 
-    def __call__(self, x: F32) -> None:
+    def __call__(self, x: Any) -> None:
         """Move x from the end of a step to the start of the next step, in place."""
-        if self._decide("restart", lambda: turn_of_steps(self._last, self._from, x) > 0):
+        if self._decide("restart", lambda: self._device.turn_of_steps(self._last, self._from, x) > 0):
             self._t = 1.0
         after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
-        extrapolate(x, (self._t - 1) / after, self._last, self._from)
+        self._device.extrapolate(x, (self._t - 1) / after, self._last, self._from)
         self._t = after
 
 
@@ -217,16 +213,17 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
         some, grid = geometry.rows(0, POWER_ROWS), projector.grid
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
         box = replace(grid, shape=(POWER_ROWS, *grid.shape[1:]), centre=centre)
-        projector = Projector(some, box, projector.matched)
-    gain, projector = projector.gain(weight), projector.plain
-    nz, ny, nx = projector.grid.shape
+        projector = replace(projector, geometry=some, grid=box)
+    gain, projector, device = projector.gain(weight), projector.plain, voxel_device(projector.device)
+    lines, (nz, ny, nx) = projector_on(device, projector), projector.grid.shape
+    rays = None if weight is None else device.array(weight)
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf
     for _ in range(POWER_ROUNDS):
-        image = projector.forward_lines(x)
-        if weight is not None:
-            image *= weight
-        product = projector.adjoint_lines(image)
+        image = lines.forward_lines(device.array(x))
+        if rays is not None:
+            image *= rays
+        product = device.numpy(lines.adjoint_lines(image))
         ratio = np.divide(product, x, out=np.zeros_like(x), where=x > 0)
         bound = min(bound, float(ratio.max()))
         if bound == 0:
@@ -277,19 +274,22 @@ class TotalVariationProx:
     Differences of a voxel are those to its three next ones; `turn` takes the ones before along y, x or both.
     """
 
-    def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        self._weights, self._dual, self._scratch = weights, tv_cpu.dual_field(shape), tv_cpu.dual_scratch(shape)
-        self._nonnegative, self._steps, self._turn = nonnegative, steps, 0
+    def __init__(
+        self, shape: tuple[int, int, int], weights: Weights, nonnegative: bool, steps: int,
+        device: VoxelDevice[Any] = CPU,
+    ) -> None:  # fmt: skip
+        self._weights, self._nonnegative, self._steps, self._turn = weights, nonnegative, steps, 0
+        self._device, self._dual, self._scratch = device, device.dual_field(shape), device.dual_scratch(shape)
 
-    def __call__(self, x: F32, threshold: float) -> None:
-        """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
+    def __call__(self, x: Any, threshold: float) -> None:
+        """Replace x [y, x, z], an array of the device, by the proximal point; `threshold` in its unit, 0 or more."""
         if threshold > 0:
             given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
             for _ in range(self._steps):
-                tv_cpu.dual_step(x, self._dual, *given, back)
-            tv_cpu.primal(x, self._dual, *given, x)
+                self._device.dual_step(x, self._dual, *given, back)
+            self._device.primal(x, self._dual, *given, x)
         elif self._nonnegative:
-            np.maximum(x, 0, out=x)
+            x[x < 0] = 0
 
     def turn(self) -> None:
         """Take the differences of the next of four mirror images from here on, so that no side is preferred.

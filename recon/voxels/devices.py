@@ -1,0 +1,152 @@
+"""Where a solver on voxels computes: the operations of its loops as one Protocol, by the CPU's kernels or on a GPU.
+
+A loop takes its arrays to the device once, and back at its end. Between loops everything is numpy: choices, noise and
+filtered back-projections are made on the CPU.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.kernels.cpu import patches, tv, vectors
+from recon.kernels.cpu.tv import Weights
+from recon.voxels.projector import Projector, views_of_exposure
+
+Array = TypeVar("Array")
+
+
+class LineProjector(Protocol[Array]):
+    """A projector and its transpose on lines along z; see `recon.voxels.projector`."""
+
+    def forward_lines(self, volume: Array) -> Array:
+        """Volume [y, x, z] to projections [view, col, row]."""
+
+    def adjoint_lines(self, projections: Array, out: Array | None = None) -> Array:
+        """Projections [view, col, row] to a volume [y, x, z]."""
+
+
+class VoxelDevice(Protocol[Array]):
+    """Operations on volumes and projections, in place where one of their arrays is named as the result.
+
+    Those of `recon.kernels.cpu.vectors`, `tv` and `patches` mean the same here.
+    """
+
+    def array(self, values: F32) -> Array:
+        """The values on the device; on the CPU the array itself."""
+
+    def numpy(self, array: Array) -> F32:
+        """The values as a numpy array; on the CPU the array itself."""
+
+    def zeros(self, shape: tuple[int, ...]) -> Array: ...
+    def copy(self, array: Array) -> Array: ...
+    def combine(self, alpha: float, a: Array, beta: float, b: Array, out: Array) -> None: ...
+    def replace_by_residual(self, data: Array, model: Array, weight: Array | None = None) -> float: ...
+    def turn_of_steps(self, before: Array, start: Array, end: Array) -> float: ...
+    def extrapolate(self, x: Array, factor: float, last: Array, start: Array) -> None: ...
+    def dual_field(self, shape: tuple[int, int, int]) -> Any: ...
+    def dual_scratch(self, shape: tuple[int, int, int]) -> Any: ...
+
+    def dual_step(
+        self, x: Array, p: Any, threshold: float, weights: Weights, nonnegative: bool, scratch: Any,
+        back: tuple[int, int] = (0, 0),
+    ) -> None: ...  # fmt: skip
+
+    def primal(
+        self, x: Array, p: Any, threshold: float, weights: Weights, nonnegative: bool, scratch: Any, out: Array
+    ) -> None: ...  # fmt: skip
+
+    def patch_scratch(self, shape: tuple[int, int, int]) -> Any: ...
+    def denoise(self, x: Array, threshold: float, nonnegative: bool, scratch: Any, out: Array) -> None: ...
+
+    def pulled_step(
+        self, x: Array, change: Array, momentum: float, pace: float, gradient: Array, pull: float, z: Array,
+        nonnegative: bool,
+    ) -> None: ...  # fmt: skip
+
+
+class Cpu:
+    """The numba kernels on numpy arrays."""
+
+    combine, extrapolate = staticmethod(vectors.combine), staticmethod(vectors.extrapolate)
+    replace_by_residual = staticmethod(vectors.replace_by_residual)
+    turn_of_steps = staticmethod(vectors.turn_of_steps)
+    dual_field, dual_scratch = staticmethod(tv.dual_field), staticmethod(tv.dual_scratch)
+    dual_step, primal = staticmethod(tv.dual_step), staticmethod(tv.primal)
+    patch_scratch, denoise = staticmethod(patches.patch_scratch), staticmethod(patches.denoise)
+    pulled_step = staticmethod(patches.pulled_step)
+
+    def array(self, values: F32) -> F32:
+        return values
+
+    def numpy(self, array: F32) -> F32:
+        return array
+
+    def zeros(self, shape: tuple[int, ...]) -> F32:
+        return np.zeros(shape, np.float32)
+
+    def copy(self, array: F32) -> F32:
+        return array.copy()
+
+
+CPU: VoxelDevice[Any] = Cpu()
+
+
+def voxel_device(device: str) -> VoxelDevice[Any]:
+    """The operations on "cpu", or on "cuda", the current CUDA device.
+
+    Raises:
+        ImportError, RuntimeError, ValueError: as `recon.kernels.gpu.require`.
+    """
+    if device == "cpu":
+        return CPU
+    gpu: VoxelDevice[Any] = import_module("recon.kernels.gpu.volumes").GpuVolumes(device)  # loads triton
+    return gpu
+
+
+def projector_on(device: VoxelDevice[Array], projector: Projector) -> LineProjector[Any]:
+    """The projector for arrays of a device."""
+    return projector if device is CPU else _GpuProjector(projector, device)
+
+
+class _GpuProjector:
+    """A projector on a GPU. Views that lean, or whose rows see angles of their own, are projected on the CPU."""
+
+    def __init__(self, projector: Projector, device: Any) -> None:
+        self._projector, self._device, geometry = projector, device, projector.geometry
+        self._joseph = import_module("recon.kernels.gpu.joseph")
+        moments = views_of_exposure(geometry) if geometry.is_straight and not geometry.skew else []
+        self._moments = [self._joseph.Rays.of(views, projector.grid, device.device) for views in moments]
+
+    def forward_lines(self, volume: Any) -> Any:
+        if not self._moments:
+            return self._device.array(self._projector.forward_lines(self._device.numpy(volume)))
+        views, rows, cols = self._projector.projection_shape
+        return self._spread(self._mean(self._joseph.forward, volume, self._device.zeros((views, cols, rows))))
+
+    def adjoint_lines(self, projections: Any, out: Any = None) -> Any:
+        if not self._moments:
+            found = self._device.array(self._projector.adjoint_lines(self._device.numpy(projections)))
+            return found if out is None else out.copy_(found)
+        nz, ny, nx = self._projector.grid.shape
+        out = self._device.zeros((ny, nx, nz)) if out is None else out
+        return self._mean(self._joseph.adjoint, self._spread(projections), out)
+
+    def _mean(self, project: Any, source: Any, out: Any) -> Any:
+        """The mean over the moments of an exposure."""
+        first, *others = self._moments
+        project(source, first, out)
+        for rays in others:
+            more = self._device.zeros(out.shape)
+            project(source, rays, more)
+            out += more
+        if others:
+            out /= len(self._moments)
+        return out
+
+    def _spread(self, lines: Any) -> Any:
+        taken = self._projector.sharpened
+        return lines if taken is None else self._device.spread(lines, -taken[:, 0], -taken[:, 1])
