@@ -1,0 +1,262 @@
+"""GpuVolumes: what iterative methods on voxels do with volumes and views on a GPU, as `recon.kernels.cpu` does it.
+
+The functions have the names, arguments and meaning of those of `cpu.vectors`, `cpu.spread`, `cpu.tv` and `cpu.patches`,
+on float32 torch tensors of one device, and follow the CPU's results to rounding. Every value follows from elementwise
+operations, slices and sums in torch's fixed order. There are no matrix products or convolutions, so TF32 cannot
+change anything, and no atomics, so the same input gives the same bits. No tensor made here asks for gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import hardshrink
+
+from recon.base.arrays import F32
+from recon.kernels.cpu.patches import EDGE
+from recon.kernels.cpu.spread import passes_of
+from recon.kernels.cpu.tv import Weights
+from recon.kernels.gpu import require
+
+Shape = tuple[int, int, int]
+DualField = tuple[Tensor, Tensor, Tensor]
+
+_AT_ONCE = 512 << 20  # bytes of temporary copies of some planes or views at once; at least one is taken
+_FASTEST = 1e15  # pace of dual steps, as in `cpu.tv`
+_BEYOND = EDGE - 1  # voxels beyond a face that blocks reach
+_BLOCK_COPIES = 40  # arrays as large as the given planes that the transform of their blocks holds, at most
+_LONG, _SHORT = math.sqrt(2) * math.cos(math.pi / 8), math.sqrt(2) * math.sin(math.pi / 8)
+
+
+def combine(alpha: float, a: Tensor, beta: float, b: Tensor, out: Tensor) -> None:
+    """out = alpha a + beta b; `out` may be `a` or `b`."""
+    torch.add(a if alpha == 1 else a * alpha, b, alpha=beta, out=out)
+
+
+def replace_by_residual(data: Tensor, model: Tensor, weight: Tensor | None = None) -> float:
+    """Replace `model` by data - model; returns Σ weight (data - model)², summed in float64. None: all 1."""
+    total = torch.zeros((), dtype=torch.float64, device=data.device)
+    for some in _parts(data, copies=2):
+        difference = torch.sub(data[some], model[some], out=model[some])
+        squares = difference * difference
+        if weight is not None:
+            squares *= weight[some]
+        total += squares.sum(dtype=torch.float64)
+    return float(total)
+
+
+def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
+    """<start - end, end - before>, summed in float64: above zero where the step to `end` points back to `before`."""
+    total = torch.zeros((), dtype=torch.float64, device=end.device)
+    for some in _parts(end, copies=3):
+        turn = (start[some] - end[some]).mul_(end[some] - before[some])
+        total += turn.sum(dtype=torch.float64)
+    return float(total)
+
+
+def extrapolate(x: Tensor, factor: float, last: Tensor, start: Tensor) -> None:
+    """x += factor (x - last), and `last` becomes x before that, `start` x after it."""
+    torch.sub(x, last, out=start)
+    torch.add(x, start, alpha=factor, out=start)
+    last.copy_(x)
+    x.copy_(start)
+
+
+def spread(lines: Tensor, along_cols: NDArray[np.float64], along_rows: NDArray[np.float64]) -> Tensor:
+    """The lines [view, col, row] after passes of three neighbours each, of these variances [view] in px².
+
+    `lines` themselves where no pass is needed, else a new tensor.
+    """
+    passes = passes_of(along_cols, along_rows)
+    if passes == 0:
+        return lines
+    found, shares = lines.clone(), np.stack([along_cols, along_rows]) / (2 * passes)
+    on_device = torch.from_numpy(shares.astype(np.float32)).to(lines.device)
+    for _ in range(passes):
+        for axis in (1, 2):
+            if shares[axis - 1].any():
+                flow = (_after(found, axis) - _before(found, axis)).mul_(on_device[axis - 1, :, None, None])
+                _before(found, axis).add_(flow)
+                _after(found, axis).sub_(flow)
+    return found
+
+
+def dual_step(
+    x: Tensor, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: None,
+    back: tuple[int, int] = (0, 0),
+) -> None:  # fmt: skip
+    """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; see `cpu.tv.dual_step`.
+
+    Memory: two volumes beside x and p.
+    """
+    pace = min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
+    point = _primal_point(x, p, threshold, weights, nonnegative)
+    for axis, (field, weight) in enumerate(zip(p, weights, strict=True)):
+        _before(field, axis).add_(_after(point, axis) - _before(point, axis), alpha=pace * weight)
+    # The difference from i to i + 1 belongs to voxel i or, of a mirror image, to voxel i + 1. The last one stays 0.
+    length = point.zero_()
+    owners = [_after(length, axis) if mirrored else _before(length, axis) for axis, mirrored in enumerate((*back, 0))]
+    for axis, (field, owner) in enumerate(zip(p, owners, strict=True)):
+        owner.addcmul_(_before(field, axis), _before(field, axis))
+    length.sqrt_().clamp_(min=1)
+    for axis, (field, owner) in enumerate(zip(p, owners, strict=True)):
+        _before(field, axis).div_(owner)
+
+
+def primal(
+    x: Tensor, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: None, out: Tensor
+) -> None:
+    """out = P(x - threshold Dᵀ p); `out` may be `x`."""
+    out.copy_(_primal_point(x, p, threshold, weights, nonnegative))
+
+
+def _primal_point(x: Tensor, p: DualField, threshold: float, weights: Weights, nonnegative: bool) -> Tensor:
+    pull = torch.zeros_like(x)
+    for axis, (field, weight) in enumerate(zip(p, weights, strict=True)):
+        _before(pull, axis).sub_(_before(field, axis), alpha=weight)
+        _after(pull, axis).add_(_before(field, axis), alpha=weight)
+    torch.add(x, pull, alpha=-threshold, out=pull)
+    return pull.clamp_(min=0) if nonnegative else pull
+
+
+def denoise(x: Tensor, threshold: float, nonnegative: bool, scratch: None, out: Tensor) -> None:
+    """out = D(x) of `cpu.patches`, at least 0 with `nonnegative`; `out` may be `x`.
+
+    Some planes of blocks are transformed at once, and the bits do not depend on how many. Memory: one volume beside x
+    and `out`, and half a GiB or, if that is more, forty planes.
+
+    Args:
+        x: [a, b, c].
+        threshold: of coefficients, in the unit of x; white noise of deviation σ has coefficients of deviation σ.
+    """
+    na, nb, nc = x.shape
+    axes = (0, 1, 2) if nc >= EDGE else (0, 1)
+    places = [_mirrored(x.shape[axis], x.device) for axis in axes]
+    sums = x.new_zeros((na + 2 * _BEYOND, nb, nc))
+    limit = threshold * 2 ** len(axes)
+    plane = math.prod(n + 2 * _BEYOND for n in (nb, nc))
+    step = max(1, _AT_ONCE // (4 * _BLOCK_COPIES * plane))
+    for first in range(0, na + _BEYOND, step):
+        end = min(first + step, na + _BEYOND)  # of the blocks' first planes
+        given = x.index_select(0, places[0][first : end + _BEYOND])
+        for axis in axes[1:]:
+            given = given.index_select(axis, places[axis])
+        # A voxel sums its blocks in one order, by their first plane, wherever a part of the planes begins.
+        for at, value in reversed(list(enumerate(_shrunk(given, axes, limit, True)))):
+            sums[first + at : end + at] += value
+    torch.mul(sums[_BEYOND : na + _BEYOND], 16.0 ** -len(axes), out=out)
+    if nonnegative:
+        out.clamp_(min=0)
+
+
+def _shrunk(given: Tensor, axes: Sequence[int], limit: float, mean: bool) -> list[Tensor]:
+    """What voxels 0 ... 3 along the first of `axes` get from each block, summed over blocks along the others.
+
+    Args:
+        limit: coefficients up to it count as 0.
+        mean: the first coefficient is kept.
+    """
+    axis, *others = axes
+    kept = []
+    for order, found in enumerate(_cosines(given, axis)):
+        is_mean = mean and order == 0
+        if others:
+            n = given.shape[others[0]] - 2 * _BEYOND
+            parts = _shrunk(found, others, limit, is_mean)
+            a, b, c, d = (part.narrow(others[0], _BEYOND - at, n) for at, part in enumerate(parts))
+            kept.append((d + c).add_(b).add_(a))
+        else:
+            kept.append(found if is_mean else hardshrink(found, limit))
+    return _values(*kept)
+
+
+def _cosines(given: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Twice the four orthonormal cosine coefficients, along one axis, of each block of `given`."""
+    blocks = given.shape[axis] - _BEYOND
+    a, b, c, d = (given.narrow(axis, at, blocks) for at in range(EDGE))
+    outer, inner, wide, near = a + d, b + c, a - d, b - c
+    return outer + inner, wide * _LONG + near * _SHORT, outer - inner, wide * _SHORT - near * _LONG
+
+
+def _values(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> list[Tensor]:
+    """Twice the inverse of the orthonormal transform."""
+    outer, inner, wide, near = a + c, a - c, b * _LONG + d * _SHORT, b * _SHORT - d * _LONG
+    return [outer + wide, inner + near, inner - near, outer - wide]
+
+
+def _mirrored(n: int, device: torch.device) -> Tensor:
+    """Which of n voxels lies at -3 ... n + 2, mirrored at both faces."""
+    at = torch.arange(-_BEYOND, n + _BEYOND, device=device) % (2 * n)
+    return torch.minimum(at, 2 * n - 1 - at)
+
+
+def pulled_step(
+    x: Tensor, change: Tensor, momentum: float, pace: float, gradient: Tensor, pull: float, z: Tensor, nonnegative: bool
+) -> None:  # fmt: skip
+    """change = momentum change + pace (gradient + pull (z - x)), and x += change, at least 0 with `nonnegative`.
+
+    Memory: one volume.
+    """
+    way = torch.sub(z, x)
+    torch.add(gradient, way, alpha=pull, out=way)
+    change.mul_(momentum).add_(way, alpha=pace)
+    torch.add(x, change, out=way)
+    if nonnegative:
+        way.clamp_(min=0)
+    torch.sub(way, x, out=change)
+    x.copy_(way)
+
+
+def _before(array: Tensor, axis: int) -> Tensor:
+    """All but the last along an axis."""
+    return array.narrow(axis, 0, array.shape[axis] - 1)
+
+
+def _after(array: Tensor, axis: int) -> Tensor:
+    """All but the first along an axis."""
+    return array.narrow(axis, 1, array.shape[axis] - 1)
+
+
+def _parts(array: Tensor, copies: int) -> list[slice]:
+    """Runs along the first axis, of which so many copies fit at once."""
+    step = max(1, _AT_ONCE // (4 * copies * max(1, math.prod(array.shape[1:]))))
+    return [slice(first, first + step) for first in range(0, array.shape[0], step)]
+
+
+class GpuVolumes:
+    """Volumes and views on one device, and the operations on them."""
+
+    combine, replace_by_residual = staticmethod(combine), staticmethod(replace_by_residual)
+    turn_of_steps, spread = staticmethod(turn_of_steps), staticmethod(spread)
+    extrapolate, pulled_step = staticmethod(extrapolate), staticmethod(pulled_step)
+    dual_step, primal, denoise = staticmethod(dual_step), staticmethod(primal), staticmethod(denoise)
+
+    def __init__(self, device: str | torch.device) -> None:
+        """Raises as `require`."""
+        self.device = require(device)
+
+    def array(self, values: F32) -> Tensor:
+        """A copy on the device."""
+        return torch.from_numpy(np.array(values, np.float32, order="C")).to(self.device)
+
+    def numpy(self, array: Tensor) -> F32:
+        """A copy on the host."""
+        return array.to("cpu", copy=True, memory_format=torch.contiguous_format).numpy()
+
+    def zeros(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.zeros(shape, dtype=torch.float32, device=self.device)
+
+    def dual_field(self, shape: Shape) -> DualField:
+        """Zeros [a, b, c] for the differences along each axis: at i, that from i to i + 1."""
+        return self.zeros(shape), self.zeros(shape), self.zeros(shape)
+
+    def dual_scratch(self, shape: Shape) -> None:
+        """What the CPU's `dual_step` and `primal` need: nothing here."""
+
+    def patch_scratch(self, shape: Shape) -> None:
+        """What the CPU's `denoise` needs: nothing here."""
