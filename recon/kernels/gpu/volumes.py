@@ -248,6 +248,9 @@ class GpuVolumes:
         """A copy on the host."""
         return array.to("cpu", copy=True, memory_format=torch.contiguous_format).numpy()
 
+    def copy(self, array: Tensor) -> Tensor:
+        return array.clone()
+
     def zeros(self, shape: tuple[int, ...]) -> Tensor:
         return torch.zeros(shape, dtype=torch.float32, device=self.device)
 

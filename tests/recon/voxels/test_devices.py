@@ -1,0 +1,75 @@
+"""Solvers on a GPU, in Triton's interpreter where there is none: the CPU's volumes, to rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import recon
+from recon import FistaTv, PnpDct
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse
+from recon.base.ray_width import RayWidth
+from recon.base.volume import Grid
+from recon.voxels.devices import CPU, projector_on, voxel_device
+from recon.voxels.projector import Projector
+from tests.recon.kernels.gpu import on_gpu  # noqa: F401, says where the kernels run before they are loaded
+
+ROWS, COLS, VIEWS = 4, 12, 16
+ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
+PARALLEL = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1)
+CONE = Geometry.cone(2 * ANGLES, (ROWS, COLS), 0.2, 20.0, 40.0)
+LEANED = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1, roll=0.05)  # projected on the CPU: fast
+
+
+@pytest.mark.parametrize(
+    "geometry", [PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE, LEANED], ids=["still", "arc", "cone", "leaned"]
+)
+def test_projections_on_a_device_are_those_of_the_cpu(geometry: Geometry) -> None:
+    projector, device, rng = (
+        Projector(geometry, Grid.matching(geometry)),
+        voxel_device("cuda"),
+        np.random.default_rng(1),
+    )
+    there, here = projector_on(device, projector), projector_on(CPU, projector)
+    volume, views = rng.random((COLS, COLS, ROWS), np.float32), rng.random((VIEWS, COLS, ROWS), np.float32)
+    seen, back = here.forward_lines(volume), here.adjoint_lines(views)
+    np.testing.assert_allclose(device.numpy(there.forward_lines(device.array(volume))), seen, atol=3e-6 * seen.max())
+    into = device.zeros(volume.shape)
+    there.adjoint_lines(device.array(views), into)
+    np.testing.assert_allclose(device.numpy(into), back, atol=3e-6 * back.max())
+
+
+def views_of(geometry: Geometry) -> np.ndarray:
+    grid, rng = Grid.matching(geometry), np.random.default_rng(3)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = np.where(np.hypot(x, y) < 0.3 * COLS * grid.voxel_size, 1 + 0.3 * np.sin(9 * x), 0).astype(np.float32)
+    clean = Projector(geometry, grid).forward(disc)
+    return (clean + rng.normal(0, 0.01, clean.shape)).astype(np.float32)
+
+
+def assert_same_volumes(geometry: Geometry, method: recon.Method, weighted: bool, off: float = 2e-5) -> None:
+    data = views_of(geometry)
+    weights = np.random.default_rng(0).uniform(0.5, 1.5, data.shape).astype(np.float32) if weighted else None
+    here, there = (
+        recon.reconstruct(data, geometry, method, use=DataUse(weights), device=device).volume.data
+        for device in ("cpu", "cuda")
+    )
+    np.testing.assert_allclose(there, here, atol=off)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize(
+    "method",
+    [FistaTv(iterations=2), FistaTv(iterations=2, tv_weight=0.02), PnpDct(iterations=6), recon.R2(steps=0)],
+    ids=["chosen", "given", "patches", "finish"],
+)
+def test_volumes_made_on_a_device_are_those_of_the_cpu(method: recon.Method, weighted: bool) -> None:
+    off = 1e-3 if isinstance(method, recon.R2) else 2e-5  # 35 steps of patches: at a threshold rounding decides
+    assert_same_volumes(LEANED, method, weighted, off)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("geometry", [PARALLEL, CONE], ids=["parallel", "cone"])
+def test_a_device_that_projects_makes_the_volume_of_the_cpu(geometry: Geometry) -> None:
+    assert_same_volumes(geometry, PnpDct(iterations=6, patch_threshold=0.02), True)
