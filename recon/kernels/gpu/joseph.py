@@ -91,8 +91,8 @@ class Rays:
         cols, rows = min(near[0], steep.shape[1]), min(1 if on_slices else near[1], geometry.detector_shape[0])
         rays = np.zeros((*steep.shape, _WIDTH.value), np.float32)
         rays[..., :STEEP], rays[..., STEEP] = table, steep
-        on_device = (torch.from_numpy(each).to(device) for each in (rays, views.astype(np.float32)))
-        return cls(*on_device, (cols, rows), geometry.is_cone, on_slices)
+        found = torch.from_numpy(rays).to(device), torch.from_numpy(views.astype(np.float32)).to(device)
+        return cls(found[0], found[1], (cols, rows), geometry.is_cone, on_slices)
 
 
 def _near(views: F64, shape: tuple[int, int, int]) -> tuple[int, int]:
