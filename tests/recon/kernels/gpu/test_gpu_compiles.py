@@ -17,7 +17,7 @@ import pytest
 # What a name in a kernel's signature stands for; everything else is a float.
 _INTEGERS = (
     "n pairs halvings edge tiles_y tiles_x n_tiles rows cols tile_cols shares nz ny nx bricks_y bricks_x pixels blocks "
-    "voxels size0 size1 size2 size3"
+    "voxels size0 size1 size2 size3 n_views"
 )
 _INDICES, _LONG = "boxes owners starts tiles go", "touched ends needed counts rooms"
 _DOUBLE = "sums variation means"  # of the tally
@@ -25,12 +25,12 @@ _ARRAYS = (
     "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
     "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
     "weights terms sums volume beam corner weight tv_weight rates vectors "
-    "p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+    "rays views projections p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
 _PARTS = {
     "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
-    "axes_of", "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
+    "axes_of", "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body", "_weight", "_level", "_length",
 }  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def _compile_all() -> None:
     from triton.compiler import ASTSource
 
     from recon.kernels.cpu.losses import L1, L2, POISSON
-    from recon.kernels.gpu import footprints, fused, images, losses, parameters, rays, tiles, voxels
+    from recon.kernels.gpu import footprints, fused, images, joseph, losses, parameters, rays, tiles, voxels
 
     block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
     of_a_kernel = [
@@ -91,6 +91,14 @@ def _compile_all() -> None:
         (tiles, "_starts", 4, {"BLOCK": 256}),
         *((parameters, "_adam", 4, {"BLOCK": 4 * parameters._BLOCK, "GUARDED": guarded}) for guarded in (False, True)),
         *((parameters, "_add_lengths", 4, block | {"GUARDED": guarded}) for guarded in (False, True)),
+        *(
+            (joseph, "_forward", 4, {"LANES": joseph._LANES, "HIGH": high, "PLANES": joseph._PLANES, "SLICES": slices})
+            for high, slices in ((1, 2), (16, 1), (32, 2))
+        ),
+        *(
+            (joseph, "_adjoint", 4, {"EDGE": edge, "DEEP": deep, "COLS": 3, "ROWS": rows, "CONE": is_cone})
+            for edge, deep, rows, is_cone in ((16, 1, 1, True), (4, 16, 1, False), (4, 64, 3, False), (4, 64, 3, True))
+        ),
         *((fused, "_tally", 4, {"VIEWS": 2, "LISTS": 2 + boxed, "BOXED": boxed}) for boxed in (False, True)),
     ]
     modules = {module for module, *_ in wanted}
