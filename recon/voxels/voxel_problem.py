@@ -16,8 +16,8 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import Weights
-from recon.kernels.cpu.vectors import add_product, replace_by_residual
-from recon.voxels.devices import CPU, VoxelDevice, projector_on, voxel_device
+from recon.kernels.cpu.vectors import replace_by_residual
+from recon.voxels.devices import CPU, LineProjector, VoxelDevice, projector_on, voxel_device
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
@@ -49,26 +49,29 @@ class Sweeps:
         self, projector: Projector, data: F32, weight: F32 | None, subsets: Sequence[NDArray[np.intp]]
     ) -> None:
         """For `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
-        nz, ny, nx = projector.grid.shape
-        self._parts: list[tuple[Projector, F32, F32 | None, F32]] = []
-        self._step = np.zeros((ny, nx, nz), np.float32)  # largest column sums, then their inverse
-        self._gradient = np.empty_like(self._step)
+        (nz, ny, nx), device = projector.grid.shape, voxel_device(projector.device)
+        self._device, self._parts, scales = device, list[tuple[LineProjector[Any], Any, Any, Any]](), 0.0
+        self._step = device.zeros((ny, nx, nz))  # largest column sums, then their inverse
+        self._gradient = device.zeros((ny, nx, nz))
         for views in subsets:
             part = projector.subset(views) if len(subsets) > 1 else projector
-            measured = data[views] if len(subsets) > 1 else data
-            rays = None if weight is None else (weight[views] if len(subsets) > 1 else weight)
+            measured = device.array(data[views] if len(subsets) > 1 else data)
+            rays = None if weight is None else device.array(weight[views] if len(subsets) > 1 else weight)
             self._gradient[...] = 1
-            plain = part.plain  # sums of absolute values, but for less than 2 in a step
+            plain = projector_on(device, part.plain)  # sums of absolute values, but for less than 2 in a step
             scale = _inverse(plain.forward_lines(self._gradient))
-            plain.adjoint_lines(np.ones_like(scale) if rays is None else rays, self._gradient)
-            np.maximum(self._step, self._gradient, out=self._step)
+            plain.adjoint_lines(
+                device.array(np.ones(scale.shape, np.float32)) if rays is None else rays, self._gradient
+            )
+            device.maximum(self._step, self._gradient, out=self._step)
             if rays is not None:
                 scale *= rays
-            self._parts.append((part, measured, rays, scale))
-        _inverse(self._step)
-        scales = sum(float(part[3].sum(dtype=np.float64)) for part in self._parts)
+            scales += float(device.numpy(scale).sum(dtype=np.float64))
+            self._parts.append((projector_on(device, part), measured, rays, scale))
+        self._step = _inverse(self._step)
         weights = data.size if weight is None else float(weight.sum(dtype=np.float64))
-        self.pace = float(self._step[self._step > 0].mean(dtype=np.float64)) * scales / weights if scales > 0 else 0.0
+        steps = device.numpy(self._step)
+        self.pace = float(steps[steps > 0].mean(dtype=np.float64)) * scales / weights if scales > 0 else 0.0
 
     def run(self, x: F32, relaxation: float, nonnegative: bool, rng: np.random.Generator | None) -> float:
         """One sweep over x [y, x, z], in place, the subsets in random order (None: as given).
@@ -77,16 +80,20 @@ class Sweeps:
             Σ weight (A x - p)², each ray counted before its own correction.
         """
         order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
-        total, seen = 0.0, []
+        total, seen, device = 0.0, [], self._device
+        there = device.array(x)
         for index in order:
             part, data, weight, scale = self._parts[index]
-            residual = part.forward_lines(x)  # the model, until the data are subtracted
+            residual = part.forward_lines(there)  # the model, until the data are subtracted
             some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
-            seen.append(whitened(data[some] - residual[some], None if weight is None else weight[some]))
-            total += replace_by_residual(data, residual, weight, scale)
+            trust = None if weight is None else device.numpy(weight[some])
+            seen.append(whitened(device.numpy(data[some] - residual[some]), trust))
+            total += device.replace_by_residual(data, residual, weight, scale)
             part.adjoint_lines(residual, self._gradient)
-            add_product(x, relaxation, self._step, self._gradient, nonnegative)
+            device.add_product(there, relaxation, self._step, self._gradient, nonnegative)
         self.residual = np.concatenate(seen)
+        if there is not x:
+            x[...] = device.numpy(there)
         return total
 
 
@@ -97,13 +104,11 @@ def whitened(residual: F32, weight: F32 | None) -> F32:
     return np.where(weight > 0, residual * np.sqrt(weight), np.float32(np.nan)).astype(np.float32, copy=False)
 
 
-def _inverse(sums: F32) -> F32:
-    """1 / sums in place, 0 where they are too small."""
+def _inverse(sums: Any) -> Any:
+    """1 / sums, 0 where they are too small, of an array of any device, which is overwritten."""
     least = max(_LEAST_SUM * float(sums.max()), float(np.finfo(np.float32).tiny))
-    seen = sums > least
-    np.divide(1, sums, out=sums, where=seen)
-    sums[~seen] = 0
-    return sums
+    sums[sums <= least] = math.inf
+    return 1 / sums
 
 
 POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike

@@ -38,14 +38,30 @@ def combine(alpha: float, a: Tensor, beta: float, b: Tensor, out: Tensor) -> Non
     torch.add(a if alpha == 1 else a * alpha, b, alpha=beta, out=out)
 
 
-def replace_by_residual(data: Tensor, model: Tensor, weight: Tensor | None = None) -> float:
-    """Replace `model` by data - model; returns Σ weight (data - model)², summed in float64. None: all 1."""
+def maximum(a: Tensor, b: Tensor, out: Tensor) -> None:
+    """out = the larger of a and b; `out` may be one of them."""
+    torch.maximum(a, b, out=out)
+
+
+def add_product(x: Tensor, factor: float, a: Tensor, b: Tensor, nonnegative: bool) -> None:
+    """x += factor a b, negative values clipped with `nonnegative`."""
+    x.addcmul_(a, b, value=factor)
+    if nonnegative:
+        x.clamp_(min=0)
+
+
+def replace_by_residual(
+    data: Tensor, model: Tensor, weight: Tensor | None = None, scale: Tensor | None = None
+) -> float:
+    """Replace `model` by scale (data - model); returns Σ weight (data - model)², summed in float64. None: all 1."""
     total = torch.zeros((), dtype=torch.float64, device=data.device)
     for some in _parts(data, copies=2):
         difference = torch.sub(data[some], model[some], out=model[some])
         squares = difference * difference
         if weight is not None:
             squares *= weight[some]
+        if scale is not None:
+            difference *= scale[some]
         total += squares.sum(dtype=torch.float64)
     return float(total)
 
@@ -232,6 +248,7 @@ class GpuVolumes:
     """Volumes and views on one device, and the operations on them."""
 
     combine, replace_by_residual = staticmethod(combine), staticmethod(replace_by_residual)
+    maximum, add_product = staticmethod(maximum), staticmethod(add_product)
     turn_of_steps, spread = staticmethod(turn_of_steps), staticmethod(spread)
     extrapolate, pulled_step = staticmethod(extrapolate), staticmethod(pulled_step)
     dual_step, primal, denoise = staticmethod(dual_step), staticmethod(primal), staticmethod(denoise)

@@ -154,7 +154,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
 
 MODELS = ", ".join(taking("steps"))
 OTHER_TAKERS = {
-    "--device": f"auto, {MODELS}", "--budget": "auto, r2, fista-tv, os-sirt-tv",
+    "--device": ", ".join(("auto", *with_trait("device"))), "--budget": "auto, r2, fista-tv, os-sirt-tv",
     "--steps": MODELS,
 }  # fmt: skip
 

@@ -25,7 +25,7 @@ LEANED = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1, roll=0.05)  # 
 @pytest.mark.parametrize(
     "geometry", [PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE, LEANED], ids=["still", "arc", "cone", "leaned"]
 )
-def test_projections_on_a_device_are_those_of_the_cpu(geometry: Geometry) -> None:
+def test_projections_on_a_gpu_are_those_of_the_cpu(geometry: Geometry) -> None:
     projector, device, rng = (
         Projector(geometry, Grid.matching(geometry)),
         voxel_device("cuda"),
@@ -64,12 +64,12 @@ def assert_same_volumes(geometry: Geometry, method: recon.Method, weighted: bool
     [FistaTv(iterations=2), FistaTv(iterations=2, tv_weight=0.02), PnpDct(iterations=6), recon.R2(steps=0)],
     ids=["chosen", "given", "patches", "finish"],
 )
-def test_volumes_made_on_a_device_are_those_of_the_cpu(method: recon.Method, weighted: bool) -> None:
+def test_volumes_made_on_a_gpu_are_those_of_the_cpu(method: recon.Method, weighted: bool) -> None:
     off = 1e-3 if isinstance(method, recon.R2) else 2e-5  # 35 steps of patches: at a threshold rounding decides
     assert_same_volumes(LEANED, method, weighted, off)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("geometry", [PARALLEL, CONE], ids=["parallel", "cone"])
-def test_a_device_that_projects_makes_the_volume_of_the_cpu(geometry: Geometry) -> None:
+def test_a_gpu_that_projects_makes_the_volume_of_the_cpu(geometry: Geometry) -> None:
     assert_same_volumes(geometry, PnpDct(iterations=6, patch_threshold=0.02), True)

@@ -62,17 +62,28 @@ def test_combine_takes_what_it_overwrites(out: str, alpha: float, rng: np.random
     assert_close(there[out], expected, 2)
 
 
+@pytest.mark.parametrize("nonnegative", [False, True])
+def test_products_are_added_as_on_the_cpu(nonnegative: bool, rng: np.random.Generator) -> None:
+    x, a, b = drawn(rng, (5, 6, 7), 3)
+    there = gpu.array(x)
+    gpu.add_product(there, 0.7, gpu.array(a), gpu.array(b), nonnegative)
+    gpu.maximum(there, gpu.array(b), out=there)
+    vectors.add_product(x, 0.7, a, b, nonnegative)
+    assert_close(there, np.maximum(x, b), 2)
+
+
 @pytest.mark.parametrize("at_once", [1, 1 << 20])
 @pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("scaled", [False, True])
 def test_residuals_and_their_sums_are_the_cpus(
-    weighted: bool, at_once: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    weighted: bool, scaled: bool, at_once: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(volumes, "_AT_ONCE", at_once)
     data, model = drawn(rng, (7, 11, 30), 2)
-    weight = rng.uniform(0, 2, data.shape).astype(np.float32) if weighted else None
+    weight, scale = (rng.uniform(0, 2, data.shape).astype(np.float32) if has else None for has in (weighted, scaled))
     views, there = gpu.array(data), gpu.array(model)
-    found = gpu.replace_by_residual(views, there, None if weight is None else gpu.array(weight))
-    assert found == pytest.approx(vectors.replace_by_residual(data, model, weight), rel=1e-6)
+    found = gpu.replace_by_residual(views, there, *(None if s is None else gpu.array(s) for s in (weight, scale)))
+    assert found == pytest.approx(vectors.replace_by_residual(data, model, weight, scale), rel=1e-6)
     assert type(found) is float
     np.testing.assert_array_equal(gpu.numpy(there), model)
 
