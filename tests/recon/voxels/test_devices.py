@@ -69,7 +69,7 @@ def test_volumes_made_on_a_gpu_are_those_of_the_cpu(method: recon.Method, weight
     assert_same_volumes(LEANED, method, weighted, off)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("geometry", [PARALLEL, CONE], ids=["parallel", "cone"])
-def test_a_gpu_that_projects_makes_the_volume_of_the_cpu(geometry: Geometry) -> None:
-    assert_same_volumes(geometry, PnpDct(iterations=6, patch_threshold=0.02), True)
+@pytest.mark.parametrize("beam", [PARALLEL, CONE], ids=["parallel", "cone"])
+def test_a_gpu_that_projects_makes_the_volume_of_the_cpu(beam: Geometry) -> None:
+    few = beam.select(slice(None, None, 4)).rows(1, 3).binned(2)  # each projection takes the interpreter a second
+    assert_same_volumes(few, FistaTv(iterations=1, subsets=1, tv_weight=0.02), True)
