@@ -243,7 +243,7 @@ method_options = together(
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
-        help="Device of the fit.",
+        help="Device that computes the fit, total variation and patches.",
     ),
     heading(METHOD),
     run_option(

@@ -1,4 +1,4 @@
-"""Triton kernels for CUDA devices: the same operations as the CPU kernels; imported only if a GPU is used.
+"""Kernels for CUDA devices, in Triton and torch: the CPU kernels' operations; imported only if a GPU is used.
 
 They work on contiguous float32 torch tensors. Sums are gathered, never scattered. An image tile or a brick of voxels
 sums the Gaussians on its list; a Gaussian sums the gradient under it. So there are no atomics, and the same input gives
