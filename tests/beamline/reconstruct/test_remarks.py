@@ -120,8 +120,8 @@ def test_views_of_one_column_say_nothing_of_a_volume() -> None:
 
 
 def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None:
-    """Views of that cylinder leave what that very volume leaves; of those of two densities the least squares leave their
-    scatter, whatever matter around the field adds to each."""
+    """Views of that cylinder leave what that very volume leaves; of those of two densities the least squares leave
+    their scatter, whatever matter around the field adds to each."""
     made, prepared = _made(np.random.default_rng(0), {}, "sirt")
     grid = made.volume.grid
     _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
