@@ -161,9 +161,9 @@ def left_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[floa
     for views in np.array_split(some, min(len(some), 4)):  # that takes less memory
         for lines, measured, _ in _in_bands(volumes, data, prepared.geometry, views, weights):
             known, own, seen = _at_voxel_resolution(*measured)
-            own, *images = (_without_means(image, known) for image in (own, seen, *lines))
+            images = [_without_means(image, known) for image in (seen, *lines)]
             products += [[np.vdot(one, other) for other in images] for one in images]
-            total += float(np.vdot(own, own))
+            total += float(np.square(_without_means(own, known)).sum())
     if total == 0:
         return 0.0, 0.0
     squares = products[0, 0] - 2 * products[0, 1] + products[1, 1]
