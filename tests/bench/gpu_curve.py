@@ -54,7 +54,7 @@ def main(folder: Path, scan: str, labels: list[str]) -> None:
     print(torch.cuda.get_device_name(), torch.__version__, flush=True)
     for label in labels:
         method = method_of(label.split())
-        few = replace(method, steps=3) if getattr(method, "steps", None) else method  # type: ignore[type-var]
+        few = replace(method, steps=3) if getattr(method, "steps", None) else method
         row(case, label, few)
         if os.environ.get("PROFILE"):
             with cProfile.Profile() as profile:
