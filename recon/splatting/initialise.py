@@ -7,8 +7,8 @@ import operator
 from dataclasses import dataclass
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 
 from recon.base.arrays import bin_views
 from recon.base.choices import Filter
@@ -19,6 +19,7 @@ from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
+from recon.kernels.cpu.slopes import slopes_at, windowed
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
@@ -231,8 +232,8 @@ def sample_gaussians(
     """
     data, unit, candidates = _matter(volume, field_radius, smooth)
     data /= unit  # so that squares of gradients stay in float32's range
-    slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
-    value = data.ravel()[candidates]
+    value, slope = data.ravel()[candidates], np.empty(candidates.size, np.float32)
+    slopes_at(data, candidates, slope)
     weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
     # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
     keys = rng.exponential(size=candidates.size) / weight
@@ -268,10 +269,11 @@ def sample_as_published(
 
 def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
     """The smoothed volume within the field, its density unit, and the voxels that may hold a Gaussian."""
-    data = gaussian_filter(np.maximum(volume.data, 0), smooth) if smooth > 0 else np.maximum(volume.data, 0)
+    taps, data = np.arange(-round(4 * smooth), round(4 * smooth) + 1), np.empty(volume.data.shape, np.float32)
+    window = np.exp(-0.5 * (taps / max(smooth, 1e-9)) ** 2)
+    windowed(np.maximum(volume.data, 0), (window / window.sum()).astype(np.float32), data)
     _, y, x = volume.grid.coordinates()
-    inside = (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
-    data = np.where(inside[None], data, 0).astype(np.float32)
+    data *= (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
     unit = density_unit(Volume(data, volume.grid))
     candidates = np.flatnonzero(data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
     if candidates.size < 4:
@@ -289,7 +291,7 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.full(near, np.inf)
     from scipy.spatial import cKDTree
 
-    distances = np.asarray(cKDTree(means).query(means, k=near)[0])
+    distances = np.asarray(cKDTree(means).query(means, k=near, workers=get_num_threads())[0])
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
 
 
