@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, sample_of
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -212,8 +212,9 @@ def _gradient(volume: F32) -> F32:
 
 
 def _limits(gradient: F32, classes: int) -> list[float]:
-    some = gradient.reshape(-1)[:: max(1, gradient.size // _SAMPLED)]
-    return [float(limit) for limit in np.percentile(some, np.linspace(0, 100, classes + 1)[1:-1])]
+    return [
+        float(limit) for limit in np.percentile(sample_of(gradient, _SAMPLED), np.linspace(0, 100, classes + 1)[1:-1])
+    ]
 
 
 def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:

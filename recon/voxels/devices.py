@@ -127,7 +127,7 @@ class _GpuProjector:
         self._projector, self._device, geometry = projector, device, projector.geometry
         self._joseph = import_module("recon.kernels.gpu.joseph")
         moments = views_of_exposure(geometry) if geometry.is_straight and not geometry.skew else []
-        self._moments = [self._joseph.VoxelRays.of(views, projector.grid, device.device) for views in moments]
+        self._moments = [self._joseph.JosephRays.of(views, projector.grid, device.device) for views in moments]
 
     def forward_lines(self, volume: Any) -> Any:
         if not self._moments:

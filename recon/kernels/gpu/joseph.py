@@ -46,7 +46,7 @@ _WHOLE = 1e-6  # slices: rows this close to slices lie on them
 
 
 @dataclass(frozen=True, eq=False)
-class VoxelRays:
+class JosephRays:
     """The rays of straight views through a box of voxels, on the device.
 
     Attributes:
@@ -64,7 +64,7 @@ class VoxelRays:
     on_slices: bool
 
     @classmethod
-    def of(cls, geometry: Geometry, grid: Grid, device: str | torch.device) -> VoxelRays:
+    def of(cls, geometry: Geometry, grid: Grid, device: str | torch.device) -> JosephRays:
         """The rays of all views of `geometry`.
 
         Raises:
@@ -227,7 +227,7 @@ def _adjoint(
     tl.store(out + voxel, sums, ((x < nx) & (y < ny))[:, None] & (z < nz)[None, :])
 
 
-def forward(volume: Tensor, rays: VoxelRays, out: Tensor) -> None:
+def forward(volume: Tensor, rays: JosephRays, out: Tensor) -> None:
     """Line integrals of volume [y, x, z] into out [view, col, row], mm times the volume's unit."""
     views, cols, rows = out.shape
     high = min(triton.next_power_of_2(rows), _HIGH)
@@ -239,7 +239,7 @@ def forward(volume: Tensor, rays: VoxelRays, out: Tensor) -> None:
         )  # fmt: skip
 
 
-def adjoint(projections: Tensor, rays: VoxelRays, out: Tensor) -> None:
+def adjoint(projections: Tensor, rays: JosephRays, out: Tensor) -> None:
     """The transpose of `forward`: projections [view, col, row] into out [y, x, z] (overwritten)."""
     (ny, nx, nz), (near_cols, near_rows) = out.shape, rays.near
     deep = min(triton.next_power_of_2(nz), _DEEP)

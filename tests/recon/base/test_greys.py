@@ -57,3 +57,9 @@ def test_classes_are_parted_where_they_are_two_and_noise_is_one(rng: np.random.G
     assert len(class_levels(rng.normal(size=50_000))) == 1
     parts = class_levels(np.concatenate([rng.normal(0, 1, 40_000), rng.normal(10, 1, 10_000)]))
     assert [round(float(np.median(each))) for each in parts] == [0, 10]
+
+
+def test_sizes_that_share_factors_with_the_sample_show_the_sample_of_the_scan() -> None:
+    volume = np.zeros((125, 80, 400), np.float32)  # a sample of every twentieth value would have twenty columns
+    volume[:, 20:60, 101:110] = 1.0
+    assert class_levels(volume)[-1][-1] == 1.0
