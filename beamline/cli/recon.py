@@ -194,11 +194,15 @@ def _in_time() -> str:
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError for a recipe whose options contradict each other, or cannot be used with a volume, for any
-    scan."""
-    with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
-        values = dict(context.params)
-        method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
+    """Raise UsageError, of the command that asks, for a recipe whose options contradict each other, or cannot be used
+    with a volume, for any scan."""
+    try:
+        with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
+            values = dict(context.params)
+            method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
+    except click.UsageError as error:
+        error.ctx = click.get_current_context()
+        raise
 
 
 def run_reconstruction(

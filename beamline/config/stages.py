@@ -58,7 +58,7 @@ def file_of(said: Mapping[str, object], folder: Path) -> Path:
 
 
 class FoundOnDisk:
-    """Implements `drivers.stages.kept.SettingsStore`. If the disk refuses, only this protection is lost."""
+    """Implements `drivers.stages.shared.SettingsStore`. If the disk refuses, only this protection is lost."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

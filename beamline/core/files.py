@@ -220,6 +220,17 @@ def refuse_existing(path: Path) -> None:
         )
 
 
+def refuse_undecoded(path: Path | str) -> None:
+    """Raises DataError for a path whose bytes are no UTF-8, which results are to name."""
+    try:
+        str(Path(path).absolute()).encode()
+    except UnicodeEncodeError as error:
+        raise DataError(
+            f"The path {path} is no text: it has bytes that are not UTF-8, and no result could name it. "
+            "Rename the file or folder. Nothing was read."
+        ) from error
+
+
 @contextmanager
 def named_on_failure(path: Path) -> Iterator[None]:
     """A context that converts an OSError while writing `path` to a DataError with the path, which the system leaves

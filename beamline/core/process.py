@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum, auto
 from pathlib import Path
 from typing import Any, Self, TextIO
@@ -18,7 +18,7 @@ from typing import Any, Self, TextIO
 import psutil
 
 from beamline.core.errors import INTERRUPTED
-from beamline.core.stop import StopScope
+from beamline.core.stop import StopScope, signals_held
 
 _POLL = 0.2  # real s between two questions whether the process should stop
 FROZEN_AFTER = 4.0  # real s without output or processor time, after which a process that was asked to end is killed
@@ -70,26 +70,32 @@ class ChildProcess:
     ) -> None:
         self._on_line, self._on_end = on_line, on_end
         self._silent_since = time.monotonic()
-        self._process = subprocess.Popen(
-            list(command),
-            stdin=subprocess.PIPE if tether else subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            env={**(os.environ if environment is None else environment), **SAFE_PATH},
-            start_new_session=True,  # POSIX
-            # Windows; without a window of its own a child ends with the console that is closed.
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-            | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
-        )
-        if behind:
-            with suppress(psutil.Error):  # it has ended, or the system does not allow it
-                child = psutil.Process(self._process.pid)
-                child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
-        self._reader = threading.Thread(target=self._read, name=f"output of process {self._process.pid}", daemon=True)
-        self._reader.start()
+        with ExitStack() as interrupted:
+            with signals_held():  # they would leave a process that nobody knows
+                self._process = subprocess.Popen(
+                    list(command),
+                    stdin=subprocess.PIPE if tether else subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=stderr,
+                    text=True,
+                    encoding="utf-8",
+                    errors="replace",
+                    env={**(os.environ if environment is None else environment), **SAFE_PATH},
+                    start_new_session=True,  # POSIX
+                    # Windows; without a window of its own a child ends with the console that is closed.
+                    creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+                    | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
+                )
+                interrupted.callback(self._process.kill)
+                if behind:
+                    with suppress(psutil.Error):  # it has ended, or the system does not allow it
+                        child = psutil.Process(self._process.pid)
+                        child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
+                name = f"output of process {self._process.pid}"
+                self._reader = threading.Thread(target=self._read, name=name, daemon=True)
+                self._reader.start()
+                interrupted.callback(self.end)
+            interrupted.pop_all()
 
     def __enter__(self) -> Self:
         return self

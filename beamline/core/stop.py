@@ -92,6 +92,21 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 
 @contextmanager
+def signals_held() -> Iterator[None]:
+    """A context in which Ctrl-C, SIGTERM and SIGHUP wait, if this is the main thread and has handlers for them: they
+    are delivered at its end, so that what it begins is whole, and its owner can end it.
+    """
+    came = list[int]()
+    numbers = [number for number in (signal.SIGINT, *_asking_to_end()) if callable(signal.getsignal(number))]
+    try:
+        with _caught(dict.fromkeys(numbers, lambda number, frame: came.append(number))):
+            yield
+    finally:
+        for number in came:
+            signal.raise_signal(number)
+
+
+@contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
     """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones."""
     with ExitStack() as restore:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,25 +144,38 @@ def measure(
     return {name: float(value) for name, value in values.items()}
 
 
-def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
-    """The residual, as in `measure`, of a uniform cylinder that fills the slices, with the density of least residual.
+def left_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[float, float]:
+    """The residual, in the differences of rays from the mean of their row, of a volume, and the lesser one of two
+    uniform volumes with the density of least residual: a box and a cylinder that fill the slices.
 
-    A volume that leaves more shows nothing of the sample yet.
+    A volume that leaves more shows nothing of the sample yet. The means tell nothing: they hold matter beyond the
+    field, too, which a right volume lacks. Both are 0 where views have no such differences.
     """
+    grid = volume.grid
     _, y, x = grid.coordinates()
     inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
+    uniform = (Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True))
     some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
-    data = prepared.projections.data
-    density = float(np.mean([data[view].mean() for view in some])) / (grid.spacing[1] * y.size)
+    products, total = np.zeros((4, 4)), 0.0  # of the views, the volume and the two uniform ones
+    volumes, data = (volume, *uniform), prepared.projections.data
+    for views in np.array_split(some, min(len(some), 4)):  # that takes less memory
+        for lines, measured, _ in _in_bands(volumes, data, prepared.geometry, views, weights):
+            known, own, seen = _at_voxel_resolution(*measured)
+            images = [_without_means(image, known) for image in (seen, *lines)]
+            products += [[np.vdot(one, other) for other in images] for one in images]
+            total += float(np.square(_without_means(own, known)).sum())
+    if total == 0:
+        return 0.0, 0.0
+    squares = products[0, 0] - 2 * products[0, 1] + products[1, 1]
+    norms = np.diag(products)[2:]
+    least = products[0, 0] - np.divide(products[0, 2:] ** 2, norms, out=np.zeros(2), where=norms > 0).max()
+    return math.sqrt(max(squares, 0.0) / total), math.sqrt(max(least, 0.0) / total)
 
-    def squares(of: float) -> float:
-        cylinder = np.broadcast_to(np.where(inside, np.float32(of), np.float32(0)), grid.shape)
-        return _residual(Volume(cylinder, grid), data, prepared.geometry, some, weights, lambda done, count: None) ** 2
 
-    # The squares are q - 2 b c + a c² of the density c; q < 1, since views are compared at the resolution of voxels.
-    plus, minus, q = squares(density), squares(-density), squares(0.0)
-    b, a = (minus - plus) / 4, (plus + minus) / 2 - q
-    return math.sqrt(max(q - b**2 / a, 0.0)) if a > 0 else math.sqrt(q)
+def _without_means(image: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The differences of known rays [view, row, col] from the mean of their row; 0 of the others."""
+    values, n = np.where(known, image, np.float64(0)), np.maximum(known.sum(axis=2, keepdims=True), 1)
+    return np.where(known, values - values.sum(axis=2, keepdims=True) / n, 0)
 
 
 def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
@@ -210,12 +223,19 @@ def squares_left(
         views: those measured, where NaN does not count.
         measured: [view, row, col]; None: all rays.
     """
-    known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
-    own = np.where(known, views, np.float32(0))
-    seen = at_voxel_resolution(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
+    known, own, seen = _at_voxel_resolution(views, resolution, measured)
     left = np.where(known, projected - seen, 0)
     sums = [np.square(each, dtype=np.float64).sum(axis=(1, 2)) for each in (left, own)]
     return sums[0], sums[1]
+
+
+def _at_voxel_resolution(
+    views: NDArray[np.float32], resolution: ViewResolution, measured: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+    """Which rays are known, p of these, and G p, [view, row, col] each; see `squares_left`."""
+    known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
+    own = np.where(known, views, np.float32(0))
+    return known, own, at_voxel_resolution(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
 
 
 def _views_compared(geometry: Geometry) -> NDArray[np.int64]:
@@ -233,23 +253,40 @@ def _residual(
 ) -> float:
     """The residual of the volume in these views, without unmeasured rays."""
     squared = total = 0.0
-    some = geometry.select(views)
-    matter = np.maximum(sum(np.nansum(data[view], axis=1, dtype=np.float64) for view in views), 0)
-    bands = residual_bands(volume.grid, some, matter)
-    for n, rows in enumerate(bands):
-        part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)
-        lines = replace(volume, data=np.ascontiguousarray(volume.data)) if part is some else volume
-        if part is not some:
-            height = (part.middle_height, *volume.grid.centre[1:])
-            grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
-            lines = Volume(np.ascontiguousarray(volume.data[rows]), grid)
-        measured = None if weights is None else np.asarray(weights[views, rows] > 0)
-        left, own = squares_left(project(lines, part), data[views, rows], ViewResolution.of(part, lines.grid), measured)
+    for (lines,), measured, done in _in_bands([volume], data, geometry, views, weights):
+        left, own = squares_left(lines, *measured)
         squared, total = squared + left.sum(), total + own.sum()
-        progress((n + 1) * some.n_views // len(bands), some.n_views)
+        progress(done, len(views))
     if total == 0:
         raise ValueError("all projections are zero, so no residual can be computed")
     return float(np.sqrt(squared / total))
+
+
+_Measured = tuple[NDArray[np.float32], ViewResolution, NDArray[np.bool_] | None]
+"""Views [view, row, col], the resolution of voxels in them, and which rays were measured; None: all."""
+
+
+def _in_bands(
+    volumes: Sequence[Volume],
+    data: NDArray[np.float32],
+    geometry: Geometry,
+    views: NDArray[np.int64],
+    weights: RayWeights | None,
+) -> Iterator[tuple[list[NDArray[np.float32]], _Measured, int]]:
+    """Line integrals of each volume in each band of rows of these views, those measured, and the
+    number of views that this and earlier bands are worth."""
+    some, grid = geometry.select(views), volumes[0].grid
+    matter = np.maximum(sum(np.nansum(data[view], axis=1, dtype=np.float64) for view in views), 0)
+    bands = residual_bands(grid, some, matter)
+    for n, rows in enumerate(bands):
+        part, slices = some, slice(None)
+        if rows != slice(0, some.detector_shape[0]):
+            part, slices = some.rows(rows.start, rows.stop), rows
+            height = (part.middle_height, *grid.centre[1:])
+            grid = replace(grid, shape=(part.detector_shape[0], *grid.shape[1:]), centre=height)
+        lines = [project(Volume(np.ascontiguousarray(each.data[slices]), grid), part) for each in volumes]
+        measured = None if weights is None else np.asarray(weights[views, rows] > 0)
+        yield lines, (data[views, rows], ViewResolution.of(part, grid), measured), (n + 1) * len(views) // len(bands)
 
 
 def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) -> list[slice]:

@@ -202,7 +202,7 @@ class ReconOptions:
         follow: settings for a scan that is still running; None for one that has ended.
         enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
-        cluster: whose workers reconstruct slabs, see `workers.cluster`; None: this process does.
+        cluster: whose workers reconstruct slabs, as `--cluster` names them; None: this process does.
         region: the box of the volume to make; None: all of it.
         partial: volume whose missing slabs are reconstructed; None begins anew.
         uncertainty: make the standard deviation of each voxel, too, see `recon.error_bars`.
@@ -279,7 +279,7 @@ class ReconOptions:
         unchanged if the whole volume is wanted.
 
         Raises:
-            ConfigError, DataError: see `region.selection_around` and `sample_box.box_around_sample`.
+            ConfigError, DataError: see `region.selection_around` and `region.box_around_sample`.
         """
         region = self.region
         if region is None:

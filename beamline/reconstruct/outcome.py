@@ -190,20 +190,22 @@ def lost_mass_warning(made: Reconstruction, beside_fbp: LostMatter) -> str:
     )
 
 
-def not_begun_warning(made: Reconstruction, residual: float, uniform: float) -> str:
-    """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a cylinder.
+def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
+    """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a
+    volume of one density.
 
     Args:
-        residual: of the volume. uniform: that of a cylinder of one density, see `measure.uniform_residual`.
+        left, uniform: by the volume, and by a volume of one density; see `measure.left_along_rows`.
     """
-    if residual < uniform or by_name(made.method).traits.direct:
+    if left < uniform or uniform == 0 or by_name(made.method).traits.direct:
         return ""
     last = made.history[-1] if made.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
-        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {residual:.3g} of the views, where "
-        f"a cylinder of one density that fills the field leaves {uniform:.3g}. The method ended in {made.seconds:.3g} "
-        f"s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method fbp."
+        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the differences "
+        f"along the rows of the views, where a volume of one density leaves {uniform:.3g}. The method ended in "
+        f"{made.seconds:.3g} s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method "
+        "fbp."
     )
 
 

@@ -58,7 +58,7 @@ class Region:
 
 @dataclass(frozen=True)
 class AroundSample:
-    """A placeholder for the box around the sample, which `sample_box.box_around_sample` finds when the scan is read."""
+    """A placeholder for the box around the sample, which `box_around_sample` finds when the scan is read."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu, Pass
 
 
-class On(NamedTuple):
+class Renderer(NamedTuple):
     """Unit of the densities, kernel and backend for raw parameters."""
 
     unit: float
@@ -28,14 +28,14 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, geometry: Geometry,
-        how: tuple[float, float, RayModel],
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer,
+        geometry: Geometry, how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
         """Images [view, row, col]; `how` has the faintness limit, the truncation in standard deviations, and the
         rays."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = on, geometry, how
-        run = _begin((means, log_scales, quaternions, raw), on)
+        ctx.given = renderer, geometry, how
+        run = _begin((means, log_scales, quaternions, raw), renderer)
         images = means.new_empty((geometry.n_views, *geometry.detector_shape))
         for view, image in enumerate(images):
             image.copy_(torch.as_tensor(run.view(geometry, view, *how).image))
@@ -43,10 +43,10 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, geometry, how = ctx.given
-        run = _begin(ctx.saved_tensors, on)
+        renderer, geometry, how = ctx.given
+        run = _begin(ctx.saved_tensors, renderer)
         for view, slope in enumerate(gradient):
-            run.view(geometry, view, *how).backward(_native(slope, on.backend))
+            run.view(geometry, view, *how).backward(_native(slope, renderer.backend))
         return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
@@ -55,26 +55,26 @@ class Voxelize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, grid: Grid,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, renderer: Renderer, grid: Grid,
         how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
         """Density [z, y, x]; `how` has the faintness limit, and the truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = on, grid, how
-        run = _begin((means, log_scales, quaternions, raw), on)
+        ctx.given = renderer, grid, how
+        run = _begin((means, log_scales, quaternions, raw), renderer)
         return torch.as_tensor(run.box(grid, *how).density)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, grid, how = ctx.given
-        run = _begin(ctx.saved_tensors, on)
-        run.box(grid, *how).backward(_native(gradient, on.backend))
+        renderer, grid, how = ctx.given
+        run = _begin(ctx.saved_tensors, renderer)
+        run.box(grid, *how).backward(_native(gradient, renderer.backend))
         return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
-def _begin(parameters: Sequence[Tensor], on: On) -> Pass[Any]:
-    means, log_scales, quaternions, raw = (_native(tensor, on.backend) for tensor in parameters)
-    return on.backend.begin(means, log_scales, quaternions, raw, on.unit, on.kernel)
+def _begin(parameters: Sequence[Tensor], renderer: Renderer) -> Pass[Any]:
+    means, log_scales, quaternions, raw = (_native(tensor, renderer.backend) for tensor in parameters)
+    return renderer.backend.begin(means, log_scales, quaternions, raw, renderer.unit, renderer.kernel)
 
 
 def _native(tensor: Tensor, backend: Backend[Any]) -> Any:

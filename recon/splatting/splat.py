@@ -106,7 +106,7 @@ def voxel_means(
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
     """The first arguments of `Project` and `Voxelize`."""
-    from recon.splatting.autograd import On
+    from recon.splatting.autograd import Renderer
 
     if implementation == "gpu":
         Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
@@ -114,7 +114,7 @@ def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
         backend: Backend[Any] = Gpu(g.means.device)
     else:
         backend = Cpu()
-    return g.means, g.log_scales, g.quaternions, g.raw_densities, On(g.density_unit, g.kernel, backend)
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, Renderer(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:

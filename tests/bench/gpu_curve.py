@@ -1,9 +1,10 @@
-"""Accuracy against seconds of fits on a CUDA device, on cones of the published protocol:
+"""Accuracy against seconds on a CUDA device, on cones of the published protocol:
 
-python -m tests.bench.gpu_curve DATA teapot:75 "published 3000" "ours 1600 0" ours
+python -m tests.bench.gpu_curve DATA teapot:75 "published 3000" "ours 1600 0" ours auto fista-tv "naf 3000"
 
-A row is `published STEPS`, or `ours [STEPS [SWEEPS]]`. DATA is the folder of the volumes. Each row is made once before
-it is measured, with few steps, so that nothing is compiled in its seconds. PROFILE=1 prints what the host did.
+A row is `published STEPS`, `ours [STEPS [SWEEPS]]`, or another method that computes there, `METHOD [STEPS]`. DATA is
+the folder of the volumes. Each row is made once before it is measured, with few steps, so that nothing is compiled in
+its seconds. PROFILE=1 prints what the host did.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ import torch
 import recon
 from recon.assess.metrics import psnr
 from recon.features.published.r2_published import R2Published
+from recon.methods import by_name
 from tests.bench.quality_cases import Case, cone, seen_by_simulator
 
 
-def method_of(words: list[str]) -> recon.R2:
-    numbers = [int(word) for word in words[1:]]
-    if words[0] == "published":
-        return R2Published(steps=numbers[0])
-    return recon.R2(**dict(zip(("steps", "finish"), numbers, strict=False)))
+def method_of(words: list[str]) -> recon.Method:
+    kinds: dict[str, type[recon.Method]] = {"published": R2Published, "ours": recon.R2, "auto": recon.Auto}
+    kind = kinds.get(words[0]) or by_name(words[0])
+    return kind(**dict(zip(("steps", "finish"), map(int, words[1:]), strict=False)))
 
 
-def row(case: Case, label: str, method: recon.R2) -> str:
+def row(case: Case, label: str, method: recon.Method) -> str:
     torch.cuda.reset_peak_memory_stats()
     torch.cuda.synchronize()
     begin, cpu = time.perf_counter(), time.process_time()
@@ -40,9 +41,10 @@ def row(case: Case, label: str, method: recon.R2) -> str:
     wall, cpu = time.perf_counter() - begin, time.process_time() - cpu
     memory = torch.cuda.max_memory_allocated() / 2**30
     quality = psnr(case.truth, np.maximum(made.volume.data, 0), case.peak)
+    size = f"{made.settings.get('steps', 0):>6} steps {made.settings.get('gaussians', 0):>7} Gaussians"
     return (
-        f"{case.name:8} {case.geometry.n_views:3} views  {label:20} {made.settings['steps']:>6} steps "
-        f"{made.settings['gaussians']:>7} Gaussians {quality:6.2f} dB {wall:7.2f} s ({cpu:.1f} CPU s) {memory:.2f} GB"
+        f"{case.name:8} {case.geometry.n_views:3} views  {label:20} {size} {quality:6.2f} dB {wall:7.2f} s "
+        f"({cpu:.1f} CPU s) {memory:.2f} GB"
     )
 
 
@@ -52,7 +54,7 @@ def main(folder: Path, scan: str, labels: list[str]) -> None:
     print(torch.cuda.get_device_name(), torch.__version__, flush=True)
     for label in labels:
         method = method_of(label.split())
-        few = replace(method, steps=3) if method.planned_steps else method
+        few = replace(method, steps=3) if getattr(method, "steps", None) else method
         row(case, label, few)
         if os.environ.get("PROFILE"):
             with cProfile.Profile() as profile:

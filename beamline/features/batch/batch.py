@@ -290,7 +290,7 @@ def _read(folder: Path) -> list[BatchRow]:
 
     path = folder / TABLE
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
             rows = [{name: value for name, value in row.items() if name and value} for row in csv.DictReader(file)]
         return TypeAdapter(list[BatchRow]).validate_python(rows)
     except ValidationError as error:
@@ -303,4 +303,5 @@ def _read(folder: Path) -> list[BatchRow]:
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
     names = [column.name for column in fields(BatchRow)]
-    write_whole(folder / TABLE, csv_text([names, *(vars(row).values() for row in rows)]), replace=True)
+    table = csv_text([names, *(vars(row).values() for row in rows)])
+    write_whole(folder / TABLE, table.encode("utf-8", "surrogateescape"), replace=True)

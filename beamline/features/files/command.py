@@ -107,12 +107,12 @@ def _described(facts: Mapping[str, Any], returned: Sequence[str]) -> list[str]:
 def _returned(scan: SourceOptions) -> list[ReturnedView]:
     from beamline.features.files.validate import LOOK
     from beamline.projections.flagged_frames import returned_views
-    from beamline.storage.readers.base import LookedEnoughError
+    from beamline.storage.readers.base import TakesTooLongError
     from beamline.storage.readers.open import open_scan
     from beamline.storage.readers.wrapped import BriefSource
 
     until = SystemClock().now() + LOOK
-    with suppress(LookedEnoughError), open_scan(scan) as source:
+    with suppress(TakesTooLongError), open_scan(scan) as source:
         return returned_views(BriefSource(source, lambda: SystemClock().now() > until))
     return []
 

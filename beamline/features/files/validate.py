@@ -17,7 +17,7 @@ from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.features.files.nexus import nexus_findings
 from beamline.storage import hdf5
-from beamline.storage.readers.base import LookedEnoughError, ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource, TakesTooLongError, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import BriefSource
 from beamline.storage.recon_record import ReconRecord
@@ -106,7 +106,7 @@ def source_findings(source: ScanSource) -> list[Finding]:
     for rule in (*SOURCE_RULES, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
-        except LookedEnoughError as error:
+        except TakesTooLongError as error:
             findings.append(Finding("warning", "brief", str(error)))
     return [*dict.fromkeys(findings)]
 

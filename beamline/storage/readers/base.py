@@ -300,7 +300,7 @@ def _measured(pixels: NDArray[Any]) -> NDArray[Any]:
     return pixels
 
 
-class LookedEnoughError(DataError):
+class TakesTooLongError(DataError):
     """The check was ended because it would take too long; findings so far are valid."""
 
 

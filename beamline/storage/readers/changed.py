@@ -38,7 +38,7 @@ class OverlaidSource(WrappedSource):
         """Lay over `base`.
 
         Args:
-            angles: radians, for `base` (see `angle_table.assign`); `angles_from` names them in errors.
+            angles: radians, for `base` (see `supplied.assign`); `angles_from` names them in errors.
             of_views: the angles are those of projections alone.
             darks, flats: [frame, row, col].
 

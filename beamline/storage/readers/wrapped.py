@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, TakesTooLongError, frame_indices
 from drivers.base.frame import Frame, FrameKind
 
 _T = TypeVar("_T")
@@ -79,7 +79,7 @@ for _name in _BY_FRAME:
 
 
 class BriefSource(WrappedSource):
-    """Forwards to `base`, for callers that only describe it: raises LookedEnoughError if `over` returns True before a
+    """Forwards to `base`, for callers that only describe it: raises TakesTooLongError if `over` returns True before a
     read, or if a read would take long or much memory. The order of dimensions or the chunks of a file can make any
     frame cost all of it.
     """
@@ -91,7 +91,7 @@ class BriefSource(WrappedSource):
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         n = frame_indices(frames, int(self.image_key.size)).size * len(range(self.shape[0])[rows])
         if self._over() or self.frame_bytes > UNPACKED or n * self.shape[1] * self.dtype.itemsize > _READ:
-            raise LookedEnoughError(
+            raise TakesTooLongError(
                 "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
                 "validate` looks at them."
             )

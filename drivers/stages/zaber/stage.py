@@ -1,7 +1,7 @@
 """Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
 
 Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
-`speed_unit` and `drivers.stages.zaber.train.TriggerUse`.
+`speed_unit` and `drivers.stages.zaber.settings.TriggerUse`.
 """
 
 from __future__ import annotations

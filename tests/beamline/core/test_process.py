@@ -1,6 +1,7 @@
 """A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -70,6 +71,24 @@ def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
     assert child.process.wait() is ProcessEnd.EXITED
     assert (child.lines, child.process.code, child.process.running) == (["1", "2"], 1, False)
     assert child.log.read_text(encoding="utf-8").strip() == "no room"
+
+
+@pytest.mark.parametrize("tether", [False, True])
+def test_ctrl_c_while_a_process_starts_leaves_none(
+    tether: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, popen = list[subprocess.Popen[str]](), subprocess.Popen
+
+    def interrupted(*words: Any, **options: Any) -> subprocess.Popen[str]:
+        begun.append(popen(*words, **options))
+        signal.raise_signal(signal.SIGINT)
+        return begun[0]
+
+    monkeypatch.setattr(subprocess, "Popen", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _Child(tmp_path, IGNORES, tether=tether)
+    assert len(begun) == 1 and begun[0].poll() is not None
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:

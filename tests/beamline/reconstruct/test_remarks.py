@@ -9,7 +9,7 @@ import pytest
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import measure, uniform_residual
+from beamline.reconstruct.measure import left_along_rows, measure
 from beamline.reconstruct.outcome import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
@@ -87,31 +87,54 @@ def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_whe
 
 
 @pytest.mark.parametrize("method", ["naf", "os-sirt-tv"])
+@pytest.mark.parametrize("wider", [False, True])
 @pytest.mark.parametrize(("amount", "begun"), [(0.0, False), (1.0, True)])
 def test_a_volume_of_one_density_is_said_to_show_nothing(
-    method: str, amount: float, begun: bool, rng: np.random.Generator
+    method: str, wider: bool, amount: float, begun: bool, rng: np.random.Generator
 ) -> None:
-    """Whatever method ended before it had begun, and whatever density it began from."""
+    """Whatever method ended before it had begun, and whatever density it began from; also of a sample that is wider
+    than the field, of whose views the right volume leaves more than a uniform one."""
     made, prepared = _made(rng, {}, method)
-    blank = np.float32(0.7 * made.volume.data.mean())
-    volume = replace(made.volume, data=amount * made.volume.data + (1 - amount) * blank)
-    left = measure(volume, prepared, None)["residual"]
-    said = not_begun_warning(replace(made, volume=volume), left, uniform_residual(volume.grid, prepared))
+    truth, data = made.volume.data, prepared.projections.data
+    if wider:
+        around = Volume(np.ones((24, 144, 144), np.float32), replace(made.volume.grid, shape=(24, 144, 144)))
+        _, y, x = around.grid.coordinates()
+        around.data[:, np.hypot(y[:, None], x) < 24] = 0
+        data = data + project(replace(around, data=0.02 * around.data), prepared.geometry)
+        prepared = replace(prepared, projections=replace(prepared.projections, data=data))
+    blank = np.float32(0.7 * truth.mean())
+    volume = replace(made.volume, data=amount * truth + (1 - amount) * blank)
+    left, uniform = left_along_rows(volume, prepared)
+    assert (measure(volume, prepared, None)["residual"] > 0.5) is (wider or not begun)
+    said = not_begun_warning(replace(made, volume=volume), left, uniform)
     assert (said == "") is begun
     assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
 
 
-def test_the_residual_of_a_uniform_cylinder_in_closed_form() -> None:
-    """Views of that cylinder leave nothing; of those of two densities the least squares leave their scatter."""
+def test_views_of_one_column_say_nothing_of_a_volume() -> None:
+    data, geometry = np.ones((8, 3, 1), np.float32), Geometry.parallel(np.linspace(0, 3, 8), (3, 1))
+    volume = Volume(np.ones((3, 1, 1), np.float32), Grid.matching(geometry))
+    found = left_along_rows(volume, prepared_views(data, geometry))
+    assert found == (0, 0)
+    assert not_begun_warning(Reconstruction(volume, {}, method="sirt", seconds=1.0), *found) == ""
+
+
+def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None:
+    """Views of that cylinder leave what that very volume leaves; of those of two densities the least squares leave
+    their scatter, whatever matter around the field adds to each."""
     made, prepared = _made(np.random.default_rng(0), {}, "sirt")
     grid = made.volume.grid
     _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
     full = Volume((np.hypot(y, x) < 24).astype(np.float32), grid)
     shadow = project(full, prepared.geometry)
     factors = np.where(np.arange(40) % 2, 1.5, 0.5).astype(np.float32)[:, None, None]
-    for data, expected in ((shadow, 0.0), (factors * shadow, None)):
+    some = np.unique(np.linspace(0, 39, 16).round().astype(int))
+    f = factors[some, 0, 0]
+    scatter = np.sqrt(1 - f.sum() ** 2 / (f.size * (f**2).sum()))
+    left = {}
+    for name, data in {"one": shadow, "two": factors * shadow, "within others": factors * (shadow + 30)}.items():
         views = replace(prepared, projections=replace(prepared.projections, data=data))
-        some = np.unique(np.linspace(0, 39, 16).round().astype(int))
-        f = factors[some, 0, 0]
-        exact = np.sqrt(1 - f.sum() ** 2 / (f.size * (f**2).sum())) if expected is None else expected
-        assert uniform_residual(grid, views) == pytest.approx(exact, abs=0.01)
+        left[name] = left_along_rows(full, views)
+    assert left["one"][1] <= left["one"][0] < left["one"][1] + 0.001 and left["one"][0] < 0.02
+    assert left["two"][1] == pytest.approx(scatter, abs=0.01)
+    assert left["within others"] == pytest.approx(left["two"], abs=1e-4)

@@ -107,7 +107,8 @@ def test_slabs_that_follow_fit_together(rng: np.random.Generator) -> None:
 
 
 def test_few_photons_get_the_strength_that_the_volume_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials of fewer steps let in less noise than the volume does, and preferred too little: 16 % beside twice it."""
+    """Trials of fewer steps let in less noise than the volume does, and preferred too little: 16 % beside twice it.
+    Of eight samples the present choice loses 0.7 % at most."""
     rng = np.random.default_rng(0)
     geometry = Geometry.parallel(np.linspace(0, np.pi, 36, endpoint=False), (4, 48), pixel_pitch=1.0)
     y, x = np.indices((48, 48)) - 23.5
@@ -125,4 +126,4 @@ def test_few_photons_get_the_strength_that_the_volume_needs(monkeypatch: pytest.
         monkeypatch.setattr(
             methods, "choose_patches", lambda *a, t=times: (p := choose(*a))._replace(strength=t * p.strength)
         )
-        assert chosen < 1.1 * error()
+        assert chosen < 1.02 * error()

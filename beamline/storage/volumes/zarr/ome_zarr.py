@@ -131,7 +131,7 @@ def _opened(path: Path, name: str) -> _Chunks:
 
 @dataclass(frozen=True)
 class _Chunks:
-    """A scale, which is sliced along z as an array is; of the finest one, `coarser` has the others (`base.Scale`)."""
+    """A scale, sliced along z as an array is; the finest one has the others in `coarser` (`base.VolumeScale`)."""
 
     path: Path  # of the whole volume
     name: str

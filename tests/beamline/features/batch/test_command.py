@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -155,6 +156,20 @@ def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_ke
     assert Path("out/scan/recon.h5").is_file()
 
 
+@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="names are text there")
+@pytest.mark.usefixtures("in_this_process")
+def test_a_scan_whose_name_is_no_text_fails_with_the_reason_before_it_is_read(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    named = Path(os.fsdecode(b"s\xe9.h5"))
+    named.write_bytes((folder / "scan.h5").read_bytes())
+    for call in range(2):  # the second one knows its row
+        result = beamline("batch", "s*.h5", "--config", "recipe.yaml", "-o", "out")
+        assert result.exit_code == 5 and "1 of 2 scans failed" in result.stderr and "defect" not in result.output, call
+        rows = batch._read(Path("out"))
+        assert [row.state for row in rows] == ["done", "failed"] and rows[1].scan == str(named.resolve())
+        assert "bytes that are not UTF-8" in rows[1].message
+
+
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     ("recipe", "sentence"),
@@ -169,7 +184,7 @@ def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_ke
 def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sentence: str) -> None:
     Path("recipe.yaml").write_text(recipe + "\n")
     result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
-    assert result.exit_code == 2 and sentence in result.output
+    assert result.exit_code == 2 and sentence in result.output and " batch [OPTIONS] SCANS" in result.output
     assert not (folder / "out").exists()
 
 

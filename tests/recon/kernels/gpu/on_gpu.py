@@ -13,7 +13,7 @@ from torch import Tensor
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
 from recon.kernels import reference
-from recon.splatting.autograd import On, Project, Voxelize
+from recon.splatting.autograd import Project, Renderer, Voxelize
 from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import as_leaves, gradients
 
@@ -62,12 +62,12 @@ def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
 def project_raw(*arguments: Any) -> Tensor:
     """The views of raw parameters and their unit: what `recon.project` calls on a GPU."""
     *raw, unit, geometry, faint, cut, model = arguments
-    return Project.apply(*raw, On(unit, Kernel.GAUSSIAN, _gpu()), geometry, (faint, cut, model))
+    return Project.apply(*raw, Renderer(unit, Kernel.GAUSSIAN, _gpu()), geometry, (faint, cut, model))
 
 
 def voxelize_raw(*arguments: Any) -> Tensor:
     *raw, unit, grid, faint, cut = arguments
-    return Voxelize.apply(*raw, On(unit, Kernel.GAUSSIAN, _gpu()), grid, (faint, cut))
+    return Voxelize.apply(*raw, Renderer(unit, Kernel.GAUSSIAN, _gpu()), grid, (faint, cut))
 
 
 def _gpu() -> Any:
