@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,17 @@ def median_deviation(values: NDArray[np.floating[Any]]) -> float:
     """Standard deviation of the normal distribution with this median of absolute values; 0 if none is finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
+
+
+def sample_of(values: NDArray[Any], about: int) -> NDArray[Any]:
+    """About so many of the values, from all places along the last axis.
+
+    With a step that shares a factor with its length, a sample of 183³ voxels showed three of 183 slices.
+    """
+    step = max(1, values.size // about)
+    while math.gcd(step, values.shape[-1]) > 1 and values.shape[-1] < values.size:
+        step += 1
+    return values.reshape(-1)[::step]
 
 
 def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float32]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import operator
-from dataclasses import dataclass
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 
 from recon.base.arrays import bin_views
 from recon.base.choices import Filter
@@ -19,6 +18,7 @@ from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
+from recon.kernels.cpu.slopes import slopes_at, windowed
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
@@ -29,7 +29,7 @@ from recon.voxels.iterative import solve
 from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import Projector, volume_lines
 from recon.voxels.view_weights import angular_weights
-from recon.voxels.voxel_problem import difference_weights
+from recon.voxels.voxel_problem import density_unit, difference_weights
 
 START_SWEEPS = 10
 """Of these sweeps; with momentum, more fit the noise. Without: not measured."""
@@ -44,30 +44,9 @@ MATTER = 0.05
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
 SCALED_BY = 12  # views
+_SLOPE = 1.0  # standard deviation of the Gaussian that gradients are taken under, voxels
 _LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
-
-
-@dataclass(frozen=True)
-class FirstVolume:
-    """The volume that the first Gaussians are drawn from.
-
-    Attributes:
-        kind: see `first_volume`.
-        factor: binning of its views.
-    """
-
-    kind: Start = "fbp"
-    factor: int = 1
-
-
-_USUAL = FirstVolume()
-
-
-def density_unit(volume: Volume) -> float:
-    """A typical high density of the volume: the 99.5th percentile of its positive part, 1/mm."""
-    positive = volume.data[volume.data > 0]
-    return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 
 
 def default_count(geometry: Geometry, voxel_size: float) -> int:
@@ -101,38 +80,33 @@ def _count_of(field: Grid, cone: bool) -> float:
 
 
 def place(
+    volume: Volume,
     projections: NDArray[np.float32],
     geometry: Geometry,
-    grid: Grid,
     count: int | None,
     rng: np.random.Generator,
     *,
-    start: FirstVolume = _USUAL,
+    start: Start = "fbp",
     rays: RayModel | None = None,
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
     """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
     Args:
-        grid: a box that holds all that the views see (`Grid.for_fit`): a fit cannot represent matter outside. Its
-            corners, outside the circle that all views see, stay empty unless the sample leaves the field.
+        volume: see `first_volume`, of a box that holds all that the views see (`Grid.for_fit`): a fit cannot represent
+            matter outside. Its corners, outside the circle that all views see, stay empty unless the sample leaves the
+            field.
         count: number of Gaussians; None: `default_count` of the field.
+        start: what made the volume.
 
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
     """
-    wanted = default_count(geometry, grid.voxel_size) if count is None else operator.index(count)
+    wanted = default_count(geometry, volume.grid.voxel_size) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
-    if (factor := start.factor) == 1:
-        volume = first_volume(projections, geometry, grid, start.kind)
-    else:
-        nz, ny, nx = (-(-n // factor) for n in grid.shape)
-        pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
-        coarse = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
-        volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start.kind)
     radius = math.inf if wider_than_field(projections, geometry) else geometry.reach
-    if start.kind == "published":
+    if start == "published":
         return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
@@ -156,13 +130,20 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
     return masked(cleaned, None, largest)[0]
 
 
-def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp") -> Volume:
+def first_volume(
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", factor: int = 1
+) -> Volume:
     """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
     "fbp": FBP or FDK; too short a scan of a cone for FDK gets a few sweeps of OS-SIRT with TV instead.
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
-    ramp.
+    ramp. Pixels and voxels are joined by `factor`.
     """
+    if factor > 1:
+        nz, ny, nx = (-(-n // factor) for n in grid.shape)
+        pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
+        grid = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
+        projections, geometry = bin_views(projections, factor), binned_geometry(geometry, factor)
     projections = without_wild_pixels(projections)
     if (sweeps := start_method(geometry, start)) is not None:
         return solve(sweeps, Projector(geometry, grid), projections)
@@ -174,18 +155,23 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     return Volume(direct(projections, geometry, grid, ramp) * whole, grid)
 
 
-def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid) -> float:
-    """Total variation of matter a voxel, over the density unit, in the middle slices of a first volume.
+def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, known: Volume | None = None) -> float:
+    """Total variation of matter a voxel, over the density unit, in the middle slices of a first volume "fbp".
 
     0 where a direct method takes these views badly (too short a scan of a cone), or the slices hold no matter.
+
+    Args:
+        known: such a volume of the grid; None: it is made, of these slices.
     """
     nz, ny, nx = grid.shape
     first = max(0, nz // 2 - _MIDDLE)
-    slab = grid.part(slice(first, min(nz, first + 2 * _MIDDLE)), slice(0, ny), slice(0, nx))
+    middle = slice(first, min(nz, first + 2 * _MIDDLE))
+    slab = grid.part(middle, slice(0, ny), slice(0, nx))
     if _swept(geometry, "fbp"):
         return 0.0
-    volume = first_volume(projections, geometry, slab)
-    lines, unit = volume_lines(np.maximum(volume.data, 0)), density_unit(volume)
+    data = first_volume(projections, geometry, slab).data if known is None else known.data[middle]
+    lines = volume_lines(np.maximum(data, 0))
+    unit = density_unit(lines)
     matter = np.count_nonzero(lines > MATTER * unit)
     return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
 
@@ -231,8 +217,8 @@ def sample_gaussians(
     """
     data, unit, candidates = _matter(volume, field_radius, smooth)
     data /= unit  # so that squares of gradients stay in float32's range
-    slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
-    value = data.ravel()[candidates]
+    value, slope = data.ravel()[candidates], np.empty(candidates.size, np.float32)
+    slopes_at(_smoothed(data, _SLOPE), candidates, slope)
     weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
     # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
     keys = rng.exponential(size=candidates.size) / weight
@@ -268,11 +254,10 @@ def sample_as_published(
 
 def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
     """The smoothed volume within the field, its density unit, and the voxels that may hold a Gaussian."""
-    data = gaussian_filter(np.maximum(volume.data, 0), smooth) if smooth > 0 else np.maximum(volume.data, 0)
+    data = _smoothed(np.maximum(volume.data, 0), smooth)
     _, y, x = volume.grid.coordinates()
-    inside = (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
-    data = np.where(inside[None], data, 0).astype(np.float32)
-    unit = density_unit(Volume(data, volume.grid))
+    data *= (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
+    unit = density_unit(data)
     candidates = np.flatnonzero(data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
     if candidates.size < 4:
         raise ValueError(
@@ -282,6 +267,14 @@ def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray
     return data, unit, candidates
 
 
+def _smoothed(x: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """x [z, y, x] under a Gaussian of this standard deviation in voxels, cut off at four of them."""
+    taps, out = np.arange(-round(4 * sigma), round(4 * sigma) + 1), np.empty(x.shape, np.float32)
+    window = np.exp(-0.5 * (taps / max(sigma, 1e-9)) ** 2)
+    windowed(x, (window / window.sum()).astype(np.float32), out)
+    return out
+
+
 def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
     """Root mean square distance [n] of each point to its three nearest neighbours; infinite for a single point."""
     near = min(4, means.shape[0])
@@ -289,7 +282,7 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.full(near, np.inf)
     from scipy.spatial import cKDTree
 
-    distances = np.asarray(cKDTree(means).query(means, k=near)[0])
+    distances = np.asarray(cKDTree(means).query(means, k=near, workers=get_num_threads())[0])
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
 
 

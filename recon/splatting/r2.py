@@ -22,7 +22,7 @@ from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.in_time import fit_costs
-from recon.splatting.initialise import Start, default_count, place
+from recon.splatting.initialise import Start, default_count, first_volume, place
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
@@ -134,7 +134,8 @@ class R2(Checked):
         field = Grid.of_field(geometry, geometry.sample_pitch)
         assert not isinstance(self.gaussians, Gaussians)
         rng = np.random.default_rng(seed)
-        placed = place(projections, geometry, field, self.gaussians, rng, kernel=self.fit.kernel)
+        volume = first_volume(projections, geometry, field)
+        placed = place(volume, projections, geometry, self.gaussians, rng, kernel=self.fit.kernel)
         return replace(self, steps=best_steps(self.name), seconds=max(0.0, left()), gaussians=placed)
 
     @property

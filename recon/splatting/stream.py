@@ -379,7 +379,8 @@ class StreamingFit:
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
         if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
-            placed = place(seen, geometry, rough, count, self._rng, kernel=kernel)
+            volume = first_volume(seen, geometry, rough)
+            placed = place(volume, seen, geometry, count, self._rng, kernel=kernel)
         else:
             model = averaged(known)
             rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, learnt)))

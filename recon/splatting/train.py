@@ -34,8 +34,8 @@ from recon.splatting.in_time import (
     planned_finish,
 )
 from recon.splatting.initialise import (
-    FirstVolume,
     default_count,
+    first_volume,
     joined_for,
     mean_change,
     place,
@@ -270,19 +270,23 @@ def _started(
     """The fit before its first step, or as a checkpoint holds it."""
     now, settings, start, backend = control.now, method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
+    first = None
     if control.resume is None:
         factor = 1 if method.seconds is None else factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
+            first = first_volume(views.p, views.seen, views.field, method.start, factor)
             start = place(
-                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed),
-                start=FirstVolume(method.start, factor), rays=settings.rays, kernel=settings.kernel,
+                first, views.p, views.seen, views.count, np.random.default_rng(problem.seed),
+                start=method.start, rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
+            first = first if method.start == "fbp" and factor == 1 else None
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
     fitting = fit.problem_of(views.p, views.seen, views.field, state.unit, settings, backend, views.p_weights)
     if settings.tv_weight is None:
-        fitting = replace(fitting, change=decide("change", lambda: mean_change(views.p, views.seen, views.field)))
+        change = decide("change", lambda: mean_change(views.p, views.seen, views.field, first))
+        fitting = replace(fitting, change=change)
     unseen = views.unseen(fitting, settings, state.unit)
     tracker = HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
     seconds = method.seconds

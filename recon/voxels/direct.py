@@ -65,15 +65,16 @@ def _along_columns(
                 a, b = filtered[v, low], filtered[v, low + 1]
                 r0 = max(0, math.floor(base + climb * first) - 1)
                 r1 = min(rows + 2, math.ceil(base + climb * (end - 1)) + 2)
-                for row in range(r0, r1):
-                    line[row] = share * (a[row] + part * (b[row] - a[row]))
+                # From r0 on, a row in single precision is right to 1e-4; to int32 the compiler converts many at once.
+                a, b, near = a[r0:r1], b[r0:r1], line[: r1 - r0]
+                for row in range(near.size):
+                    near[row] = share * (a[row] + part * (b[row] - a[row]))
                 target = out[j, i, first:end]
-                base += climb * first
-                for k in range(end - first):
-                    row = base + climb * k
-                    whole = np.uint32(row)
-                    rest = _f(row - whole)
-                    target[k] += line[whole] + rest * (line[whole + np.uint32(1)] - line[whole])
+                start, rise = _f(base + climb * first - r0), _f(climb)
+                for k in range(target.size):
+                    at = start + rise * _f(k)
+                    whole = np.int32(at)
+                    target[k] += near[whole] + (at - _f(whole)) * (near[whole + 1] - near[whole])
 
 
 def fdk(

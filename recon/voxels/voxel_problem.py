@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, sample_of
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -180,7 +180,7 @@ class VoxelProblem:
 
 def density_unit(x: F32) -> float:
     """A typical high density: the 99.5th percentile of the positive values, from some 10⁵ of them; 0 for none."""
-    sample = x.reshape(-1)[:: max(1, x.size // 100_003)]
+    sample = sample_of(x, 100_003)
     positive = sample[sample > 0]
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 

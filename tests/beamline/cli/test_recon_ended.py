@@ -83,7 +83,7 @@ def test_a_fit_that_is_interrupted_before_its_first_step_ends_at_once_and_leaves
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*arguments: Any, **options: Any) -> Any:
-        if arguments[1].n_views == SCAN.angles.size:  # not the toy that is fitted before
+        if arguments[2].n_views == SCAN.angles.size:  # not the toy that is fitted before
             signal.raise_signal(signal.SIGTERM)
         return place(*arguments, **options)
 

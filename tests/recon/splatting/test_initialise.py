@@ -69,7 +69,7 @@ def test_a_sample_wider_than_the_field_gets_gaussians_up_to_the_corners(rng: np.
     wide, narrow = Grid((4, 24, 24)), Grid((4, 12, 12))
     for grid, corners in ((wide, True), (narrow, False)):
         data = Projector(views, grid).forward(np.ones(grid.shape, np.float32))
-        means = place(data, views, wide, 500, rng).means.numpy()
+        means = place(first_volume(data, views, wide), data, views, 500, rng).means.numpy()
         assert bool((np.hypot(*means[:, :2].T) > 12.5).any()) == corners
 
 
@@ -99,7 +99,8 @@ def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: floa
     u, v = np.arange(40) - 19.5, np.arange(16) - 7.5
     shadow = 3 * np.sqrt(2 * np.pi) * np.exp(-(u[None] ** 2 + v[:, None] ** 2) / 18)
     data = np.broadcast_to(shadow, (30, 16, 40)).astype(np.float32)
-    placed = place(data, views, Grid.matching(views), 500, np.random.default_rng(0))
+    first = first_volume(data, views, Grid.matching(views))
+    placed = place(first, data, views, 500, np.random.default_rng(0))
     assert 0.3 < placed.density_unit < 2
 
 
@@ -107,7 +108,7 @@ def test_the_unit_is_a_density_of_the_sample_however_narrow_the_views(span: floa
 def test_no_gaussians_are_refused(count: int, rng: np.random.Generator) -> None:
     views = Geometry.parallel([0.0, 1.0], (4, 6))
     with pytest.raises(ValueError, match="at least one Gaussian"):
-        place(np.ones((2, 4, 6), np.float32), views, Grid.matching(views), count, rng)
+        place(_ball(), np.ones((2, 4, 6), np.float32), views, count, rng)
 
 
 def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:
@@ -154,5 +155,8 @@ def test_the_change_of_matter_is_its_variation_over_its_voxels() -> None:
     expected = np.sqrt(np.square(forward).sum(axis=0)).sum() / np.count_nonzero(volume > 0.05 * unit) / unit
     assert found[0] == pytest.approx(expected, rel=1e-3)
     assert found[1] < found[0]
+    assert mean_change(data[0], geometry, grid, first_volume(data[0], geometry, grid)) == pytest.approx(
+        found[0], rel=1e-6
+    )
     assert mean_change(7 * data[0], geometry, grid) == pytest.approx(found[0], rel=1e-3)
     assert mean_change(0 * data[0], geometry, grid) == 0

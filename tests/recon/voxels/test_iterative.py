@@ -399,3 +399,10 @@ def test_the_weight_that_was_chosen_is_recorded_and_gives_the_same_volume(method
     other, far = (np.std(each.volume.data - chosen.volume.data) for each in (given, twice))
     assert other < 0.2 * far
     assert "tv_weight_chosen" not in given.settings
+
+
+@pytest.mark.parametrize("shape", [(40, 40, 40), (317, 317, 2), (183, 183, 183)])
+def test_a_typical_density_is_that_of_all_slices(shape: tuple[int, int, int]) -> None:
+    x = np.zeros(shape, np.float32)
+    x[..., 1 : 1 + shape[2] // 2] = 3.0
+    assert density_unit(x) == pytest.approx(3.0)

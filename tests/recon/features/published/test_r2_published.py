@@ -13,9 +13,10 @@ from recon.base.volume import Grid, Volume
 from recon.features.published.r2_published import R2Published, published_fit
 from recon.kernels.reference import rotation_matrices
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import density_unit, neighbour_distance, sample_as_published
+from recon.splatting.initialise import neighbour_distance, sample_as_published
 from recon.splatting.settings import Change, DensityPolicy, control, in_steps
 from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import density_unit
 from tests.recon.conftest import Make
 
 FIELD = 20.0
@@ -65,7 +66,7 @@ def test_the_start_is_even_over_matter_at_0_15_of_its_density(rng: np.random.Gen
     values[4:12, 6:12, 6:18], values[4:12, 12:18, 6:18] = 1.0, 0.2
     volume = Volume(values, grid)
     placed = sample_as_published(volume, 600, rng, field_radius=6.0)
-    assert placed.density_unit == density_unit(volume) and placed.n == 600
+    assert placed.density_unit == density_unit(values) and placed.n == 600
     np.testing.assert_allclose(np.unique(placed.densities.numpy().round(5)), [0.03, 0.15], rtol=1e-3)
     assert (placed.densities.numpy() > 0.1).mean() == pytest.approx(0.5, abs=0.05)  # half of the voxels
     np.testing.assert_allclose(
