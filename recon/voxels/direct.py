@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from importlib import import_module
 from typing import Any, ClassVar, Self
 
@@ -115,7 +115,7 @@ def fdk(
     )
 
 
-Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[F32, tuple[Any, ...]]]
+Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[Any, tuple[Any, ...]]]
 """Some views, weighed and filtered, by their geometry, the weights of their rays and columns of zeros beside them; and
 what a kernel takes of the views before the voxels."""
 
@@ -151,9 +151,9 @@ def _by_slabs(
     for start in range(0, geometry.n_views, slab):
         some = slice(start, start + slab)
         part = geometry.select(some)
-        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
-        if not np.isfinite(prepared).all():
+        if not np.isfinite(projections[some]).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
         samples = _SAMPLES * part.n_views * x.size * z.size
         for layers in calls(y.size, samples) if device == "cpu" else [range(y.size)]:
             lines = slice(layers.start, layers.stop)
@@ -241,22 +241,42 @@ def posed_direct(
         weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
         return weights * np.cos(geometry.tilt)[:, None], zeros
 
-    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[F32, tuple[Any, ...]]:
-        each = range(part.n_views)
-        if part.is_cone and part.is_straight:  # filtered row by row in half the time
-            prepared = np.ascontiguousarray(_prepared_views(views, part, weights, zeros, filter)[0][:, 1:-1, 1:-1])
+    gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
+
+    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[Any, tuple[Any, ...]]:
+        each, (rows, cols) = range(part.n_views), part.detector_shape
+        responses = (_response(rows, cols + sum(zeros), float(roll), part.sample_pitch, filter) for roll in part.roll)
+        if gpu is None:
+            prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, next(responses)) for v in each])
         else:
-            prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, filter) for v in each])
+            prepared = gpu.filtered(views, part, weights, zeros, responses)
         origins = np.array([part.origin(v) for v in each])
         origins[:, 0] += zeros[0]
         distances = (part.sod, part.sdd) if part.is_cone else (0.0, 0.0)
         return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
 
-    kernel = _along_rays if device == "cpu" else import_module("recon.kernels.gpu.back_project").back_project
+    kernel = _along_rays if gpu is None else gpu.back_project
     return _by_slabs(projections, geometry, grid, weights_of, prepare, kernel, on_block, device)
 
 
-def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], filter: Filter) -> F32:
+Response = tuple[int, tuple[int, int], F32]
+"""Of a filter in two dimensions: rows added on either side, the shape of the transform, and the gain [row or 1, col]"""
+
+
+@lru_cache(1)  # most detectors are rolled by one angle
+def _response(rows: int, width: int, roll: float, pitch: float, filter: Filter) -> Response:
+    """The ramp across the rotation axis, for views of this roll and so many rows and columns, zeros counted."""
+    beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
+    m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
+    along = fft.fftfreq(m)[:, None] if roll else np.zeros((1, 1))
+    across = np.abs(fft.rfftfreq(n) * math.cos(roll) - along * math.sin(roll))
+    response = ramp(n, pitch, filter)
+    return beyond, (m, n), np.interp(across, np.arange(response.size) / n, response).astype(np.float32)
+
+
+def _prepared(
+    image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], response: Response
+) -> F32:  # fmt: skip
     """A view [row, col], weighed and filtered across the rotation axis: [col, row], with columns of zeros beside it."""
     rows, cols = geometry.detector_shape
     weighed = image * weights
@@ -264,15 +284,10 @@ def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tu
         col0, row0 = geometry.origin(view)
         u, v = (np.arange(cols) - col0) * geometry.pixel_pitch, (np.arange(rows) - row0) * geometry.pixel_pitch
         weighed *= geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
-    roll, width = float(geometry.roll[view]), cols + sum(zeros)
-    beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
+    beyond, shape, gain = response
     wide = np.pad(np.pad(weighed, ((0, 0), zeros)), ((beyond, beyond), (0, 0)), mode="edge").astype(np.float32)
-    m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
-    across = np.abs(fft.rfftfreq(n) * math.cos(roll) - fft.fftfreq(m)[:, None] * math.sin(roll))
-    response = ramp(n, geometry.sample_pitch, filter)
-    gain = np.interp(across, np.arange(response.size) / n, response).astype(np.float32)
-    filtered = fft.irfft2(fft.rfft2(wide, (m, n)) * gain, (m, n))
-    return np.ascontiguousarray(filtered[beyond : beyond + rows, :width].T)
+    filtered = fft.irfft2(fft.rfft2(wide, shape) * gain, shape)
+    return np.ascontiguousarray(filtered[beyond : beyond + rows, : cols + sum(zeros)].T)
 
 
 @dataclass(frozen=True)
@@ -323,7 +338,7 @@ def direct(
     device: str = "cpu",
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
-    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU, and so do filters."""
+    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU."""
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
         return posed_direct(projections, geometry, grid, filter, on_block, device)
     if geometry.is_cone:

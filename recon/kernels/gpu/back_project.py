@@ -1,4 +1,4 @@
-"""Back-projection along the rays of a cone or a parallel beam, of views in any pose (Triton): `_along_rays` of FDK.
+"""FDK of views in any pose, of a cone or a parallel beam: the filter (torch) and the back-projection (Triton).
 
     depth = D + Dx i + Dy j + Dz k,   col = (C + Cx i + Cy j + Cz k) / depth,   row likewise
 
@@ -9,6 +9,9 @@ Each voxel sums over the views in their order, so the same input gives the same 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import torch
 import triton
@@ -16,6 +19,8 @@ import triton.language as tl
 from torch import Tensor
 
 from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.kernels.gpu import require
 from recon.kernels.gpu.joseph import tiles_of
 
 _OF_VIEW = tl.constexpr(12)  # three linear forms: column, row, depth
@@ -62,8 +67,31 @@ def _back_project(
     tl.store(out + voxel, sums, live)
 
 
+def filtered(
+    views: F32, geometry: Geometry, weights: F64, zeros: tuple[int, int], responses: Iterable[tuple[Any, ...]]
+) -> Tensor:
+    """Views [view, row, col], weighed and filtered as `recon.voxels.direct` does it: [view, col, row] on the GPU."""
+    (rows, cols), device = geometry.detector_shape, require("cuda")
+    out = torch.empty((len(views), cols + sum(zeros), rows), dtype=torch.float32, device=device)
+    col, row = (torch.arange(n, dtype=torch.float64, device=device) for n in (cols, rows))
+    for view, (beyond, shape, gain) in enumerate(responses):
+        image, weight, factor = (
+            torch.tensor(np.ascontiguousarray(array), device=device) for array in (views[view], weights[view], gain)
+        )
+        weighed = image * weight
+        if geometry.is_cone:
+            col0, row0 = geometry.origin(view)
+            u, v = (col - col0) * geometry.pixel_pitch, (row - row0) * geometry.pixel_pitch
+            weighed *= geometry.sdd / torch.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
+        wide = torch.nn.functional.pad(weighed.float(), zeros)
+        wide = wide[torch.arange(-beyond, rows + beyond, device=device).clamp(0, rows - 1)]
+        found = torch.fft.irfft2(torch.fft.rfft2(wide, shape) * factor, shape)
+        out[view] = found[beyond : beyond + rows, : out.shape[1]].T
+    return out
+
+
 def back_project(
-    filtered: F32, axes: F64, origins: F64, sod: float, sdd: float, pitch: float, x: F64, y: F64, z: F64, out: Tensor
+    filtered: Tensor, axes: F64, origins: F64, sod: float, sdd: float, pitch: float, x: F64, y: F64, z: F64, out: Tensor
 ) -> None:
     """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth.
 
@@ -84,5 +112,5 @@ def back_project(
     terms[:, :2] += (origins - [n // 2 for n in pixels])[..., None] * terms[:, 2:]
     edge, deep, jobs = tiles_of(out.shape)
     if jobs > 0:
-        given, views = (torch.from_numpy(a.astype(np.float32, copy=False)).to(out.device) for a in (filtered, terms))
-        _back_project[(jobs,)](given, views, out, *given.shape, *out.shape, EDGE=edge, DEEP=deep, num_warps=4)
+        views = torch.from_numpy(terms.astype(np.float32)).to(out.device)
+        _back_project[(jobs,)](filtered, views, out, *filtered.shape, *out.shape, EDGE=edge, DEEP=deep, num_warps=4)

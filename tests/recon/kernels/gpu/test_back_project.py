@@ -11,7 +11,7 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.direct import _along_rays
+from recon.voxels import direct
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 
 gpu = importlib.import_module("recon.kernels.gpu.back_project")
@@ -54,8 +54,8 @@ def _arguments(name: str, rng: np.random.Generator) -> list[Any]:
 
 
 def _added(arguments: list[Any], to: np.ndarray) -> np.ndarray:
-    there = torch.tensor(to, device=DEVICE)
-    gpu.back_project(*arguments, there)
+    there, (filtered, *others) = torch.tensor(to, device=DEVICE), arguments
+    gpu.back_project(torch.tensor(filtered, device=DEVICE), *others, there)
     return there.cpu().numpy()
 
 
@@ -64,13 +64,24 @@ def test_voxels_sum_what_they_do_on_the_cpu(name: str, rng: np.random.Generator)
     arguments = _arguments(name, rng)
     before = rng.normal(size=[c.size for c in (arguments[-2], arguments[-3], arguments[-1])]).astype(np.float32)
     expected = before.copy()
-    _along_rays(*arguments, expected)
+    direct._along_rays(*arguments, expected)
     assert (expected != before).any() == (name != "out of sight")
     found = _added(arguments, before)
     if name == "wider than the field":
         assert (expected == before).any()
         np.testing.assert_array_equal(found == before, expected == before)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * float(np.abs(expected).max()))
+
+
+@pytest.mark.parametrize("name", ["cone", "leaning cone", "leaning, parallel"])
+def test_views_are_filtered_as_on_the_cpu(name: str, rng: np.random.Generator) -> None:
+    geometry, zeros, (rows, cols) = CASES[name][0], (3, 0), SHAPE
+    views, weights = rng.normal(size=(4, cols, rows)).astype(np.float32).swapaxes(1, 2), rng.random((4, cols))
+    views.setflags(write=False)  # as of a file in memory
+    responses = [direct._response(rows, cols + 3, float(roll), geometry.sample_pitch, "hann") for roll in geometry.roll]
+    found = gpu.filtered(views, geometry, weights, zeros, responses)
+    expected = [direct._prepared(views[v], geometry, v, weights[v], zeros, responses[v]) for v in range(4)]
+    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=0, atol=1e-6 * float(np.max(expected)))
 
 
 @pytest.mark.parametrize(("roll", "shape"), [(0.0, (2048, 4)), (np.pi / 2, (4, 2048))], ids=["rows", "columns"])
@@ -82,7 +93,7 @@ def test_voxels_of_a_high_box_are_placed_to_a_fraction_of_a_pixel(roll: float, s
     where = geometry.axes(0)[None], np.array([geometry.origin(0)])
     arguments = [filtered, *where, geometry.sod, geometry.sdd, 1.0, x, y, z]
     expected = np.zeros((1, 1, 2048), np.float32)
-    _along_rays(*arguments, expected)
+    direct._along_rays(*arguments, expected)
     assert np.unique(expected.round(2)).size > 90
     found = _added(arguments, 0 * expected)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4)
