@@ -158,7 +158,8 @@ def left_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[floa
     some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
     products, total = np.zeros((4, 4)), 0.0  # of the views, the volume and the two uniform ones
     volumes, data = (volume, *uniform), prepared.projections.data
-    for views in np.array_split(some, min(len(some), 4)):  # that takes less memory
+    # What is not looked at in bands of rows takes less memory so.
+    for views in [some] if prepared.geometry.rows_show_slices else np.array_split(some, min(len(some), 4)):
         for lines, measured, _ in _in_bands(volumes, data, prepared.geometry, views, weights):
             known, own, seen = _at_voxel_resolution(*measured)
             images = [_without_means(image, known) for image in (seen, *lines)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 from recon.base.kernel import Kernel
@@ -22,3 +23,12 @@ NECK = 0.8  # Two parts are one particle if the neck between them has at least t
 
 FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""
+
+
+def refuse_other_devices(device: str) -> None:
+    """Raises ValueError for a device that is neither "cpu" nor a CUDA device."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise ValueError(
+            f"device {device!r} was asked for; methods compute on 'cpu' or on 'cuda', the current CUDA device. Name "
+            f"one of these. CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
+        )

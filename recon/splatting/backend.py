@@ -6,7 +6,6 @@ reading them. Losses are values that `float` converts: on a GPU that waits for t
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, Protocol, SupportsFloat, TypeVar
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
+from recon.base.choices import refuse_other_devices
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
@@ -138,13 +138,9 @@ def backend_for(device: str) -> Backend[Any]:
         RuntimeError: torch sees no CUDA device.
         ValueError: another kind of device, or a CUDA device that is missing or not the current one.
     """
+    refuse_other_devices(device)
     if device == "cpu":
         return Cpu()
-    if not re.fullmatch(r"cuda(:\d+)?", device):
-        raise ValueError(
-            f"device {device!r} was asked for; a fit computes on 'cpu' or on 'cuda', the current CUDA device. Name "
-            f"one of these. CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
-        )
     Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
 
     return Gpu(device)

@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.choices import refuse_other_devices
 from recon.kernels.cpu import patches, tv, vectors
 from recon.kernels.cpu.tv import Weights
 from recon.voxels.projector import Projector, views_of_exposure
@@ -73,7 +74,7 @@ class VoxelDevice(Protocol[Array]):
     ) -> None: ...  # fmt: skip
 
 
-class Cpu:
+class CpuVolumes:
     """The numba kernels on numpy arrays."""
 
     combine, extrapolate = staticmethod(vectors.combine), staticmethod(vectors.extrapolate)
@@ -98,7 +99,7 @@ class Cpu:
         return array.copy()
 
 
-CPU: VoxelDevice[Any] = Cpu()
+CPU: VoxelDevice[Any] = CpuVolumes()
 
 
 def voxel_device(device: str) -> VoxelDevice[Any]:
@@ -107,6 +108,7 @@ def voxel_device(device: str) -> VoxelDevice[Any]:
     Raises:
         ImportError, RuntimeError, ValueError: as `recon.kernels.gpu.require`.
     """
+    refuse_other_devices(device)
     if device == "cpu":
         return CPU
     gpu: VoxelDevice[Any] = import_module("recon.kernels.gpu.volumes").GpuVolumes(device)  # loads triton
@@ -125,7 +127,7 @@ class _GpuProjector:
         self._projector, self._device, geometry = projector, device, projector.geometry
         self._joseph = import_module("recon.kernels.gpu.joseph")
         moments = views_of_exposure(geometry) if geometry.is_straight and not geometry.skew else []
-        self._moments = [self._joseph.Rays.of(views, projector.grid, device.device) for views in moments]
+        self._moments = [self._joseph.VoxelRays.of(views, projector.grid, device.device) for views in moments]
 
     def forward_lines(self, volume: Any) -> Any:
         if not self._moments:

@@ -86,13 +86,13 @@ def edge_levels(projections: F32) -> dict[float, F32]:
     """
     cols = projections.shape[-1]
     n = min(max(_EDGE, cols // 100), cols)
+    m = max(cols // 8, n)
     sides = np.stack([part.mean(axis=-1) for part in (projections[..., :n], projections[..., cols - n :])], axis=-1)
     level, mean = sides.mean(axis=0), projections.mean(axis=0)
     cut = (level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST)
-    if not cut.any():
+    if not cut.any() or cols <= 2 * m:  # no columns within, or too few to tell how it goes on
         return {}
     # The square of an ellipse falls as the square of the way from its middle, which is taken to be that of the row.
-    m = max(cols // 8, n)
     inner = np.stack([mean[:, m : m + n].mean(axis=-1), mean[:, cols - m - n : cols - m].mean(axis=-1)], axis=-1)
     edge, within = 1 - n / cols, 1 - (2 * m + n) / cols
     fall = np.maximum(inner**2 - level**2, 0) / (edge**2 - within**2) if edge > within else np.zeros_like(level)

@@ -47,7 +47,7 @@ _WHOLE = 1e-6  # slices: rows this close to slices lie on them
 
 
 @dataclass(frozen=True, eq=False)
-class Rays:
+class VoxelRays:
     """The rays of straight views through a box of voxels, on the device.
 
     Attributes:
@@ -65,7 +65,7 @@ class Rays:
     on_slices: bool
 
     @classmethod
-    def of(cls, geometry: Geometry, grid: Grid, device: str | torch.device) -> Rays:
+    def of(cls, geometry: Geometry, grid: Grid, device: str | torch.device) -> VoxelRays:
         """The rays of all views of `geometry`.
 
         Raises:
@@ -228,7 +228,7 @@ def _adjoint(
     tl.store(out + voxel, sums, ((x < nx) & (y < ny))[:, None] & (z < nz)[None, :])
 
 
-def forward(volume: Tensor, rays: Rays, out: Tensor) -> None:
+def forward(volume: Tensor, rays: VoxelRays, out: Tensor) -> None:
     """Line integrals of volume [y, x, z] into out [view, col, row], mm times the volume's unit."""
     views, cols, rows = out.shape
     high = min(triton.next_power_of_2(rows), _HIGH)
@@ -240,7 +240,7 @@ def forward(volume: Tensor, rays: Rays, out: Tensor) -> None:
         )  # fmt: skip
 
 
-def adjoint(projections: Tensor, rays: Rays, out: Tensor) -> None:
+def adjoint(projections: Tensor, rays: VoxelRays, out: Tensor) -> None:
     """The transpose of `forward`: projections [view, col, row] into out [y, x, z] (overwritten)."""
     (edge, deep, jobs), (near_cols, near_rows) = tiles_of(out.shape), rays.near
     if jobs > 0:

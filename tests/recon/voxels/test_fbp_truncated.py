@@ -55,6 +55,11 @@ def test_views_that_end_in_air_are_filtered_as_ever() -> None:
     assert edge_levels(lines + np.float32(0.001)) == {}
 
 
+@pytest.mark.parametrize("cols", range(1, 8))
+def test_rows_too_short_to_tell_how_they_go_on_are_filtered_as_they_are(cols: int) -> None:
+    assert np.isfinite(fbp(disc(cols, 90, 0.004), Geometry.parallel(ANGLES, (3, cols)))).all()
+
+
 def test_rows_are_cut_each_by_itself() -> None:
     """Rows are independent: what a block of slices has beside it changes no bit."""
     lines = disc(COLS, 24, 0.01)

@@ -46,25 +46,25 @@ CASES = {
 }  # fmt: skip
 
 
-def _forward(volume: Tensor, rays: joseph.Rays, views: Tensor) -> Tensor:
+def _forward(volume: Tensor, rays: joseph.VoxelRays, views: Tensor) -> Tensor:
     out = torch.full_like(views, torch.nan)
     joseph.forward(volume, rays, out)
     return out
 
 
-def _adjoint(views: Tensor, rays: joseph.Rays, volume: Tensor) -> Tensor:
+def _adjoint(views: Tensor, rays: joseph.VoxelRays, volume: Tensor) -> Tensor:
     out = torch.full_like(volume, torch.nan)
     joseph.adjoint(views, rays, out)
     return out
 
 
-def _case(name: str, rng: np.random.Generator) -> tuple[Projector, joseph.Rays, Tensor, Tensor]:
+def _case(name: str, rng: np.random.Generator) -> tuple[Projector, joseph.VoxelRays, Tensor, Tensor]:
     """Joseph's samples alone, not spread over a pixel, with a random volume and random views."""
     geometry, grid = CASES[name]
     projector = Projector(geometry.seen_with(RayWidth(pixel=1e-6)), grid, matched=False)
     (nz, ny, nx), (n_views, rows, cols) = grid.shape, projector.projection_shape
     volume, views = (rng.random(shape, dtype=np.float32) for shape in ((ny, nx, nz), (n_views, cols, rows)))
-    rays = joseph.Rays.of(geometry, grid, DEVICE)
+    rays = joseph.VoxelRays.of(geometry, grid, DEVICE)
     return projector, rays, torch.from_numpy(volume).to(DEVICE), torch.from_numpy(views).to(DEVICE)
 
 
@@ -110,6 +110,6 @@ def test_no_views_leave_an_empty_volume(rng: np.random.Generator) -> None:
 
 def test_leaning_views_and_a_box_at_the_source_are_refused() -> None:
     with pytest.raises(ValueError, match="straight"):
-        joseph.Rays.of(_parallel(roll=0.1), Grid((7, 9, 11), 0.7), DEVICE)
+        joseph.VoxelRays.of(_parallel(roll=0.1), Grid((7, 9, 11), 0.7), DEVICE)
     with pytest.raises(ValueError, match="reaches the source"):
-        joseph.Rays.of(_cone(), Grid((7, 60, 60), 0.7), DEVICE)
+        joseph.VoxelRays.of(_cone(), Grid((7, 60, 60), 0.7), DEVICE)
