@@ -131,13 +131,14 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
 
 
 def first_volume(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", factor: int = 1
-) -> Volume:
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", factor: int = 1,
+    device: str = "cpu",
+) -> Volume:  # fmt: skip
     """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
     "fbp": FBP or FDK; too short a scan of a cone for FDK gets a few sweeps of OS-SIRT with TV instead.
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
-    ramp. Pixels and voxels are joined by `factor`.
+    ramp. Pixels and voxels are joined by `factor`. The device is that of `direct` and of the sweeps.
     """
     if factor > 1:
         nz, ny, nx = (-(-n // factor) for n in grid.shape)
@@ -146,22 +147,24 @@ def first_volume(
         projections, geometry = bin_views(projections, factor), binned_geometry(geometry, factor)
     projections = without_wild_pixels(projections)
     if (sweeps := start_method(geometry, start)) is not None:
-        return solve(sweeps, Projector(geometry, grid), projections)
+        return solve(sweeps, Projector(geometry, grid, device=device), projections)
     ramp: Filter = "ram-lak" if start == "published" else "hann"
     if geometry.is_cone:
-        return Volume(direct(projections, geometry, grid, ramp), grid)
+        return Volume(direct(projections, geometry, grid, ramp, device=device), grid)
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
-    return Volume(direct(projections, geometry, grid, ramp) * whole, grid)
+    return Volume(direct(projections, geometry, grid, ramp, device=device) * whole, grid)
 
 
-def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, known: Volume | None = None) -> float:
+def mean_change(
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, known: Volume | None = None, device: str = "cpu"
+) -> float:
     """Total variation of matter a voxel, over the density unit, in the middle slices of a first volume "fbp".
 
     0 where a direct method takes these views badly (too short a scan of a cone), or the slices hold no matter.
 
     Args:
-        known: such a volume of the grid; None: it is made, of these slices.
+        known: such a volume of the grid; None: it is made, of these slices, on the device.
     """
     nz, ny, nx = grid.shape
     first = max(0, nz // 2 - _MIDDLE)
@@ -169,7 +172,7 @@ def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid
     slab = grid.part(middle, slice(0, ny), slice(0, nx))
     if _swept(geometry, "fbp"):
         return 0.0
-    data = first_volume(projections, geometry, slab).data if known is None else known.data[middle]
+    data = first_volume(projections, geometry, slab, device=device).data if known is None else known.data[middle]
     lines = volume_lines(np.maximum(data, 0))
     unit = density_unit(lines)
     matter = np.count_nonzero(lines > MATTER * unit)

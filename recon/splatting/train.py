@@ -274,7 +274,7 @@ def _started(
     if control.resume is None:
         factor = 1 if method.seconds is None else factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
-            first = first_volume(views.p, views.seen, views.field, method.start, factor)
+            first = first_volume(views.p, views.seen, views.field, method.start, factor, problem.device)
             start = place(
                 first, views.p, views.seen, views.count, np.random.default_rng(problem.seed),
                 start=method.start, rays=settings.rays, kernel=settings.kernel,
@@ -285,7 +285,7 @@ def _started(
         state = _resumed(control.resume, problem.geometry.n_views, backend)
     fitting = fit.problem_of(views.p, views.seen, views.field, state.unit, settings, backend, views.p_weights)
     if settings.tv_weight is None:
-        change = decide("change", lambda: mean_change(views.p, views.seen, views.field, first))
+        change = decide("change", lambda: mean_change(views.p, views.seen, views.field, first, problem.device))
         fitting = replace(fitting, change=change)
     unseen = views.unseen(fitting, settings, state.unit)
     tracker = HeldOutTracker.over(unseen, settings, state.step, control.resume or {})

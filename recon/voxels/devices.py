@@ -1,7 +1,7 @@
 """Where a solver on voxels computes: the operations of its loops as one Protocol, by the CPU's kernels or on a GPU.
 
-A loop takes its arrays to the device once, and back at its end. Between loops everything is numpy: choices, noise and
-filtered back-projections are made on the CPU.
+A loop takes its arrays to the device once, and back at its end. Between loops everything is numpy: choices and noise
+are made on the CPU.
 """
 
 from __future__ import annotations

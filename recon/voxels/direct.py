@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
+from importlib import import_module
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -23,6 +24,7 @@ from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.back_project import SLICES, nanoseconds
+from recon.voxels.devices import voxel_device
 from recon.voxels.fbp import Filter, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
@@ -113,7 +115,7 @@ def fdk(
     )
 
 
-Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[F32, tuple[Any, ...]]]
+Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[Any, tuple[Any, ...]]]
 """Some views, weighed and filtered, by their geometry, the weights of their rays and columns of zeros beside them; and
 what a kernel takes of the views before the voxels."""
 
@@ -123,8 +125,9 @@ def _by_slabs(
     prepare: Prepare,
     kernel: Callable[..., None],
     on_block: Callable[[int, int], None],
+    device: str = "cpu",
 ) -> F32:  # fmt: skip
-    """Back-project views [view, row, col], some at a time, to [z, y, x].
+    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device.
 
     Raises:
         ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
@@ -142,19 +145,21 @@ def _by_slabs(
         )
     weights, zeros = weights_of(geometry)
     z, y, x = grid.coordinates()
-    volume = np.zeros((y.size, x.size, z.size), np.float32)
+    there = voxel_device(device)
+    volume = there.zeros((y.size, x.size, z.size))
     slab = max(1, SLAB_BYTES // (4 * math.prod(geometry.detector_shape)))
     for start in range(0, geometry.n_views, slab):
         some = slice(start, start + slab)
         part = geometry.select(some)
-        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
-        if not np.isfinite(prepared).all():
+        if not np.isfinite(projections[some]).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        for layers in calls(y.size, _SAMPLES * part.n_views * x.size * z.size):
+        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
+        samples = _SAMPLES * part.n_views * x.size * z.size
+        for layers in calls(y.size, samples) if device == "cpu" else [range(y.size)]:
             lines = slice(layers.start, layers.stop)
             kernel(prepared, *of_views, x, y[lines], z, volume[lines])
             on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
-    return volume_slices(volume)
+    return volume_slices(there.numpy(volume))
 
 
 def _prepared_views(
@@ -216,8 +221,9 @@ def posed_direct(
     grid: Grid,
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
+    device: str = "cpu",
 ) -> F32:
-    """Reconstruct rolled and tilted views [view, row, col]; see `fbp` and `fdk` for arguments, result and errors.
+    """Reconstruct views in any pose [view, row, col]; see `fbp` and `fdk` for arguments, result and errors.
 
     Two things differ from them. The ramp runs along the direction of the detector that is across the rotation axis,
     which a rolled detector's rows are not. Each voxel takes the filtered views where its own ray meets the detector, so
@@ -235,18 +241,42 @@ def posed_direct(
         weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
         return weights * np.cos(geometry.tilt)[:, None], zeros
 
-    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[F32, tuple[Any, ...]]:
-        each = range(part.n_views)
-        prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, filter) for v in each])
+    gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
+
+    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[Any, tuple[Any, ...]]:
+        each, (rows, cols) = range(part.n_views), part.detector_shape
+        responses = (_response(rows, cols + sum(zeros), float(roll), part.sample_pitch, filter) for roll in part.roll)
+        if gpu is None:
+            prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, next(responses)) for v in each])
+        else:
+            prepared = gpu.filtered(views, part, weights, zeros, responses)
         origins = np.array([part.origin(v) for v in each])
         origins[:, 0] += zeros[0]
         distances = (part.sod, part.sdd) if part.is_cone else (0.0, 0.0)
         return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
 
-    return _by_slabs(projections, geometry, grid, weights_of, prepare, _along_rays, on_block)
+    kernel = _along_rays if gpu is None else gpu.back_project
+    return _by_slabs(projections, geometry, grid, weights_of, prepare, kernel, on_block, device)
 
 
-def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], filter: Filter) -> F32:
+Response = tuple[int, tuple[int, int], F32]
+"""Of a filter in two dimensions: rows added on either side, the shape of the transform, and the gain [row or 1, col]"""
+
+
+@lru_cache(1)  # most detectors are rolled by one angle
+def _response(rows: int, width: int, roll: float, pitch: float, filter: Filter) -> Response:
+    """The ramp across the rotation axis, for views of this roll and so many rows and columns, zeros counted."""
+    beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
+    m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
+    along = fft.fftfreq(m)[:, None] if roll else np.zeros((1, 1))
+    across = np.abs(fft.rfftfreq(n) * math.cos(roll) - along * math.sin(roll))
+    response = ramp(n, pitch, filter)
+    return beyond, (m, n), np.interp(across, np.arange(response.size) / n, response).astype(np.float32)
+
+
+def _prepared(
+    image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], response: Response
+) -> F32:  # fmt: skip
     """A view [row, col], weighed and filtered across the rotation axis: [col, row], with columns of zeros beside it."""
     rows, cols = geometry.detector_shape
     weighed = image * weights
@@ -254,15 +284,10 @@ def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tu
         col0, row0 = geometry.origin(view)
         u, v = (np.arange(cols) - col0) * geometry.pixel_pitch, (np.arange(rows) - row0) * geometry.pixel_pitch
         weighed *= geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
-    roll, width = float(geometry.roll[view]), cols + sum(zeros)
-    beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
+    beyond, shape, gain = response
     wide = np.pad(np.pad(weighed, ((0, 0), zeros)), ((beyond, beyond), (0, 0)), mode="edge").astype(np.float32)
-    m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
-    across = np.abs(fft.rfftfreq(n) * math.cos(roll) - fft.fftfreq(m)[:, None] * math.sin(roll))
-    response = ramp(n, geometry.sample_pitch, filter)
-    gain = np.interp(across, np.arange(response.size) / n, response).astype(np.float32)
-    filtered = fft.irfft2(fft.rfft2(wide, (m, n)) * gain, (m, n))
-    return np.ascontiguousarray(filtered[beyond : beyond + rows, :width].T)
+    filtered = fft.irfft2(fft.rfft2(wide, shape) * gain, shape)
+    return np.ascontiguousarray(filtered[beyond : beyond + rows, : cols + sum(zeros)].T)
 
 
 @dataclass(frozen=True)
@@ -310,11 +335,12 @@ def direct(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
+    device: str = "cpu",
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
-    and `posed_direct`. Only `fbp` takes `out`."""
-    if not geometry.is_straight:
-        return posed_direct(projections, geometry, grid, filter, on_block)
+    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU."""
+    if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
+        return posed_direct(projections, geometry, grid, filter, on_block, device)
     if geometry.is_cone:
         return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)

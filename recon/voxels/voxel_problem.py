@@ -168,7 +168,7 @@ class VoxelProblem:
             images = masked(images[seen], projection_images(self.weight[seen]))[0]
         if not has_direct_method(geometry):
             return None
-        return volume_lines(direct(images, geometry, self.projector.grid, filter))
+        return volume_lines(direct(images, geometry, self.projector.grid, filter, device=self.projector.device))
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
         return Sweeps(self.projector, self.data, self.weight, subsets)

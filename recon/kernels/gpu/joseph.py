@@ -15,6 +15,7 @@ The transpose is gathered: a voxel looks at the few columns, and at the few rows
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -241,12 +242,17 @@ def forward(volume: Tensor, rays: JosephRays, out: Tensor) -> None:
 
 def adjoint(projections: Tensor, rays: JosephRays, out: Tensor) -> None:
     """The transpose of `forward`: projections [view, col, row] into out [y, x, z] (overwritten)."""
-    (ny, nx, nz), (near_cols, near_rows) = out.shape, rays.near
-    deep = min(triton.next_power_of_2(nz), _DEEP)
-    edge = 16 if deep <= 2 else 8 if deep <= 8 else 4  # 256 voxels or more
-    jobs = triton.cdiv(ny, edge) * triton.cdiv(nx, edge) * triton.cdiv(nz, deep)
+    (edge, deep, jobs), (near_cols, near_rows) = tiles_of(out.shape), rays.near
     if jobs > 0:
         _adjoint[(jobs,)](
-            projections, rays.table, rays.views, out, *projections.shape, ny, nx, nz, EDGE=edge, DEEP=deep,
+            projections, rays.table, rays.views, out, *projections.shape, *out.shape, EDGE=edge, DEEP=deep,
             COLS=near_cols, ROWS=near_rows, CONE=rays.is_cone, num_warps=4,
         )  # fmt: skip
+
+
+def tiles_of(shape: Sequence[int]) -> tuple[int, int, int]:
+    """Edge and slices of a tile of a volume [y, x, z], 256 voxels or more, and how many there are."""
+    ny, nx, nz = shape
+    deep = min(triton.next_power_of_2(nz), _DEEP)
+    edge = 16 if deep <= 2 else 8 if deep <= 8 else 4
+    return edge, deep, triton.cdiv(ny, edge) * triton.cdiv(nx, edge) * triton.cdiv(nz, deep)

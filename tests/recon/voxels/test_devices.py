@@ -12,6 +12,7 @@ from recon.base.method import DataUse
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.voxels.devices import CPU, projector_on, voxel_device
+from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from tests.recon.kernels.gpu import on_gpu  # noqa: F401, says where the kernels run before they are loaded
 
@@ -46,6 +47,16 @@ def views_of(geometry: Geometry) -> np.ndarray:
     disc = np.where(np.hypot(x, y) < 0.3 * COLS * grid.voxel_size, 1 + 0.3 * np.sin(9 * x), 0).astype(np.float32)
     clean = Projector(geometry, grid).forward(disc)
     return (clean + rng.normal(0, 0.01, clean.shape)).astype(np.float32)
+
+
+@pytest.mark.parametrize("beam", [CONE, LEANED], ids=["cone", "leaned"])
+def test_filtered_back_projection_on_a_gpu_is_that_of_the_cpu(beam: Geometry) -> None:
+    few, told = beam.select(slice(None, None, 4)), list[tuple[int, int]]()
+    grid, data = Grid.matching(few), views_of(few)
+    here = direct(data, few, grid, "hann")
+    there = direct(data, few, grid, "hann", lambda *done: told.append(done), device="cuda")
+    np.testing.assert_allclose(there, here, atol=3e-6 * here.max())
+    assert told == [(COLS, COLS)]
 
 
 def assert_same_volumes(geometry: Geometry, method: recon.Method, weighted: bool, off: float = 2e-5) -> None:

@@ -25,12 +25,13 @@ _ARRAYS = (
     "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
     "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
     "weights terms sums volume beam corner weight tv_weight rates vectors "
-    "rays views projections p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+    "rays views projections filtered p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
 _PARTS = {
     "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
     "axes_of", "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body", "_weight", "_level", "_length",
+    "_form",
 }  # fmt: skip
 
 
@@ -52,7 +53,18 @@ def _compile_all() -> None:
     from triton.compiler import ASTSource
 
     from recon.kernels.cpu.losses import L1, L2, POISSON
-    from recon.kernels.gpu import footprints, fused, images, joseph, losses, parameters, rays, tiles, voxels
+    from recon.kernels.gpu import (
+        back_project,
+        footprints,
+        fused,
+        images,
+        joseph,
+        losses,
+        parameters,
+        rays,
+        tiles,
+        voxels,
+    )
 
     block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
     of_a_kernel = [
@@ -99,6 +111,7 @@ def _compile_all() -> None:
             (joseph, "_adjoint", 4, {"EDGE": edge, "DEEP": deep, "COLS": 3, "ROWS": rows, "CONE": is_cone})
             for edge, deep, rows, is_cone in ((16, 1, 1, True), (4, 16, 1, False), (4, 64, 3, False), (4, 64, 3, True))
         ),
+        *((back_project, "_back_project", 4, {"EDGE": edge, "DEEP": deep}) for edge, deep in ((16, 1), (4, 64))),
         *((fused, "_tally", 4, {"VIEWS": 2, "LISTS": 2 + boxed, "BOXED": boxed}) for boxed in (False, True)),
     ]
     modules = {module for module, *_ in wanted}
