@@ -86,7 +86,8 @@ class ChildProcess:
                     creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
                     | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
                 )
-                interrupted.callback(self._process.kill)
+                interrupted.callback(self.let_go)
+                interrupted.callback(self._end, 0.0, lambda: False)
                 if behind:
                     with suppress(psutil.Error):  # it has ended, or the system does not allow it
                         child = psutil.Process(self._process.pid)
@@ -94,7 +95,6 @@ class ChildProcess:
                 name = f"output of process {self._process.pid}"
                 self._reader = threading.Thread(target=self._read, name=name, daemon=True)
                 self._reader.start()
-                interrupted.callback(self.end)
             interrupted.pop_all()
 
     def __enter__(self) -> Self:

@@ -96,14 +96,14 @@ def signals_held() -> Iterator[None]:
     """A context in which Ctrl-C, SIGTERM and SIGHUP wait, if this is the main thread and has handlers for them: they
     are delivered at its end, so that what it begins is whole, and its owner can end it.
     """
-    came = list[int]()
     numbers = [number for number in (signal.SIGINT, *_asking_to_end()) if callable(signal.getsignal(number))]
-    try:
-        with _caught(dict.fromkeys(numbers, lambda number, frame: came.append(number))):
+    with ExitStack() as later:  # one whose handler raises does not keep the others from theirs
+
+        def hold(number: int, frame: FrameType | None) -> None:
+            later.callback(signal.raise_signal, number)
+
+        with _caught(dict.fromkeys(numbers, hold)):
             yield
-    finally:
-        for number in came:
-            signal.raise_signal(number)
 
 
 @contextmanager

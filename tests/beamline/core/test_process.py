@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 from beamline.core import process as module
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
+from beamline.core.stop import signals_held
 from tests.clock import wait_until
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
@@ -89,6 +91,41 @@ def test_ctrl_c_while_a_process_starts_leaves_none(
         _Child(tmp_path, IGNORES, tether=tether)
     assert len(begun) == 1 and begun[0].poll() is not None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_while_a_process_starts_does_not_wait_for_its_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is called after the last line of a live reconstruction waits until its owner is built."""
+    started, owner, ended = threading.Thread.start, threading.Lock(), threading.Event()
+
+    def interrupted(thread: threading.Thread) -> None:
+        started(thread)
+        signal.raise_signal(signal.SIGINT)
+
+    def on_end() -> None:
+        with owner:
+            ended.set()
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    begin = time.monotonic()
+    with owner, pytest.raises(KeyboardInterrupt):
+        _Child(tmp_path, IGNORES, on_end=on_end)
+    assert time.monotonic() - begin < module._LAST_LINES / 2
+    assert ended.wait(10)
+
+
+def test_of_several_signals_that_are_held_each_reaches_its_handler() -> None:
+    came = list[int]()
+    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
+    try:
+        with pytest.raises(KeyboardInterrupt), signals_held(), signals_held():
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+            assert not came
+        assert came == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
