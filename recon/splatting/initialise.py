@@ -44,7 +44,7 @@ MATTER = 0.05
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
 SCALED_BY = 12  # views
-_SLOPE = 1.0  # standard deviation of the Gaussian that gradients are taken under, voxels
+_SLOPE_SIGMA = 1.0  # of the Gaussian that gradients are taken under, voxels
 _LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
 
@@ -221,7 +221,7 @@ def sample_gaussians(
     data, unit, candidates = _matter(volume, field_radius, smooth)
     data /= unit  # so that squares of gradients stay in float32's range
     value, slope = data.ravel()[candidates], np.empty(candidates.size, np.float32)
-    slopes_at(_smoothed(data, _SLOPE), candidates, slope)
+    slopes_at(_smoothed(data, _SLOPE_SIGMA), candidates, slope)
     weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
     # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
     keys = rng.exponential(size=candidates.size) / weight
