@@ -122,6 +122,7 @@ def test_misfits_are_named() -> None:
         fdk(views, geometry, Grid((2, 9, 9), 2.0))
     with pytest.raises(ValueError, match=r"filter .* is unknown"):
         fdk(views, geometry, filter="box")  # type: ignore[arg-type]
-    views[3, 1, 2] = np.nan
-    with pytest.raises(ValueError, match="NaN"):
-        fdk(views, geometry)
+    for value in (np.nan, np.inf, np.finfo(np.float32).max):  # the last one is finite before the filter
+        views[3, 1, 2] = value
+        with pytest.raises(ValueError, match="NaN"), np.errstate(over="ignore", invalid="ignore"):
+            fdk(views, geometry)
