@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-from recon.base.arrays import F32, sample_of
+from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -213,7 +213,7 @@ def _gradient(volume: F32) -> F32:
 
 def _limits(gradient: F32, classes: int) -> list[float]:
     return [
-        float(limit) for limit in np.percentile(sample_of(gradient, _SAMPLED), np.linspace(0, 100, classes + 1)[1:-1])
+        float(limit) for limit in np.percentile(some_values(gradient, _SAMPLED), np.linspace(0, 100, classes + 1)[1:-1])
     ]
 
 

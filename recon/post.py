@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, sample_of
+from recon.base.arrays import F32, F64, some_values
 
 _CLUSTERED = 20_000  # values from which centres are computed
 _STARTS = 8
@@ -173,7 +173,7 @@ def rescaled(volume: F32, low: float = 0.5, high: float = 99.5) -> F32:
 
 
 def _range(volume: F32, low: float, high: float) -> tuple[float, float]:
-    bottom, top = np.percentile(sample_of(volume, _SAMPLE), [low, high])
+    bottom, top = np.percentile(some_values(volume, _SAMPLE), [low, high])
     if not top > bottom:
         raise ValueError(f"grey values are {bottom:g} at both percentiles ({low:g} and {high:g}): nothing to rescale")
     return float(bottom), float(top)

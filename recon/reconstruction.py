@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import sample_of
+from recon.base.arrays import some_values
 from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views
 from recon.base.masks import RayWeights
@@ -174,7 +174,7 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     require_views(geometry, given)
     with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
         data = np.ascontiguousarray(given, np.float32)
-    some = np.abs(sample_of(data, _LOOKED_AT))
+    some = np.abs(some_values(data, _LOOKED_AT))
     some = some[np.isfinite(some)]
     if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
         raise ValueError(

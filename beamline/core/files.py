@@ -220,7 +220,7 @@ def refuse_existing(path: Path) -> None:
         )
 
 
-def refuse_undecoded(path: Path | str) -> None:
+def refuse_not_utf8(path: Path | str) -> None:
     """Raises DataError for a path whose bytes are no UTF-8, which results are to name."""
     try:
         str(Path(path).absolute()).encode()

@@ -21,7 +21,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.base import VolumeScale
 from beamline.storage.volumes.files import opened_volume, times_of
 from beamline.storage.writers.recon_file import opened_reconstruction
-from recon.base.arrays import sample_of
+from recon.base.arrays import some_values
 from recon.base.greys import apart, grey_windows
 
 F32 = NDArray[np.float32]
@@ -71,7 +71,7 @@ class ScaledSlices:
 
     def sample(self) -> NDArray[Any]:
         coarsest, _ = self._scales[-1]
-        return sample_of(coarsest.box((0, 0, 0), coarsest.shape), _SAMPLE)
+        return some_values(coarsest.box((0, 0, 0), coarsest.shape), _SAMPLE)
 
 
 class CopiedSlices:

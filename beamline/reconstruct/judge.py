@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Note, event_of_sentence
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.measure import contrast_by, left_along_rows, measure, regions, residual_share
+from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, residuals_along_rows
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.outcome import (
     ReportContext,
@@ -147,7 +147,7 @@ class VolumeLooks:
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
         self.all_rays = (self.clock.now() - before) / share
         if not self.direct and "residual" in figures:
-            self.warn(not_begun_warning(made, *left_along_rows(made.volume, prepared)))
+            self.warn(not_begun_warning(made, *residuals_along_rows(made.volume, prepared)))
         if self.unexplained is not None:
             figures["unexplained"] = self.unexplained.share
             self.hiding = hiding_warning(made, self.unexplained)

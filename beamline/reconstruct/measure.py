@@ -144,7 +144,7 @@ def measure(
     return {name: float(value) for name, value in values.items()}
 
 
-def left_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[float, float]:
+def residuals_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[float, float]:
     """The residual, in the differences of rays from the mean of their row, of a volume, and the lesser one of two
     uniform volumes with the density of least residual: a box and a cylinder that fill the slices.
 

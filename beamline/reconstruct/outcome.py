@@ -195,7 +195,7 @@ def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     volume of one density.
 
     Args:
-        left, uniform: by the volume, and by a volume of one density; see `measure.left_along_rows`.
+        left, uniform: by the volume, and by a volume of one density; see `measure.residuals_along_rows`.
     """
     if left < uniform or uniform == 0 or by_name(made.method).traits.direct:
         return ""
@@ -204,8 +204,8 @@ def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     return (
         f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the differences "
         f"along the rows of the views, where a volume of one density leaves {uniform:.3g}. The method ended in "
-        f"{made.seconds:.3g} s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method "
-        "fbp."
+        f"{made.seconds:.3g} s{steps}: give it more seconds, steps or iterations. If the sample is wider than the "
+        "field, its parts outside may be why: compare with --method fbp."
     )
 
 

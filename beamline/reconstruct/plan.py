@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered
-from beamline.core.files import refuse_undecoded
+from beamline.core.files import refuse_not_utf8
 from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
@@ -255,7 +255,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     if options.follow is not None:
         _refuse_unfollowed(options)
     for path in (*(each.path for each in scans_of(options.source)), options.target.output):
-        refuse_undecoded(path)
+        refuse_not_utf8(path)
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
@@ -306,7 +306,7 @@ def _require_finished(source: ScanSource, options: ReconOptions) -> None:
 
 
 def _check_device(device: str) -> None:
-    """Raises ConfigError if a fit cannot compute on the device."""
+    """Raises ConfigError if methods cannot compute on the device."""
     try:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:

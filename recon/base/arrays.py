@@ -22,7 +22,7 @@ def median_deviation(values: NDArray[np.floating[Any]]) -> float:
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
 
 
-def sample_of(values: NDArray[Any], about: int) -> NDArray[Any]:
+def some_values(values: NDArray[Any], about: int) -> NDArray[Any]:
     """About so many of the values, from all places along the last axis.
 
     With a step that shares a factor with its length, a sample of 183³ voxels showed three of 183 slices.

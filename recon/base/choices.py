@@ -25,7 +25,7 @@ FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""
 
 
-def refuse_other_devices(device: str) -> None:
+def refuse_unknown_device(device: str) -> None:
     """Raises ValueError for a device that is neither "cpu" nor a CUDA device."""
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise ValueError(

@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import sample_of
+from recon.base.arrays import some_values
 
 _SAMPLE = 200_000  # values that are looked at
 _SPLIT = 0.7  # share of the variance that two classes explain; halves of one normal distribution explain 0.64
@@ -30,7 +30,7 @@ def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
     A class is parted where two of its parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man
     Cybern. 9, 62), and each of these likewise.
     """
-    flat = np.sort(sample_of(np.asarray(values), _SAMPLE))
+    flat = np.sort(some_values(np.asarray(values), _SAMPLE))
     flat = flat[np.isfinite(flat)].astype(np.float64)
     least = max(4, round(_LEAST * flat.size))
     classes, splits = [flat], [_split(flat, least)]

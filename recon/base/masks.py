@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, Mask, sample_of
+from recon.base.arrays import F32, Mask, some_values
 
 Image = NDArray[np.float32]
 NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
@@ -126,7 +126,7 @@ def usual_weight(weights: F32, data: F32) -> float:
 
     Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
     """
-    top = max(float(np.percentile(sample_of(data, 100_003), 99)), 0.0)
+    top = max(float(np.percentile(some_values(data, 100_003), 99)), 0.0)
     matter, weighed = 0.0, 0.0
     for view, weight in zip(data, weights, strict=True):
         depth = np.clip(view, 0, top) * (weight > 0)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 
-from recon.base.arrays import F32, median_deviation, sample_of
+from recon.base.arrays import F32, median_deviation, some_values
 from recon.base.geometry import Geometry
 
 NOISE_VIEWS = 16  # looked at
@@ -190,7 +190,7 @@ def air_level(values: F32) -> tuple[float, float]:
     It begins at the lowest value that many voxels have, and repeatedly takes the values within four deviations. The
     deviation of uneven air is at most four times that of the values below the first level.
     """
-    values = sample_of(values, _SAMPLED)
+    values = some_values(values, _SAMPLED)
     low, high = np.percentile(values, (0.05, 99.95))
     if not high > low:
         return float(low), 0.0

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import median_deviation, sample_of
+from recon.base.arrays import median_deviation, some_values
 from recon.base.views import spread
 
 HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
@@ -58,7 +58,7 @@ def look_like_counts(projections: NDArray[np.floating]) -> bool:
     They do if nine in ten are too large for any detector to measure the remaining light. If all are whole numbers, half
     of them suffice.
     """
-    some = sample_of(projections, _LOOKED_AT)
+    some = some_values(projections, _LOOKED_AT)
     some = some[np.isfinite(some)]
     if some.size == 0 or not np.median(some) > _OPAQUE:
         return False

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.choices import refuse_other_devices
+from recon.base.choices import refuse_unknown_device
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
@@ -138,7 +138,7 @@ def backend_for(device: str) -> Backend[Any]:
         RuntimeError: torch sees no CUDA device.
         ValueError: another kind of device, or a CUDA device that is missing or not the current one.
     """
-    refuse_other_devices(device)
+    refuse_unknown_device(device)
     if device == "cpu":
         return Cpu()
     Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.choices import refuse_other_devices
+from recon.base.choices import refuse_unknown_device
 from recon.kernels.cpu import patches, tv, vectors
 from recon.kernels.cpu.tv import Weights
 from recon.voxels.projector import Projector, views_of_exposure
@@ -108,7 +108,7 @@ def voxel_device(device: str) -> VoxelDevice[Any]:
     Raises:
         ImportError, RuntimeError, ValueError: as `recon.kernels.gpu.require`.
     """
-    refuse_other_devices(device)
+    refuse_unknown_device(device)
     if device == "cpu":
         return CPU
     gpu: VoxelDevice[Any] = import_module("recon.kernels.gpu.volumes").GpuVolumes(device)  # loads triton

@@ -171,14 +171,14 @@ def ordered_fista(
         x.shape, difference_weights(problem.projector.grid), problem.nonnegative, tv_steps, device
     )
     scale, projectors = problem.scale, [projector_on(device, part) for part in subsets.projectors]
-    every, weights = device.array(problem.data), None if problem.weight is None else device.array(problem.weight)
+    views, weights = device.array(problem.data), None if problem.weight is None else device.array(problem.weight)
     x = device.array(x)
     gradient, ahead = device.copy(x), Momentum(x, problem.decide, device)
     for k in range(sweeps):
         error, seen = 0.0, []
         for at, s in enumerate(problem.rng.permutation(count)):
             part = slice(None) if count == 1 else subsets.views[s]
-            data, rays = every[part], None if weights is None else weights[part]
+            data, rays = views[part], None if weights is None else weights[part]
             mu = weight.value if isinstance(weight, NoiseBalance) else weight
             residual = projectors[s].forward_lines(x)
             error += device.replace_by_residual(data, residual, rays)

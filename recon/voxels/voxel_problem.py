@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, sample_of
+from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -81,19 +81,19 @@ class Sweeps:
         """
         order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
         total, seen, device = 0.0, [], self._device
-        there = device.array(x)
+        volume = device.array(x)
         for index in order:
             part, data, weight, scale = self._parts[index]
-            residual = part.forward_lines(there)  # the model, until the data are subtracted
+            residual = part.forward_lines(volume)  # the model, until the data are subtracted
             some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
-            trust = None if weight is None else device.numpy(weight[some])
-            seen.append(whitened(device.numpy(data[some] - residual[some]), trust))
+            weights_of_rays = None if weight is None else device.numpy(weight[some])
+            seen.append(whitened(device.numpy(data[some] - residual[some]), weights_of_rays))
             total += device.replace_by_residual(data, residual, weight, scale)
             part.adjoint_lines(residual, self._gradient)
-            device.add_product(there, relaxation, self._step, self._gradient, nonnegative)
+            device.add_product(volume, relaxation, self._step, self._gradient, nonnegative)
         self.residual = np.concatenate(seen)
-        if there is not x:
-            x[...] = device.numpy(there)
+        if volume is not x:
+            x[...] = device.numpy(volume)
         return total
 
 
@@ -180,7 +180,7 @@ class VoxelProblem:
 
 def density_unit(x: F32) -> float:
     """A typical high density: the 99.5th percentile of the positive values, from some 10⁵ of them; 0 for none."""
-    sample = sample_of(x, 100_003)
+    sample = some_values(x, 100_003)
     positive = sample[sample > 0]
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 

@@ -277,12 +277,12 @@ def _suggestion(record: ReconRecord) -> str:
     """A window for the volume, by some of its slices."""
     import numpy as np
 
-    from recon.base.arrays import sample_of
+    from recon.base.arrays import some_values
 
     depth = record.volume.grid.shape[0]
     chosen = spread(np.arange(depth), _SLICES)
     some = [np.asarray(record.volume.data[z : z + 1], np.float32) for z in chosen.tolist()]
-    values = np.concatenate([sample_of(values, _VALUES) for values in some])
+    values = np.concatenate([some_values(values, _VALUES) for values in some])
     values = values[np.isfinite(values)]
     if not values.size:
         return "No value of the slices looked at is finite. Nothing was written."

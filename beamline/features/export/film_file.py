@@ -24,7 +24,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from drivers.base.frame import FrameKind
-from recon.base.arrays import sample_of
+from recon.base.arrays import some_values
 from recon.base.greys import matter_window
 from recon.base.views import spread
 
@@ -161,7 +161,7 @@ def _size(shape: tuple[int, ...], ratio: float, side: int) -> tuple[int, int]:
 
 
 def _window(some: Iterator[F32]) -> tuple[float, float]:
-    values = [sample_of(image, _VALUES) for image in some]
+    values = [some_values(image, _VALUES) for image in some]
     finite = np.concatenate([part[np.isfinite(part)] for part in values])
     if not finite.size or finite.min() == finite.max():
         low = float(finite[0]) if finite.size else 0.0

@@ -23,7 +23,7 @@ from beamline.cli.recipe import names_given
 from beamline.cli.recon import options_of, recon
 from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
-from beamline.core.files import refuse_existing, refuse_undecoded, write_whole
+from beamline.core.files import refuse_existing, refuse_not_utf8, write_whole
 from beamline.core.text import aligned, csv_text
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
 from beamline.report.metrics import METRICS
@@ -78,7 +78,7 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
         raise click.UsageError(f"-o {path}: the sheet is a picture; give a name such as {path.with_suffix('.png')}.")
     trials = _trials(options, common)
     table = path.with_suffix(".csv")
-    refuse_undecoded(common[0])
+    refuse_not_utf8(common[0])
     refuse_existing(path)
     refuse_existing(table)
     if dry:

@@ -15,7 +15,7 @@ import numpy as np
 from beamline.core.durations import MachineSpeed
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
-from beamline.core.files import refuse_existing, refuse_undecoded
+from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.forecast import Expected, Timed, expected_seconds, trials_left
@@ -74,7 +74,7 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable]
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    refuse_undecoded(asked.source.path)
+    refuse_not_utf8(asked.source.path)
     refuse_existing(asked.folder)
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:

@@ -9,7 +9,7 @@ import pytest
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import left_along_rows, measure
+from beamline.reconstruct.measure import measure, residuals_along_rows
 from beamline.reconstruct.outcome import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
@@ -104,7 +104,7 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
         prepared = replace(prepared, projections=replace(prepared.projections, data=data))
     blank = np.float32(0.7 * truth.mean())
     volume = replace(made.volume, data=amount * truth + (1 - amount) * blank)
-    left, uniform = left_along_rows(volume, prepared)
+    left, uniform = residuals_along_rows(volume, prepared)
     assert (measure(volume, prepared, None)["residual"] > 0.5) is (wider or not begun)
     said = not_begun_warning(replace(made, volume=volume), left, uniform)
     assert (said == "") is begun
@@ -114,7 +114,7 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
 def test_views_of_one_column_say_nothing_of_a_volume() -> None:
     data, geometry = np.ones((8, 3, 1), np.float32), Geometry.parallel(np.linspace(0, 3, 8), (3, 1))
     volume = Volume(np.ones((3, 1, 1), np.float32), Grid.matching(geometry))
-    found = left_along_rows(volume, prepared_views(data, geometry))
+    found = residuals_along_rows(volume, prepared_views(data, geometry))
     assert found == (0, 0)
     assert not_begun_warning(Reconstruction(volume, {}, method="sirt", seconds=1.0), *found) == ""
 
@@ -134,7 +134,7 @@ def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None
     left = {}
     for name, data in {"one": shadow, "two": factors * shadow, "within others": factors * (shadow + 30)}.items():
         views = replace(prepared, projections=replace(prepared.projections, data=data))
-        left[name] = left_along_rows(full, views)
+        left[name] = residuals_along_rows(full, views)
     assert left["one"][1] <= left["one"][0] < left["one"][1] + 0.001 and left["one"][0] < 0.02
     assert left["two"][1] == pytest.approx(scatter, abs=0.01)
     assert left["within others"] == pytest.approx(left["two"], abs=1e-4)
