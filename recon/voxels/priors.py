@@ -25,7 +25,7 @@ from recon.base.empirical import (
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure, noise_level
 from recon.kernels.cpu.tv import total_variation
-from recon.voxels.devices import projector_on, voxel_device
+from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import (
@@ -234,12 +234,12 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
     bound = problem.decide("bound", lambda: problem.norm)
     device, rounds = voxel_device(problem.projector.device), -(-steps // STEPS)
     scratch, x = device.patch_scratch(x.shape), device.array(x)
-    z = device.copy(x)
+    z, views = device.copy(x), views_on_device(problem)
     for k in range(rounds):
         threshold = strength * FALL ** (k - rounds)
         device.denoise(x, threshold, problem.nonnegative, scratch, z)
         done = k * STEPS
-        if not towards_views(problem, x, z, bound, steps=min(STEPS, steps - done), done=done):
+        if not towards_views(problem, views, x, z, bound, steps=min(STEPS, steps - done), done=done):
             break
     else:
         threshold = strength
@@ -247,15 +247,27 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
     return device.numpy(x)
 
 
-def towards_views(problem: VoxelProblem, x: Any, z: Any, bound: float, *, steps: int, done: int = 0) -> bool:
+ViewsOnDevice = tuple[LineProjector[Any], Any, Any]
+"""Projector, line integrals and weights of a problem, the arrays on its device."""
+
+
+def views_on_device(problem: VoxelProblem) -> ViewsOnDevice:
+    """What `towards_views` compares a volume with; on the CPU the problem's own arrays."""
+    device = voxel_device(problem.projector.device)
+    weight = None if problem.weight is None else device.array(problem.weight)
+    return projector_on(device, problem.projector), device.array(problem.data), weight
+
+
+def towards_views(
+    problem: VoxelProblem, views: ViewsOnDevice, x: Any, z: Any, bound: float, *, steps: int, done: int = 0
+) -> bool:
     """Steps of Chebyshev's semi-iteration from x towards min ½||A x - p||² + m/2 |x - z|², in place.
 
     Golub & Varga 1961, Numer. Math. 3, 147. Whether `problem.go_on` was content, which is told `done` and more steps.
-    x and z [y, x, z] are arrays of the problem's device.
+    `views` are the problem's, and x and z [y, x, z] arrays of its device.
     """
     device, pull = voxel_device(problem.projector.device), PULL * bound
-    projector, data = projector_on(device, problem.projector), device.array(problem.data)
-    rays = None if problem.weight is None else device.array(problem.weight)
+    projector, data, rays = views
     centre, half = pull + bound / 2, bound / 2
     change, gradient = device.zeros(x.shape), device.copy(x)
     scale, momentum, pace = problem.scale, 0.0, 1 / centre
@@ -287,6 +299,6 @@ def noise_of_volume(problem: VoxelProblem) -> float:
     )
     nz, ny, nx = problem.projector.grid.shape
     x, z = (device.zeros((ny, nx, nz)) for _ in range(2))
-    towards_views(alone, x, z, problem.norm, steps=STEPS)
+    towards_views(alone, views_on_device(alone), x, z, problem.norm, steps=STEPS)
     noise = noise_beside_structure(whitened(problem.views, problem.weight), problem.projector.geometry)
     return noise * float(np.sqrt(np.mean(np.square(device.numpy(x), dtype=np.float64))))

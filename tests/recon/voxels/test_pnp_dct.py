@@ -17,7 +17,7 @@ from recon.base.volume import Grid, part_of, slabs_of
 from recon.reconstruction import reconstruct
 from recon.voxels import methods
 from recon.voxels.methods import PnpDct
-from recon.voxels.priors import pnp_dct, towards_views
+from recon.voxels.priors import pnp_dct, towards_views, views_on_device
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
@@ -51,7 +51,7 @@ def test_many_steps_solve_the_normal_equations(rng: np.random.Generator, beam: s
     problem = problem_of(geometry, rng.random(shape, np.float32), weight, nonnegative=False)
     x, z = (volume_lines(rng.random(shape, np.float32)) for _ in range(2))
     bound = largest_eigenvalue(problem.projector, problem.weight)
-    assert towards_views(problem, x, z, bound, steps=60)
+    assert towards_views(problem, views_on_device(problem), x, z, bound, steps=60)
     left = problem.data - problem.projector.forward_lines(x)
     gradient = problem.projector.adjoint_lines(left if problem.weight is None else left * problem.weight)
     np.testing.assert_allclose(gradient, 0.03 * bound * (x - z), atol=1e-3 * np.abs(gradient).max())
@@ -62,7 +62,7 @@ def test_steps_end_at_the_least_volume_that_is_not_negative(rng: np.random.Gener
     problem = problem_of(BEAMS["parallel"], rng.random((6, 14, 14), np.float32) ** 4)
     x, z = (volume_lines(rng.normal(0, 1, (6, 14, 14)).astype(np.float32)) for _ in range(2))
     bound = largest_eigenvalue(problem.projector, None)
-    towards_views(problem, np.maximum(x, 0, out=x), z, bound, steps=300)
+    towards_views(problem, views_on_device(problem), np.maximum(x, 0, out=x), z, bound, steps=300)
     gradient = problem.projector.adjoint_lines(problem.data - problem.projector.forward_lines(x))
     gradient += 0.03 * bound * (z - x)
     some = 1e-3 * np.abs(gradient).max()
