@@ -293,10 +293,8 @@ def noise_of_volume(problem: VoxelProblem) -> float:
         np.divide(data, np.sqrt(problem.weight), out=data, where=problem.weight > 0)
         data[problem.weight == 0] = 0
     data = smoothed(data, problem.projector.resolution, None if problem.weight is None else problem.weight > 0)
-    alone, device = (
-        replace(problem, data=data, nonnegative=False, go_on=lambda *_: True),
-        voxel_device(problem.projector.device),
-    )
+    alone = replace(problem, data=data, nonnegative=False, go_on=lambda *_: True)
+    device = voxel_device(problem.projector.device)
     nz, ny, nx = problem.projector.grid.shape
     x, z = (device.zeros((ny, nx, nz)) for _ in range(2))
     towards_views(alone, views_on_device(alone), x, z, problem.norm, steps=STEPS)

@@ -140,6 +140,11 @@ def _primal(
                 target[k] = plane[k]
 
 
+def dual_pace(threshold: float, weights: Weights) -> float:
+    """The length of a dual step: 0.75 of the longest one that converges by itself, see `dual_step`."""
+    return min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
+
+
 def dual_step(
     x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch,
     back: tuple[int, int] = (0, 0),
@@ -155,7 +160,7 @@ def dual_step(
         back: of the first two axes: 1 where |p| of a voxel takes the difference from the voxel before, 0 where it
             takes the one to the next. It is total variation as a mirror image sees it.
     """
-    pace = min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
+    pace = dual_pace(threshold, weights)
     floor = 0.0 if nonnegative else _NO_FLOOR
     _dual_step(*_in_planes(x, *p), x.shape[2], threshold, pace, weights, floor, *back, *scratch)
 

@@ -20,14 +20,13 @@ from torch.nn.functional import hardshrink
 from recon.base.arrays import F32
 from recon.kernels.cpu.patches import EDGE
 from recon.kernels.cpu.spread import passes_of
-from recon.kernels.cpu.tv import Weights
+from recon.kernels.cpu.tv import Weights, dual_pace
 from recon.kernels.gpu import require
 
 Shape = tuple[int, int, int]
 DualField = tuple[Tensor, Tensor, Tensor]
 
 _AT_ONCE = 512 << 20  # bytes of temporary copies of some planes or views at once; at least one is taken
-_FASTEST = 1e15  # pace of dual steps, as in `cpu.tv`
 _BEYOND = EDGE - 1  # voxels beyond a face that blocks reach
 _BLOCK_COPIES = 40  # arrays as large as the given planes that the transform of their blocks holds, at most
 _LONG, _SHORT = math.sqrt(2) * math.cos(math.pi / 8), math.sqrt(2) * math.sin(math.pi / 8)
@@ -110,7 +109,7 @@ def dual_step(
 
     Memory: two volumes beside x and p.
     """
-    pace = min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
+    pace = dual_pace(threshold, weights)
     point = _primal_point(x, p, threshold, weights, nonnegative)
     for axis, (field, weight) in enumerate(zip(p, weights, strict=True)):
         _before(field, axis).add_(_after(point, axis) - _before(point, axis), alpha=pace * weight)
@@ -239,7 +238,7 @@ def _after(array: Tensor, axis: int) -> Tensor:
 
 
 def _parts(array: Tensor, copies: int) -> list[slice]:
-    """Runs along the first axis, of which so many copies fit at once."""
+    """Slices of the first axis, as long as the budget holds so many copies of one."""
     step = max(1, _AT_ONCE // (4 * copies * max(1, math.prod(array.shape[1:]))))
     return [slice(first, first + step) for first in range(0, array.shape[0], step)]
 

@@ -1,4 +1,4 @@
-"""Solvers on a GPU, in Triton's interpreter where there is none: the CPU's volumes, to rounding."""
+"""Solvers make the same volumes on a GPU as on the CPU, to rounding. Without a GPU, Triton's interpreter stands in."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from recon.base.volume import Grid
 from recon.voxels.devices import CPU, projector_on, voxel_device
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
-from tests.recon.kernels.gpu import on_gpu  # noqa: F401, says where the kernels run before they are loaded
+from tests.recon.kernels.gpu.on_gpu import DEVICE
 
 ROWS, COLS, VIEWS = 4, 12, 16
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -27,16 +27,14 @@ LEANED = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1, roll=0.05)  # 
     "geometry", [PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE, LEANED], ids=["still", "arc", "cone", "leaned"]
 )
 def test_projections_on_a_gpu_are_those_of_the_cpu(geometry: Geometry) -> None:
-    projector, device, rng = (
-        Projector(geometry, Grid.matching(geometry)),
-        voxel_device("cuda"),
-        np.random.default_rng(1),
-    )
+    projector, device = Projector(geometry, Grid.matching(geometry)), voxel_device("cuda")
+    rng = np.random.default_rng(1)
     there, here = projector_on(device, projector), projector_on(CPU, projector)
     volume, views = rng.random((COLS, COLS, ROWS), np.float32), rng.random((VIEWS, COLS, ROWS), np.float32)
     seen, back = here.forward_lines(volume), here.adjoint_lines(views)
     np.testing.assert_allclose(device.numpy(there.forward_lines(device.array(volume))), seen, atol=3e-6 * seen.max())
     into = device.zeros(volume.shape)
+    assert into.device.type == DEVICE.type
     there.adjoint_lines(device.array(views), into)
     np.testing.assert_allclose(device.numpy(into), back, atol=3e-6 * back.max())
 
