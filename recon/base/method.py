@@ -91,6 +91,8 @@ class DataUse(Checked):
             views.
         energies: of the views, for a method of volumes of materials; None: all have one, at which there is one material
             of attenuation 1.
+        sample_radius: how far the sample reaches from the rotation axis, in mm, where it is wider than the field; None:
+            that is measured.
     """
 
     weights: F32 | None = None
@@ -98,6 +100,7 @@ class DataUse(Checked):
     emission: Any = None
     times: F64 | None = None
     energies: Energies | None = None
+    sample_radius: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,6 +207,8 @@ class Reconstruction:
         chosen: how a choice, a budget or a preset came to the settings; empty where they were given.
         started_from: Gaussians at the start of a fit; 0 for other methods.
         ending: how it ended, as its caller knows it.
+        outside: gives what the sample outside the volume adds to views, [view, row, col] for their geometry; None:
+            nothing is known to lie there.
     """
 
     volume: Volume
@@ -219,6 +224,7 @@ class Reconstruction:
     chosen: str = ""
     started_from: int = 0
     ending: Ending = Ending()
+    outside: Callable[[Geometry], F32] | None = None
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"

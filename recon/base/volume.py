@@ -105,6 +105,21 @@ class Grid:
         across = max(nx, math.floor(min(by * nx, most)))
         return replace(self, shape=(nz, across, across))
 
+    def reaching(self, radius: float, geometry: Geometry) -> Grid:
+        """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis, or
+        until its corners reach the source of a cone."""
+        most = geometry.source_distance / math.sqrt(2) - self.voxel_size
+        half = np.asarray(self.shape[1:]) * self.voxel_size / 2
+        below, above = (
+            np.maximum(
+                np.ceil((min(radius, most) - half + side * np.asarray(self.centre[1:])) / self.voxel_size - 1e-6), 0
+            )
+            for side in (1, -1)
+        )
+        y, x = (np.asarray(self.shape[1:]) + below + above).astype(int).tolist()
+        middle = np.asarray(self.centre[1:]) + (above - below) / 2 * self.voxel_size
+        return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
+
     @property
     def spacing(self) -> tuple[float, float, float]:
         """Voxel edges (z, y, x) in mm."""

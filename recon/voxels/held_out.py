@@ -38,6 +38,7 @@ _ERRORS = 1.0  # standard errors of the difference, up to which two candidates p
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
+_WIDE, _FEWEST_ROWS = 1.2, 4  # over the field's width, from which on a box is wide; rows of its trials
 SUBSETS, TV_STEPS = 9, 3  # of a trial
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
 TRIALS = 4
@@ -46,6 +47,12 @@ CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 """The most sweeps of trials, over those as a rule."""
+
+
+def _trial_rows(geometry: Geometry, grid: Grid) -> int:
+    """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
+    wider = grid.shape[2] * grid.voxel_size / (2 * geometry.reach)
+    return TRIAL_ROWS if wider < _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS / wider))
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
@@ -229,12 +236,13 @@ class HeldOutTrial:
             return None
         images = problem.data.swapaxes(1, 2)
         if not geometry.is_cone:
-            rows = busiest_rows(images, TRIAL_ROWS)
+            rows = busiest_rows(images, _trial_rows(geometry, grid))
             views, box = slab_of(geometry, grid, rows.start, rows.stop)
             return cls._of_rows(problem, rows, views, box, columns_of_matter(views, box, images[:, rows]))
-        if geometry.detector_shape[0] <= TRIAL_ROWS:
+        height = _trial_rows(geometry, grid)
+        if geometry.detector_shape[0] <= height:
             return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)
-        middle = middle_of_cone(geometry, grid, images, TRIAL_ROWS)
+        middle = middle_of_cone(geometry, grid, images, height)
         return None if middle is None else cls._of_rows(problem, *middle)
 
     @classmethod

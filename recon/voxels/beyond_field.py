@@ -1,0 +1,183 @@
+"""Beyond the field: how far a sample reaches that is wider than the field, and its volume in a box that holds all of it.
+
+Each view also sums the matter beside the field. A box of the field alone would push that matter into its rim, and make
+the middle too dense. So the views are explained by voxels, or Gaussians, as far as the sample reaches, and the field's
+part is given back. How far it reaches is the radius whose volume predicts views held out best (docs/numerics.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from recon.base.arrays import F32, F64, bin_views
+from recon.base.decisions import Decisions
+from recon.base.empirical import LIGHT_WEIGHT
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
+from recon.base.views import spread_views
+from recon.base.volume import Grid, Volume
+from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of, wider_than_field
+from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
+from recon.voxels.methods import FistaTv
+from recon.voxels.projector import Projector, projection_lines
+
+_COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
+_STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
+_ERRORS = 1.0  # standard errors by which radii predict alike
+
+SAMPLE = "sample_radius"
+"""Name of the decision on the radius, and how the settings begin that state it."""
+
+
+@dataclass(frozen=True)
+class SampleRadius:
+    """How far a sample reaches from the rotation axis, where it is wider than the field.
+
+    Attributes:
+        radius: that predicts views held out best, or that was given, in mm.
+        low, high: mm, from which to which radius views are predicted as well, but for chance.
+        density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
+    """
+
+    radius: float
+    low: float
+    high: float
+    density: float
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The values as settings of a result."""
+        return {SAMPLE if name == "radius" else f"{SAMPLE}_{name}": value for name, value in asdict(self).items()}
+
+
+def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
+    """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
+
+    A sample within the field, a direct method, which continues the views, and methods that make several volumes, run as
+    they are.
+
+    Raises:
+        ValueError: as `Method.run`.
+    """
+    traits, decide = method.traits, control.decide or Decisions(problem.seed)
+    if traits.direct or traits.several:
+        return method.run(problem, control)
+    measured = decide(SAMPLE, lambda: _values(sample_radius(problem)))
+    if not measured:
+        return method.run(problem, control)
+    sample, grid = SampleRadius(*measured), problem.grid
+    wide = grid.reaching(sample.radius, problem.geometry)
+    result = method.run(replace(problem, grid=wide), control)
+    before = [
+        round((own - all_of_it) / grid.voxel_size)
+        for own, all_of_it in zip(grid.first[1:], wide.first[1:], strict=True)
+    ]
+    y, x = (slice(first, first + n) for first, n in zip(before, grid.shape[1:], strict=True))
+    whole = result.volume.data
+
+    def outside(views: Geometry) -> F32:
+        matter = np.maximum(whole, 0)
+        matter[:, y, x] = 0
+        return Projector(views, wide).forward(matter)
+
+    volume = Volume(np.ascontiguousarray(whole[:, y, x]), grid)
+    return replace(result, volume=volume, settings={**result.settings, **sample.settings}, outside=outside)
+
+
+def _values(sample: SampleRadius | None) -> list[float]:
+    return [] if sample is None else list(asdict(sample).values())
+
+
+def sample_radius(problem: ReconProblem) -> SampleRadius | None:
+    """How far the sample reaches; None: not beyond the field, or its views see that it ends there.
+
+    FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
+    and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
+    leaves more unknown than the views tell. `DataUse.sample_radius` comes before.
+    """
+    data, geometry = problem.projections, problem.geometry
+    some = spread_views(geometry.angles, _VIEWS, np.arange(geometry.n_views))
+    weights = problem.use.weights
+    views, rays = masked(data[some], None if weights is None else weights[some])
+    geometry = geometry.select(some)
+    if not wider_than_field(views, geometry):
+        return None
+    reach = geometry.reach
+    if (given := problem.use.sample_radius) is not None:
+        return SampleRadius(given, given, given, 0.0) if given > reach else None
+    if geometry.n_views < LEAST_VIEWS:
+        radius = _STEP * reach
+        return SampleRadius(radius, reach, _WIDEST * reach, 1.0)
+    trial = _Trial.of(views, geometry, problem, _COLS)
+    tried: dict[float, tuple[F64, float]] = {}
+
+    def best(ratios: Iterable[float]) -> float:
+        for ratio in ratios:
+            if ratio not in tried:
+                tried[ratio] = trial.of_radius(ratio * reach)
+        return min(tried, key=lambda ratio: float(tried[ratio][0].mean()))
+
+    first = best(_STEP**k for k in range(1 + math.floor(math.log(_WIDEST, _STEP))))
+    least = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
+    if least < _STEP:  # coarse voxels blur where the field ends
+        trial = _Trial.of(views, geometry, problem, 2 * _COLS)
+        tried.clear()
+        least = best(_FINE ** (k / 2) for k in range(8))
+    if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
+        return None
+    alike = [ratio for ratio, (left, _) in tried.items() if not beyond_chance(left - tried[least][0], _ERRORS)]
+    densities = [tried[ratio][1] for ratio in alike]
+    uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
+    return SampleRadius(least * math.sqrt(_FINE) * reach, min(alike) * reach, max(alike) * reach, uncertain)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Some binned rows of the views, of which one in eight judges.
+
+    Attributes:
+        seen, unseen: line integrals [view, row, col] and geometry of the views.
+        box: of the field.
+    """
+
+    seen: tuple[F32, Geometry]
+    unseen: tuple[F32, Geometry]
+    box: Grid
+
+    @classmethod
+    def of(cls, views: F32, geometry: Geometry, problem: ReconProblem, columns: int) -> _Trial:
+        rows, cols = geometry.detector_shape
+        factor = max(1, min(rows, math.ceil(cols / columns)))
+        height = min(rows, factor * _ROWS)
+        if geometry.is_cone:
+            middle = middle_of_cone(geometry, problem.grid, views, height)
+            if middle is not None:
+                views, geometry = np.ascontiguousarray(views[:, middle[0]]), middle[1]
+        else:
+            some = busiest_rows(views, height)
+            views, geometry = np.ascontiguousarray(views[:, some]), geometry.rows(some.start, some.stop)
+        views, geometry = bin_views(views, factor), geometry.binned(factor)
+        box = Grid.matching(geometry)
+        if not geometry.rows_show_slices:
+            box = slab_of(geometry, box, 0, geometry.detector_shape[0])[1] if not geometry.is_cone else box
+        fitted, judges = split_views(geometry)
+        return cls((views[fitted], geometry.select(fitted)), (views[judges], geometry.select(judges)), box)
+
+    def of_radius(self, radius: float) -> tuple[F64, float]:
+        """Residual [view held out] of a box that reaches so far, and the mean density in the middle of the field."""
+        (data, geometry), (judged, apart) = self.seen, self.unseen
+        grid = self.box.reaching(radius, geometry)
+        method = FistaTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
+        volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume.data
+        projector = Projector(apart, grid)
+        model = projection_lines(projector.forward(volume))
+        y, x = np.meshgrid(*grid.coordinates()[1:], indexing="ij")
+        middle = np.hypot(y, x) < geometry.reach / 2
+        return unseen_residuals(model, projection_lines(judged), None, projector.resolution), float(
+            volume[:, middle].mean()
+        )
