@@ -173,7 +173,8 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
-        aside = np.abs(poses.shifts[usable.frames, 0]) > source.shape[1] / 2
+        cols = poses.shifts[usable.frames, 0]
+        aside = np.abs(cols - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
     return usable, poses, np.flatnonzero(source.image_key == FrameKind.WIDE_VIEW)
 

@@ -121,8 +121,9 @@ class PreparedProjections:
 
     @property
     def ordinary(self) -> PreparedProjections:
-        """The same views without wide ones, which show the sample more than half a field beside its place."""
-        aside = np.abs(self.geometry.shifts[:, 0]) > self.geometry.detector_shape[1] / 2
+        """The same views without wide ones, which show the sample more than half a field beside its usual place."""
+        cols = self.geometry.shifts[:, 0]
+        aside = np.abs(cols - np.median(cols)) > self.geometry.detector_shape[1] / 2
         return self.of_views(np.flatnonzero(~aside)) if aside.any() else self
 
     def of_views(self, views: I64) -> PreparedProjections:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from recon.base.arrays import F64, I64
     from recon.base.geometry import Geometry
 
-_FIELDS = 8  # by which a sample is stepped aside at most; more is another unit
 _SAME_SIZE = 0.01  # of a pixel
 _OFF = 0.25  # of the step between two views: an angle that differs by more belongs to another view
 
@@ -168,7 +167,7 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
     height, width = source.shape
-    if (far := (np.abs(shifts) >= (_FIELDS * width, height)).any(axis=1)).any():
+    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():  # wide views are a few fields aside
         row = int(np.flatnonzero(far)[0])
         raise DataError(
             f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "

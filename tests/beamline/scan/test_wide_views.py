@@ -167,7 +167,7 @@ def test_the_sample_is_where_the_geometry_says(words: tuple[str, ...], tmp_path:
 
 def test_direct_methods_leave_them_out_and_others_get_them(tmp_path: Path) -> None:
     views, _ = prepared(run_scan(asked(*WIDE), tmp_path, []).path)
-    assert [views_for(by_name(name), views)[1].n_views for name in ("fbp", "sirt")] == [VIEWS, VIEWS + 8]
+    assert [views_for(by_name(name)(), views)[1].n_views for name in ("fbp", "sirt")] == [VIEWS, VIEWS + 8]
 
 
 def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
