@@ -173,8 +173,7 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
-        cols = poses.shifts[usable.frames, 0]
-        aside = np.abs(cols - np.nanmedian(cols)) > source.shape[1] / 2
+        aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
     return usable, poses, np.flatnonzero(source.image_key == FrameKind.WIDE_VIEW)
 

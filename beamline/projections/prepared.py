@@ -122,8 +122,7 @@ class PreparedProjections:
     @property
     def ordinary(self) -> PreparedProjections:
         """The same views without wide ones, which show the sample more than half a field beside its usual place."""
-        cols = self.geometry.shifts[:, 0]
-        aside = np.abs(cols - np.median(cols)) > self.geometry.detector_shape[1] / 2
+        aside = np.abs((cols := self.geometry.shifts[:, 0]) - np.median(cols)) > self.geometry.detector_shape[1] / 2
         return self.of_views(np.flatnonzero(~aside)) if aside.any() else self
 
     def of_views(self, views: I64) -> PreparedProjections:
