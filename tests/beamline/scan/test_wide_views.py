@@ -1,6 +1,7 @@
 """Wide views: the sample is stepped across the beam after the views, so that frames side by side show all of it."""
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -8,23 +9,32 @@ import pytest
 
 from beamline.config.load import plan_of, wide_places
 from beamline.config.models import Config
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.plan.timeline import describe as lines_of
+from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.reconstruct import result
+from beamline.reconstruct.judge import judge
+from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
 from beamline.scan.preflight import dry_run
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan
-from beamline.storage.readers.open import open_scan
+from beamline.storage.pose_table import read_poses
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
+from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
-from recon.methods import by_name
+from recon.base.method import Reconstruction
+from recon.voxels.direct import Fbp
+from recon.voxels.methods import FistaTv
 from tests.beamline.ball_scan import COMMON, shipped, with_scene
 
 # A can of 2.8 fields with a ball near its wall, which no ordinary view at 0 degrees shows.
@@ -129,28 +139,28 @@ def test_a_cone_is_refused() -> None:
 @pytest.mark.parametrize("words", [(), ("scan.mode=fly",), (motor(-1.0),)], ids=["step", "fly", "motor"])
 def test_triggers_frames_and_rows_are_one(words: tuple[str, ...], tmp_path: Path) -> None:
     events: list[Event] = []
-    result = run_scan(asked(*WIDE, *words), tmp_path, [events.append])
+    scan = run_scan(asked(*WIDE, *words), tmp_path, [events.append])
     rows = slice(FIRST, FIRST + 8)
     planned = sum(event.data["n"] for event in events if event.event == "block_started")
-    assert (result.n_frames, result.missing) == (planned, ()) == (FIRST + 8 + 2, ())
-    assert {check: levels for check, levels in result.flags.items() if set(levels) != {"info"}} == {}
-    with h5py.File(result.path) as file:
+    assert (scan.n_frames, scan.missing) == (planned, ()) == (FIRST + 8 + 2, ())
+    assert {check: levels for check, levels in scan.flags.items() if set(levels) != {"info"}} == {}
+    with h5py.File(scan.path) as file:
         assert file[layout.X_TRANSLATION][rows] == pytest.approx(FIELD * np.repeat(STEPS, 2))
         assert not np.delete(file[layout.X_TRANSLATION][()], rows).any()
         assert file[layout.X_TRANSLATION].attrs["units"] == "mm"
         assert (file[layout.IMAGE_KEY][rows] == 0).all() and (file[layout.KIND][rows] == -1).all()
         assert file[layout.ANGLE][rows] == pytest.approx(np.tile([0, 90], 4), abs=1e-3)
         assert len(file["/exchange/data"]) == VIEWS
-        assert {len(file[path]) for path in (layout.DATA, *layout.growing(file))} == {result.n_frames}
-    assert describe(result.path)["kinds"] == {"projection": VIEWS, "wide_view": 8, "flat": 4, "dark": 2}
-    assert [finding for finding in validate(result.path) if finding.severity == "error"] == []
+        assert {len(file[path]) for path in (layout.DATA, *layout.growing(file))} == {scan.n_frames}
+    assert describe(scan.path)["kinds"] == {"projection": VIEWS, "wide_view": 8, "flat": 4, "dark": 2}
+    assert [finding for finding in validate(scan.path) if finding.severity == "error"] == []
 
 
 @pytest.mark.parametrize("words", [(), (motor(-1.0),)], ids=["simulated", "motor"])
 def test_the_sample_is_where_the_geometry_says(words: tuple[str, ...], tmp_path: Path) -> None:
     """The ball's image in the frames of the simulator, beside the column that the shifts predict."""
-    result = run_scan(asked(*WIDE, *words), tmp_path, [])
-    views, told = prepared(result.path)
+    scan = run_scan(asked(*WIDE, *words), tmp_path, [])
+    views, told = prepared(scan.path)
     geometry, data = views.geometry, views.projections.data
     assert geometry.shifts[:, 0] == pytest.approx([0.0] * VIEWS + [COLS * step for step in np.repeat(STEPS, 2)])
     assert not geometry.shifts[:, 1].any()
@@ -167,7 +177,7 @@ def test_the_sample_is_where_the_geometry_says(words: tuple[str, ...], tmp_path:
 
 def test_direct_methods_leave_them_out_and_others_get_them(tmp_path: Path) -> None:
     views, _ = prepared(run_scan(asked(*WIDE), tmp_path, []).path)
-    assert [views_for(by_name(name)(), views)[1].n_views for name in ("fbp", "sirt")] == [VIEWS, VIEWS + 8]
+    assert [views_for(method, views)[1].n_views for method in (Fbp(), FistaTv())] == [VIEWS, VIEWS + 8]
 
 
 def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
@@ -183,9 +193,6 @@ def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
         file["entry"].attrs["NX_class"], file["entry/definition"] = "NXentry", "NXtomo"
         for name, kind in (("instrument", "NXinstrument"), ("instrument/detector", "NXdetector")):
             file[f"entry/{name}"].attrs["NX_class"] = kind
-    from beamline.projections.corrections.poses import PosesOfFile
-    from beamline.storage.pose_table import read_poses
-
     selection = Selection(axis_col=19.5).with_steps(PosesOfFile(read_poses(f"{tmp_path / 'other.nxs'}:x,0")))
     with open_scan(tmp_path / "other.nxs") as source:
         other = prepare_projections(source, selection, lambda sentence: None)
@@ -215,3 +222,23 @@ def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Pat
         views, _ = prepared(path)
         assert views.geometry.shifts[-8:, 0] == pytest.approx(COLS * np.repeat(STEPS, 2))
         assert (views.geometry.shifts[:VIEWS] == 0).all()
+
+
+def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = run_scan(asked(*WIDE), tmp_path, []).path
+    judged: list[int] = []
+
+    def noted(made: Reconstruction, views: PreparedProjections, *more: Any) -> Any:
+        judged.append(views.geometry.n_views)
+        return judge(made, views, *more)
+
+    monkeypatch.setattr(result, "judge", noted)
+    used = []
+    for method in (Fbp(), FistaTv(iterations=2, tv_weight=0.01)):
+        target = OutputPaths(tmp_path / f"{method.name}.h5", None)
+        options = ReconOptions(SourceOptions(path), target, Selection(axis_col=(COLS - 1) / 2), method=method)
+        record = reconstruct_file(options, lambda event: None, SystemClock())
+        used.append(len(np.atleast_1d(record.parameters["view_frames"])))
+    assert (used, judged) == ([VIEWS, VIEWS + 8], [VIEWS, VIEWS])
