@@ -50,11 +50,11 @@ class PlacedStage:
         """Name of the present place. Raises DeviceError."""
         return next((name for name in self._places.places if self._is_at(name)), None)
 
-    def put(self, place: str) -> None:
-        """Move to a place. Raises DeviceError if the stage did not arrive."""
-        stage, speed, target = self._stage, self._places.speed, self._places.places[place]
+    def put(self, place: str, beside: float = 0.0) -> None:
+        """Move to a place, or so many radians beside it. Raises DeviceError if the stage did not arrive."""
+        stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
         try:
-            if self._is_at(place):
+            if self._stands_at(target):
                 return
             way = abs(stage.position() - target)
             stage.start_move(target, speed)
@@ -102,17 +102,18 @@ class PlacedStage:
 class StageSampleMover:
     """Implements `drivers.base.protocols.SampleMover` by a stage with the places INSIDE and OUTSIDE."""
 
-    def __init__(self, motor: PlacedStage) -> None:
+    def __init__(self, motor: PlacedStage, rad_per_mm: float = math.nan) -> None:
         self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
+        self._rad_per_mm = rad_per_mm
         self.remember_place = motor.remember_place
 
     def out(self) -> None:
         """Move the sample out. Raises DeviceError if it did not arrive."""
         self._motor.put(OUTSIDE)
 
-    def back(self) -> None:
-        """Move the sample back. Raises DeviceError if it did not arrive."""
-        self._motor.put(INSIDE)
+    def back(self, aside: float = 0.0) -> None:
+        """Move the sample back, or `aside`. Raises DeviceError if it did not arrive."""
+        self._motor.put(INSIDE, aside * self._rad_per_mm if aside else 0.0)
 
 
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
@@ -250,7 +251,7 @@ class ManualSampleMover(_Manual):
     def out(self) -> None:
         self._bring("out", "Move the sample out of the beam.")
 
-    def back(self) -> None:
+    def back(self, aside: float = 0.0) -> None:
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 

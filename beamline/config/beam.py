@@ -27,7 +27,7 @@ class MotorSection(Section):
     """null: the stage's max_speed_deg_s."""
     stage: Annotated[StageConfig, Field(discriminator="kind")]
 
-    def _refuse_unreachable(self, places: Mapping[str, float]) -> None:
+    def refuse_unreachable(self, places: Mapping[str, float]) -> None:
         figures = self.stage.settings.figures
         low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
         for name, place in places.items():
@@ -55,10 +55,12 @@ class StageMover(MotorSection):
     """Where the sample is in the beam."""
     out_deg: float
     """Where flats are taken."""
+    mm_per_deg: Annotated[float, Field(ge=-1e3, le=1e3)] | None = None
+    """mm towards higher columns of the frame that a unit of the axis moves the sample; null: unknown, or not across."""
 
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
-        self._refuse_unreachable({"in_deg": self.in_deg, "out_deg": self.out_deg})
+        self.refuse_unreachable({"in_deg": self.in_deg, "out_deg": self.out_deg})
         if self.in_deg == self.out_deg:
             raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
         return self
@@ -70,7 +72,8 @@ class StageMover(MotorSection):
             DeviceError: its stage does not answer, or does not fit.
         """
         places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not come")
-        return StageSampleMover(self._connected("sample mover", places, clock, url))
+        rad_per_mm = math.radians(1 / self.mm_per_deg) if self.mm_per_deg else math.nan
+        return StageSampleMover(self._connected("sample mover", places, clock, url), rad_per_mm)
 
 
 class NoFilter(Section):
@@ -100,7 +103,7 @@ class MotorFilter(MotorSection):
 
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
-        self._refuse_unreachable(self.places)
+        self.refuse_unreachable(self.places)
         refuse_equal(self.places)
         return self
 

@@ -14,6 +14,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from beamline.config.beam import StageMover
 from beamline.config.devices import DcamOrca
 from beamline.config.models import Config as Config
 from beamline.config.models import (
@@ -185,6 +186,8 @@ def plan_of(config: Config) -> ScanPlan:
         settle=scan.settle_s,
         warm_up=scan.warm_up_s,
         return_views=scan.return_views,
+        wide_views=scan.wide_views,
+        wide_places=wide_places(config),
         filter=scan.filter,
         energy=scan.energy,
         darks=_field(scan.darks, scan.exposure_s),
@@ -261,6 +264,10 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
+    try:
+        wide_places(config)
+    except ValueError as error:
+        yield ("scan", "wide_views"), f"scan.wide_views {config.scan.wide_views}: {error}"
 
 
 def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -308,6 +315,30 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
     """The configured region, binning and readout with an exposure (s) and a trigger source."""
     camera = config.devices.camera
     return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
+
+
+def wide_places(config: Config) -> tuple[float, ...]:
+    """mm that the sample is stepped aside for wide views: by 0.9 of the field, until a twentieth of it shows air beyond
+    the sample on either side. ValueError: why it cannot be."""
+    mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
+    if not config.scan.wide_views:
+        return ()
+    if diameter is None:
+        raise ValueError("how far the sample is stepped follows from its diameter; set sample.diameter_mm")
+    per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
+    if not per_unit:
+        raise ValueError("devices.sample_mover cannot step the sample; set its kind to stage, and its mm_per_deg")
+    settings, axis = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL), config.optics.axis_col
+    cols = camera.timing_of(settings).shape[1]
+    field = 1e-3 * config.optics.pixel_size_um * camera.binning * cols
+    off_middle = 0.0 if axis is None else abs((axis + 0.5) / cols - 0.5)
+    n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
+    if n < 1:
+        raise ValueError(f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set it to 0")
+    places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
+    if isinstance(mover, StageMover):
+        mover.refuse_unreachable({f"the place for {mm:.4g} mm aside,": mover.in_deg + mm / per_unit for mm in places})
+    return places
 
 
 def _camera(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:

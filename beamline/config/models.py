@@ -27,6 +27,8 @@ class SampleSection(Section):
     name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)]
     """letters, digits and _ . + - (it ends the run folder's name)"""
     description: str = ""
+    diameter_mm: Annotated[float, Field(gt=0, le=1e3)] | None = None
+    """Of the circle about the rotation axis that holds all of the sample; null: not known."""
 
 
 Views = Annotated[int, Field(gt=0, le=1_000_000)]
@@ -123,6 +125,8 @@ class ScanSection(Section):
     """keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle."""
     return_views: Annotated[int, Field(ge=0, le=100)] = 0
     """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
+    wide_views: Annotated[int, Field(ge=0, le=100)] = 0
+    """Angles at which a sample wider than the field is stepped across the beam after the views, until all was shown."""
     without_watchdog: Literal["warn", "pause"] = "warn"
     """The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."""
     darks: Fields = Fields()

@@ -48,7 +48,7 @@ from simulators.scenes.scene import Scene, load_scene
 from simulators.wires.registry import WIRES
 from simulators.wires.wire import Controller, register
 
-IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
+IN_PLACE = 0.1  # deg or mm: how far a motor may be from its place while the sample is seen there
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,12 @@ def simulated_devices(
         beam_is_on = partial(_is_at_level, controller, number, wanted.open_high)
     sample: SampleMover
     sample = simulated = SimulatedSampleMover()
-    sample_is_in = simulated.is_in
+    place: Callable[[], float | None] = simulated.place
     if isinstance(mover := config.devices.sample_mover, StageMover):
         axis = TriggerLine(clock)
         sample = motor = mover.connect(clock, _wire("sample_mover.stage", mover.stage, clock, axis)[1])
         opened.callback(motor.close)
-        sample_is_in = partial(_stands_at, axis, clock, math.radians(mover.in_deg))
+        place = partial(_place_of, mover, axis, clock)
     changer: Filter | None = None
     if isinstance(wheel := config.devices.filter, MotorFilter):
         changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
@@ -106,7 +106,7 @@ def simulated_devices(
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     build = OrcaQuestBuild(pixel_pitch=pitch, model=model)
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, beam_is_on, sample_is_in, build)
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, beam_is_on, place, build)
     opened.callback(camera.close)
     monochromator: Monochromator | None = None
     if isinstance(section := config.devices.monochromator, SceneMonochromator):
@@ -121,8 +121,11 @@ def _is_at_level(controller: Controller, output: int, high: bool) -> bool:
     return controller.output_is_high(output) is high
 
 
-def _stands_at(axis: TriggerLine, clock: Clock, angle: float) -> bool:
-    return abs(axis.angle_at(clock.now()) - angle) < IN_PLACE
+def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | None:
+    """mm by which the sample stands aside; None: out of the beam, or nobody says how far aside."""
+    place, mm = math.degrees(axis.angle_at(clock.now())), mover.mm_per_deg
+    is_out = abs(place - mover.out_deg) < IN_PLACE if mm else abs(place - mover.in_deg) >= IN_PLACE
+    return None if is_out else (mm or 0.0) * (place - mover.in_deg)
 
 
 def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
@@ -175,6 +178,8 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
             f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
             f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
         )
+    if config.scan.wide_views:
+        raise ConfigError("scan.wide_views is for a parallel beam; the scene is a cone beam. Nothing was started.")
     if config.optics.axis_col is None:
         raise ConfigError(
             "optics.axis_col: the scene is a cone beam, whose axis is not searched while views come; set it, here "

@@ -53,9 +53,10 @@ class ScanPlan:
         retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
         stored: views that need not be taken: earlier files of the same scan have them.
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
-        end_references: kinds of references that are still to be taken after the views, where all else is stored. None:
-            all that are planned, before and after the views.
+        end_references: kinds of references that are still to be taken after the views, where all else but wide views
+            is stored. None: all that are planned, before and after the views.
         return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
+        wide_views: angles, evenly spread, of one frame each with the sample at each of `wide_places`, in mm aside.
         filter: the place of the filter for all frames; None: as it stands.
         energy: keV of the monochromator for all frames; None: as it stands.
         frames_per_view: of a step scan; the stage neither moves nor settles between them.
@@ -74,6 +75,8 @@ class ScanPlan:
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
     return_views: int = 0
+    wide_views: int = 0
+    wide_places: tuple[float, ...] = ()
     filter: str | None = None
     energy: float | None = None
     frames_per_view: int = 1
@@ -104,6 +107,7 @@ class Block:
         speed: rad/s during the pulses (FLY).
         taxi: radians of run-up before the first and after the last pulse (FLY).
         stored: frames of the block, counted within it, that are not taken.
+        aside: mm, where the sample stands, as of `Frame.aside`.
     """
 
     kind: FrameKind
@@ -116,6 +120,7 @@ class Block:
     speed: float = 0.0
     taxi: float = 0.0
     stored: frozenset[int] = frozenset()
+    aside: float = 0.0
 
     @property
     def n(self) -> int:
@@ -314,6 +319,12 @@ def return_block(views: Block, n: int, *, stored: bool) -> Block:
     """The block that repeats some views on the way back; the stage stands during each exposure."""
     block = retake_block(views, return_triggers(views, n))
     return replace(block, kind=FrameKind.ALIGNMENT, stored=frozenset(range(block.n)) if stored else frozenset[int]())
+
+
+def wide_block(views: Block, n: int, aside: float) -> Block:
+    """The block of wide views with the sample `aside`, at `n` evenly spread angles; the stage stands for each."""
+    triggers = np.argsort(views.angles, kind="stable")[np.arange(n) * views.n // n]
+    return replace(retake_block(views, triggers), kind=FrameKind.WIDE_VIEW, aside=aside)
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from beamline.plan.plan import (
     retake_block,
     return_block,
     spread_retakes,
+    wide_block,
 )
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
@@ -83,7 +84,7 @@ def work_out(
     )
     return Timeline(
         blocks=blocks,
-        duration=_duration(plan, blocks, views, stage, camera),
+        duration=_duration(plan, blocks, stage, camera),
         frame_bytes=frame_bytes,
         total_bytes=facts.total_bytes,
         step_counts=flight.interval if flight else 0,
@@ -109,11 +110,11 @@ def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight |
         return None, [str(error)]
 
 
-def _duration(plan: ScanPlan, blocks: Sequence[Block], views: Block, stage: StageLimits, camera: CameraTiming) -> float:
+def _duration(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camera: CameraTiming) -> float:
     """Seconds of all blocks, of the way back to zero, and of the shutter's openings."""
-    last = next((block for block in blocks if block.kind is FrameKind.ALIGNMENT and block.left), views)
-    seconds = sum(block_seconds(block, stage, camera, plan.settle, _start(block, views)) for block in blocks)
-    return seconds + _return(last, stage) + plan.warm_up * _openings(blocks)
+    *starts, end = _stands(blocks)
+    seconds = sum(block_seconds(b, stage, camera, plan.settle, at) for b, at in zip(blocks, starts, strict=True))
+    return seconds + move_seconds(end, stage.max_speed, stage.acceleration) + plan.warm_up * _openings(blocks)
 
 
 def _openings(blocks: Iterable[Block]) -> int:
@@ -213,6 +214,9 @@ def _blocks(
         back = return_block(views, plan.return_views, stored=missing is not None)
         yield replace(back, first_trigger=row)
         row += back.n
+    for mm in plan.wide_places:
+        yield replace(wide_block(views, plan.wide_views, mm), first_trigger=row)
+        row += plan.wide_views
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
             yield _static(kind, field, row, plan, camera, stored=missing is not None and kind not in missing)
@@ -275,8 +279,10 @@ def _end(block: Block) -> float:
     return passes(block)[-1].end if block.trains else float(block.angles[-1])
 
 
-def _start(block: Block, views: Block) -> float:
-    return _end(views) if block.kind is FrameKind.ALIGNMENT else 0.0
+def _stands(blocks: Iterable[Block]) -> list[float]:
+    """Angles at which the stage stands before each block, and after the last one."""
+    moving = (block if block.left and block.mode is not Mode.STATIC else None for block in blocks)
+    return [*accumulate(moving, lambda at, block: at if block is None else _end(block), initial=0.0)]
 
 
 def describe(
@@ -286,10 +292,10 @@ def describe(
     lines = [
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]
-    for block, row in zip(timeline.blocks, timeline.first_rows, strict=True):
+    for block, row, at in zip(timeline.blocks, timeline.first_rows, _stands(timeline.blocks), strict=False):
         if not block.left:
             continue
-        seconds = block_seconds(block, stage, camera, plan.settle, _start(block, timeline.views))
+        seconds = block_seconds(block, stage, camera, plan.settle, at)
         lines.append(
             f"{row:>6}-{row + block.left - 1:<6}  {block.kind.name.lower():<10}  {block.left:>6}  {block.mode:<6}  "
             f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"
@@ -311,6 +317,8 @@ def describe(
         ]
     else:
         facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
+    if plan.wide_places:
+        facts.append(("wide", f"the sample {', '.join(f'{mm:+.4g}' for mm in plan.wide_places)} mm across the beam"))
     total = size(timeline.total_bytes)
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [

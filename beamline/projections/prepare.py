@@ -30,6 +30,7 @@ from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.changed import JOINED_DEG
 from drivers.base.frame import FrameKind
+from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
 from recon.base.registry import in_folders
@@ -101,7 +102,7 @@ def prepare_projections(
         return emitted
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable, poses = _usable(source, selection, warn)
+    usable, poses, wide = _usable(source, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
@@ -118,6 +119,7 @@ def prepare_projections(
     if check is not None:
         check(view_geometry.of(used))
     phases.enter("correction")
+    used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(source, correction, used, buffer, phases)
     light = compare_with_flats(source, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
@@ -127,7 +129,7 @@ def prepare_projections(
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
-    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared, selection, warn)})
+    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.ordinary, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
@@ -160,8 +162,8 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
         _usable(source, selection, lambda sentence: None)
 
 
-def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
-    """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
+def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
+    """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
     _warn_of_joined_views(source, warn)
     usable = checked_views(source, selection, warn)
     _warn_of_units(source, selection, warn)
@@ -171,7 +173,9 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
-    return usable, poses
+        aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
+        return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
+    return usable, poses, np.flatnonzero(source.image_key == FrameKind.WIDE_VIEW)
 
 
 def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
@@ -283,7 +287,6 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    _warn_of_the_field(source, selection, projections, geometry, warn)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
@@ -301,7 +304,7 @@ def assemble(
         within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
         return regions.weights(ids[views], within, binning, (part.stop - part.start, width))
 
-    return PreparedProjections(
+    prepared = PreparedProjections(
         projections=projections,
         geometry=geometry,
         axis_col=axis_col,
@@ -318,19 +321,19 @@ def assemble(
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
     )
+    _warn_of_the_field(source, selection, prepared.ordinary, warn)
+    return prepared
 
 
-def _warn_of_the_field(
-    source: ScanSource, selection: Selection, projections: Projections, geometry: Geometry, warn: Warn
-) -> None:
+def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view, and of the ring current where no air corrects it."""
-    edges = FieldEdges.of(projections.data, geometry)
+    edges = FieldEdges.of(prepared.projections.data, prepared.geometry)
     if sides := edges.beyond():
         warn(cut_sentence(sides))
-        if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
+        if (change := uncorrected_current(source, selection)) and not any(prepared.projections.air_columns):
             warn(change)
     elif ranges := edges.passing():
-        warn(passing_sentence(ranges, geometry.n_views))
+        warn(passing_sentence(ranges, prepared.geometry.n_views))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

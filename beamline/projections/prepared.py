@@ -119,6 +119,12 @@ class PreparedProjections:
             shares_of=None,
         )
 
+    @property
+    def ordinary(self) -> PreparedProjections:
+        """The same views without wide ones, which show the sample more than half a field beside its usual place."""
+        aside = np.abs((cols := self.geometry.shifts[:, 0]) - np.median(cols)) > self.geometry.detector_shape[1] / 2
+        return self.of_views(np.flatnonzero(~aside)) if aside.any() else self
+
     def of_views(self, views: I64) -> PreparedProjections:
         """Some of the views used, by number and in this order; held-out views are unchanged."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,6 +102,8 @@ class ViewGeometry:
     def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views without calibration."""
         geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
+        if (aside := self.source.aside_mm) is not None:
+            geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
         geometry, self.width = part.step(Width).rays(self.source, part, geometry)

@@ -205,6 +205,7 @@ def _for_method(
     Raises:
         ConfigError, DataError: the views do not suffice, or the disk does not.
     """
+    prepared = prepared.ordinary if options.method.traits.direct else prepared
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:

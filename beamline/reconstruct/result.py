@@ -78,12 +78,12 @@ def write_result(
     """
     phases = context.phases
     phases.enter("measuring the volume")
-    judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
+    judged = judge(made, prepared.ordinary, truth, target, context, sink, clock, partial_volume is not None)
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
     stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
     context = replace(context, warnings=remarks, stray=stray)
     phases.enter("report")
-    record, volumes = _record(judged, context, clock.now())
+    record, volumes = _record(judged, prepared, context, clock.now())
     page, timed = None, _nothing
     try:
         if target.report is not None:
@@ -91,7 +91,7 @@ def write_result(
             from beamline.report.html import write_report, write_timed
 
             metrics, parameters = judged.metrics, record.parameters
-            report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
+            report = compose(made, judged.prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
             page, timed = target.report, partial(write_timed, target.report, report, label_of(made.method))
@@ -117,9 +117,11 @@ def _nothing(elapsed: float) -> None:
     """There is no page that states the time."""
 
 
-def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
+def _record(
+    judged: VolumeLooks, prepared: PreparedProjections, context: ReportContext, now: float
+) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
-    made, prepared, target = judged.made, judged.prepared, judged.target
+    made, target = judged.made, judged.target
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))

@@ -56,6 +56,7 @@ def run_on(
 
 def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geometry, DataUse]:
     """Line integrals [view, row, col], geometry and use of the views in the form that the method expects."""
+    prepared = prepared.ordinary if method.traits.direct else prepared
     data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
     if method.traits.held_out:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)

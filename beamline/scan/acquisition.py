@@ -12,7 +12,7 @@ from beamline.core.errors import BeamlineError, DataError, InstrumentError, Refe
 from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
-from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block, return_triggers
+from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block
 from beamline.scan.control import State
 from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
 from beamline.scan.ledger import LedgerError
@@ -136,8 +136,8 @@ class Acquisition:
                 return
             if self._stop.stopping and not self._still_needed(block):
                 continue
-            if block.kind is FrameKind.ALIGNMENT:
-                yield from self._on_the_way_back(block)
+            if block.kind in (FrameKind.ALIGNMENT, FrameKind.WIDE_VIEW):
+                yield from self._standing(block)
                 continue
             done = RecordedBlock(block, BlockTally())
             yield from self._block(done)
@@ -150,7 +150,7 @@ class Acquisition:
         what = block.kind.name.lower(), str(block.mode), block.left, self.n_frames
         self._sink(BlockStarted(*what, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
-        self._set_shutter_and_sample(block.kind)
+        self._set_shutter_and_sample(block)
         first, looks = self.n_frames, self._remembered_places(block.kind)
         yield from self._exposures.take(block, first, taken)
         self._require_in_place(looks, block.kind, range(first, self.n_frames))
@@ -186,15 +186,16 @@ class Acquisition:
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 
-    def _on_the_way_back(self, block: Block) -> Iterator[Frame]:
-        """Views that are taken a second time, at the angles of the first ones. Nothing replaces anything."""
+    def _standing(self, block: Block) -> Iterator[Frame]:
+        """Views on the way back, or wide ones, at angles of the first views. Nothing replaces anything."""
         views = self._timeline.views
-        beyond = middle_of_exposure(views)[return_triggers(views, block.n)]
-        done = RecordedBlock(block, BlockTally(), again=True)
+        beyond = float(middle_of_exposure(views)[0])  # every pass goes the same way
+        done = RecordedBlock(block, BlockTally(), again=block.kind is FrameKind.ALIGNMENT)
+        first = 0 if done.again else block.first_trigger - views.first_trigger  # in files wide views are views, too
         for frame in self._block(done):
             invalid = frame.kind is FrameKind.INVALID
-            yield frame if invalid else replace(frame, angle=frame.angle - float(beyond[frame.trigger]))
-        if done.taken.missing:
+            yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
+        if done.again and done.taken.missing:
             self._sink(Warned(f"Of {block.n} views on the way back {len(done.taken.missing)} gave no frame."))
 
     def _still_needed(self, block: Block) -> bool:
@@ -205,13 +206,13 @@ class Acquisition:
         kinds = {done.block.kind for done in self._done if done.taken.frames}
         return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
-    def _set_shutter_and_sample(self, kind: FrameKind) -> None:
-        """Bring shutter and sample where this kind of frame needs them; a shutter that does not move ends the scan."""
-        shutter, sample = self._devices.shutter, self._devices.sample
+    def _set_shutter_and_sample(self, block: Block) -> None:
+        """Bring shutter and sample where the block needs them; a shutter that does not move ends the scan."""
+        shutter, sample, kind = self._devices.shutter, self._devices.sample, block.kind
         if kind is FrameKind.DARK:
             shutter.close()
         else:
-            sample.out() if kind is FrameKind.FLAT else sample.back()
+            sample.out() if kind is FrameKind.FLAT else sample.back(block.aside)
             cold = not shutter.is_open()
             shutter.open()
             if cold:
@@ -270,7 +271,7 @@ class Acquisition:
             if self._supervision.wait_in_pause():
                 pause.resume()
         if not self._stop.stopping:
-            self._set_shutter_and_sample(block.kind)
+            self._set_shutter_and_sample(block)
             states.enter(_state_of(block), "The scan goes on")
 
     def _make_safe(self, home: float | None) -> list[BaseException]:

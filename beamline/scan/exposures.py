@@ -195,8 +195,9 @@ class Exposures:
                 replaces, _ = taken.rows.get(trigger, before)
                 taken.rows[trigger] = row, frame.time
             yield Frame(
-                frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces
-            )
+                frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces,
+                block.aside,
+            )  # fmt: skip
 
     def go(self, angle: float, *, until_stop: bool = True) -> bool:
         """Move to `angle` at full speed and wait; returns False if a stop (or only an abort) interrupted the move."""

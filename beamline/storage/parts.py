@@ -251,7 +251,8 @@ def _digest(part: h5py.File) -> str:
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:
     rows = [int(file[layout.COMMITTED][()]) for file in files]
     firsts = np.cumsum([0, *rows])
-    values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in layout.GROWING}
+    grown = layout.growing(files[0])
+    values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in grown}
     for i, (file, n, first) in enumerate(zip(files, rows, firsts[:-1], strict=True)):
         record = {path: values[path][i] for path in layout.RECORDED}
         again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, 0, n))
@@ -281,7 +282,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
 
 def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
     """Copy the first `n` rows of a scan file, with all that is not stored by row, into a new, closed file."""
-    _copy(file["/"], target, {path: file[path][:n] for path in layout.GROWING})
+    _copy(file["/"], target, {path: file[path][:n] for path in layout.growing(file)})
     for path in _VIRTUAL:
         item = file[path]
         maxshape, chunks = (None, *item.shape[1:]), (1, *item.shape[1:])

@@ -263,7 +263,7 @@ def _take_place(new: Path, path: Path, kept: Path) -> None:
 def _rows_readable(file: h5py.File) -> int:
     """Number of rows from the first on whose columns and pixels can be read, up to the last that is as written."""
     n = int(file[layout.COMMITTED][()])
-    for path in layout.GROWING:
+    for path in layout.growing(file):
         n = _most_rows(file[path], n)
     images = file[layout.DATA], file[layout.PREVIEW]
     n = min(n, *map(len, images))
@@ -301,7 +301,7 @@ def _read(file: h5py.File) -> None:
 
 def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
     """End the file as a writer does, with the frames that are committed and on the disk; how many these are."""
-    growing = (layout.DATA, layout.PREVIEW, *layout.GROWING)
+    growing = (layout.DATA, layout.PREVIEW, *layout.growing(file))
     frames = min(committed, *(_rows_within(file[name], head.size) for name in growing))
     file[layout.COMMITTED][()] = frames
     ending = ending_in(file)

@@ -17,6 +17,7 @@ class FrameKind(IntEnum):
     DARK = 2
     INVALID = 3
     ALIGNMENT = -1
+    WIDE_VIEW = -2  # a projection with the sample stepped aside; in files a projection with a translation
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,7 @@ class Frame:
         time: s since the Unix epoch, at the trigger.
         exposure: s.
         replaces: row of the view that this one repeats; -1: none.
+        aside: mm by which the sample was moved across the beam, towards higher columns.
     """
 
     counts: NDArray[np.uint16]
@@ -44,3 +46,4 @@ class Frame:
     time: float
     exposure: float
     replaces: int = -1
+    aside: float = 0.0

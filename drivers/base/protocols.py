@@ -237,7 +237,8 @@ class SampleMover(Protocol):
 
     def out(self) -> None: ...
 
-    def back(self) -> None: ...
+    def back(self, aside: float = 0.0) -> None:
+        """Move the sample into the beam, so many mm beside its place, towards higher columns of the frame."""
 
 
 class Filter(Protocol):

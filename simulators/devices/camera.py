@@ -66,7 +66,7 @@ class SimulatedOrcaQuest:
     Args:
         scene: what stands in the beam.
         seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
-        beam_is_on, sample_is_in: asked when a frame is exposed: dark, flat or projection.
+        beam_is_on, place_of_sample: asked when a frame is exposed: a dark, or else mm aside; None: a flat.
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class SimulatedOrcaQuest:
         clock: Clock,
         seed: int,
         beam_is_on: Callable[[], bool],
-        sample_is_in: Callable[[], bool],
+        place_of_sample: Callable[[], float | None],
         build: OrcaQuestBuild = _USUAL,
     ) -> None:
         self.name, self._model = build.name, build.model
         self._scene, self._line, self._clock, self._seed = scene, line, clock, seed
-        self._beam_is_on, self._sample_is_in, self._build = beam_is_on, sample_is_in, build
+        self._beam_is_on, self._place_of_sample, self._build = beam_is_on, place_of_sample, build
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
         self._timing = orca_quest.timing(self._settings, model=self._model)
         self._connected = clock.now()
@@ -125,7 +125,7 @@ class SimulatedOrcaQuest:
             CannotExposeError: the scene cannot be exposed with them; the message says what would help.
         """
         now = self._clock.now()
-        expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
+        expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, 0.0, 0)))
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply settings and read them back; the exposure is rounded to 10 ns. Raises DeviceRefused, with nothing
@@ -281,12 +281,12 @@ class SimulatedOrcaQuest:
             self._gone = f"does not answer any more: it was unplugged at frame {self._frames}"
             return
         ready = time + self._settings.exposure + self._timing.readout
-        beam, sample = self._beam_is_on(), self._sample_is_in()
+        beam, sample = self._beam_is_on(), self._place_of_sample()
         if self._frames not in self._build.lost:
             self._ring.append(Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
         self._framestamp += 1
         self._frames += 1
-        self._views += beam and sample
+        self._views += beam and sample is not None
 
     def _check_overrun(self, now: float) -> None:
         over = sum(frame.ready <= now for frame in self._ring) - self._build.ring_frames

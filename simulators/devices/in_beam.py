@@ -81,17 +81,17 @@ class SimulatedSampleMover:
 
     def __init__(self, name: str = "sample mover") -> None:
         self.name = name
-        self._in = True
+        self._aside: float | None = 0.0
 
     def out(self) -> None:
-        self._in = False
+        self._aside = None
 
-    def back(self) -> None:
-        self._in = True
+    def back(self, aside: float = 0.0) -> None:
+        self._aside = aside
 
-    def is_in(self) -> bool:
-        """Whether the sample is in the beam; the simulated camera asks it."""
-        return self._in
+    def place(self) -> float | None:
+        """mm by which the sample stands aside, None: out of the beam; the simulated camera asks it."""
+        return self._aside
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,8 @@ class Exposed:
         time: of the trigger, s since the Unix epoch.
         angle: of the stage then, radians.
         ready: when the frame can be taken, s since the Unix epoch.
-        beam, sample: whether the shutter was open, and the sample in.
+        beam: whether the shutter was open.
+        sample: mm by which the sample stood aside; None: out of the beam.
         view: projections exposed before this one.
     """
 
@@ -114,7 +115,7 @@ class Exposed:
     angle: float
     ready: float
     beam: bool
-    sample: bool
+    sample: float | None
     view: int
 
 
@@ -178,9 +179,10 @@ class CameraView:
             readout=self.settings.readout,
             conversion=CONVERSION[self.settings.readout],
             beam=frame.beam,
-            sample=frame.sample,
+            sample=frame.sample is not None,
             radius=self.scene.sample.radius,
             seed=self.seed,
             frame=frame.number,
             view=frame.view,
+            aside=frame.sample or 0.0,
         )

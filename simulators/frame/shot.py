@@ -147,6 +147,7 @@ class Shot:
         frame: number since the camera was connected, of any kind.
         view: projections exposed before this frame.
         model: of the camera.
+        aside: mm by which the sample stands beside its place, towards higher columns.
     """
 
     detector: Detector
@@ -167,6 +168,7 @@ class Shot:
     frame: int
     view: int
     model: str = MODEL
+    aside: float = 0.0
 
     def later(self, seconds: float) -> Shot:
         """The same shot with time and angle `seconds` after the trigger."""

@@ -181,6 +181,7 @@ def _transmission(
 ) -> Image:
     """open_beam x exp(-line integral) with the sample's pose at one moment of each row, mean over a pixel's rays."""
     pose = scene.chain.pose(Pose(angles), times, shot)
+    pose = pose.shifted_by((shot.aside, 0.0, 0.0)) if shot.aside else pose
     now, rays = shot.later(float(times[0])), scene.chain.rays
     sample = sample_at(scene.sample, shot.elapsed + float(times[0]))
 

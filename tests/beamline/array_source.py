@@ -51,6 +51,7 @@ class ArraySource:
     used: tuple[Any, ...] = ()
     replaces = None
     shifts: NDArray[np.float64] | None = None
+    aside_mm: NDArray[np.float64] | None = None
     part_starts: NDArray[np.int64] = np.zeros(1, np.int64)
     checksummed = False
     altered: frozenset[int] = frozenset()

@@ -323,7 +323,7 @@ class Sample:
     def out(self) -> None:
         self.instrument.is_in = False
 
-    def back(self) -> None:
+    def back(self, aside: float = 0.0) -> None:
         self.instrument.is_in = True
 
 

@@ -83,6 +83,7 @@ def ingest(
             distance_mm=distance if isinstance(distance, int | float) else None,
             source_distance_mm=None if source.cone is None else source.cone[0],
             plan=json.dumps({} if other_angles else dict(source.plan)),
+            wide_views=source.aside_mm is not None,
         )
         with hdf5.created(partial, layout.LIBVER) as file:
             invalid = _copy(source, file, out, info, no_data, progress)
@@ -172,7 +173,7 @@ def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
     if source.dtype == np.uint16:
         for i, frame in enumerate(source.frames()):
             known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i))
+            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i), aside=frame.aside)
         return
     keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):

@@ -92,6 +92,7 @@ class ScanSource(ABC):
         emission: the counts of a sample that emits, whose line integrals the pixels are; None: it does not emit.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
+        aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
         stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
     """
 
@@ -122,6 +123,7 @@ class ScanSource(ABC):
     emission: EmissionOf | None = None
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
+    aside_mm: NDArray[np.float64] | None = None
     stated_shifts: NDArray[np.float64] | None = None
     stated_ending: ScanEnding = ScanEnding()
 

@@ -181,6 +181,10 @@ class NXtomoSource(ScanSource):
             self._altered |= {self.n + row for row in rows.tolist()}
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
+        if self._ours and (moved := datasets.dataset(places.entry, "sample/x_translation")) is not None:
+            hdf5.look_again(moved)
+            self.aside_mm = datasets.values_of(moved)[:n]
+            self.image_key[(self.image_key == FrameKind.ALIGNMENT) & (self.aside_mm != 0)] = FrameKind.WIDE_VIEW
         self.image_key[[*self._altered]] = FrameKind.INVALID
         self.n, self.angles = n, angles[:n]
         self._checksums = self._column("digest/checksum", np.empty(0))[:n] if self._ours else np.empty(0)
@@ -359,6 +363,7 @@ class NXtomoSource(ScanSource):
                 time=float(time[i]),
                 exposure=float(self.exposures[i]),
                 replaces=int(replaces[i]),
+                aside=0.0 if self.aside_mm is None else float(self.aside_mm[i]),
             )
 
     def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:

@@ -21,7 +21,7 @@ _T = TypeVar("_T")
 UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
-_BY_FRAME = ("currents", "energies", "times", "shifts")
+_BY_FRAME = ("currents", "energies", "times", "shifts", "aside_mm")
 _OWN = {"facts", "unreadable", "stated_shifts", "stated_ending", *_BY_FRAME}
 _COPIED = [name for name in ScanSource.__annotations__ if name not in _OWN]
 

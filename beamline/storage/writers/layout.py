@@ -59,6 +59,7 @@ IMAGE_KEY_CONTROL = f"{DETECTOR}/image_key_control"
 FIELD_OF_VIEW = f"{DETECTOR}/field_of_view"
 ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
+X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with wide views
 PREVIEW = "/entry/digest/preview"
 COMMITTED = "/entry/progress/frames_committed"
 COUNT_TIME = f"{DETECTOR}/count_time"
@@ -112,7 +113,11 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 
-GROWING = (*COLUMNS, VALID, SCORES, REGIONS)  # What has a row for each frame, beside the pixels and their preview
+
+def growing(file: h5py.File) -> list[str]:
+    """What has a row for each frame in this file, beside the pixels and their preview."""
+    return [*COLUMNS, VALID, SCORES, REGIONS, *(path for path in (X_TRANSLATION,) if path in file)]
+
 
 RECORDED = (
     IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,
@@ -139,6 +144,7 @@ class ScanInfo:
         monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
+        wide_views: whether some are planned.
     """
 
     sample: str
@@ -157,6 +163,7 @@ class ScanInfo:
     filter: str | None = None
     monochromator_kev: float | None = None
     saturation: float | None = None
+    wide_views: bool = False
 
 
 def iso_time(seconds: float) -> str:
@@ -269,7 +276,8 @@ def _columns(
     _growing(file, DATA, frame_shape, dtype)
     _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
     file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
-    for path, (kind, unit) in COLUMNS.items():
+    wide = {X_TRANSLATION: ("<f8", "mm")} if info.wide_views else {}
+    for path, (kind, unit) in {**COLUMNS, **wide}.items():
         _growing(file, path, (), np.dtype(kind))
         if unit:
             file[path].attrs["units"] = unit

@@ -148,7 +148,7 @@ class NXtomoWriter:
         self._check(frame, digest)
         record = Record(
             frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time,
-            mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces,
+            mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces, frame.aside,
         )  # fmt: skip
         try:
             self._require_untouched()

@@ -45,13 +45,14 @@ class Record:
     time: float = np.nan
     mark: Mark = UNMARKED
     replaces: int = -1
+    aside: float = 0.0
 
 
 def image_key_of(kind: FrameKind) -> int:
     """NXtomo's image key of a kind of frame. NXtomo has no key for alignment frames: programs that do not know them
-    must not use them.
+    must not use them. A wide view is a projection, of a translated sample.
     """
-    return int(FrameKind.INVALID if kind is FrameKind.ALIGNMENT else kind)
+    return int({FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.WIDE_VIEW: FrameKind.PROJECTION}.get(kind, kind))
 
 
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
@@ -109,7 +110,7 @@ class Rows:
     def __init__(self, file: h5py.File) -> None:
         self._data: h5py.Dataset = file[layout.DATA]
         self._preview: h5py.Dataset = file[layout.PREVIEW]
-        self._columns: dict[str, h5py.Dataset] = {path: file[path] for path in layout.GROWING}
+        self._columns: dict[str, h5py.Dataset] = {path: file[path] for path in layout.growing(file)}
         self._types = {path: column.dtype for path, column in self._columns.items()}
         self._first, self._said = 0, list[dict[str, Any]]()
 
@@ -123,7 +124,8 @@ class Rows:
             self._first = row
         values = {
             layout.IMAGE_KEY: image_key_of(record.kind),
-            layout.KIND: int(record.kind),
+            layout.KIND: max(int(record.kind), int(FrameKind.ALIGNMENT)),
+            layout.X_TRANSLATION: record.aside,
             layout.COUNT_TIME: record.exposure,
             layout.ANGLE: math.degrees(record.angle),
             layout.TRIGGER: record.trigger,

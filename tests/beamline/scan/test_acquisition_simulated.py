@@ -52,7 +52,7 @@ class FaultyInstrument:
             self.clock,
             0,
             self.shutter.is_open,
-            self.sample.is_in,
+            self.sample.place,
             OrcaQuestBuild(lost=lost, ignored=ignored),
         )
 

@@ -47,7 +47,7 @@ class _Bench:
             }
         )
         self.camera = SimulatedOrcaQuest(
-            self.scene, self.line, self.clock, 5, self.shutter.is_open, self.sample.is_in, OrcaQuestBuild(**options)
+            self.scene, self.line, self.clock, 5, self.shutter.is_open, self.sample.place, OrcaQuestBuild(**options)
         )
         self.camera.configure(SETTINGS)
 
@@ -82,7 +82,7 @@ class TestConformance(CameraConformance):
 def test_dark_flat_and_projection_follow_shutter_and_sample() -> None:
     """The shutter is closed and the sample in the beam before anybody moves them."""
     assert not SimulatedShutter().is_open()
-    assert SimulatedSampleMover().is_in()
+    assert SimulatedSampleMover().place() == 0
     bench = _Bench()
     projection = bench.one().counts
     assert projection.min() < 0.6 * FULL
@@ -220,7 +220,7 @@ def test_noise_belongs_to_seed_and_frame_number() -> None:
         np.testing.assert_array_equal(mine, again.counts)
     second.camera.rehearse()  # which is no frame: the next is as if it had not been
     np.testing.assert_array_equal(second.one().counts, first.one().counts)
-    other_seed = SimulatedOrcaQuest(first.scene, first.line, first.clock, 6, first.shutter.is_open, first.sample.is_in)
+    other_seed = SimulatedOrcaQuest(first.scene, first.line, first.clock, 6, first.shutter.is_open, first.sample.place)
     other_seed.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
     other_seed.arm(1)
     assert (other_seed.next_frame(1.0).counts != frames[0]).mean() > 0.9

@@ -25,7 +25,7 @@ def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: in
     of = scan.frame(25).shot
     settings = CameraSettings(asked.exposure_s, TriggerSource.EXTERNAL, scan.roi, binning, readout)
     view = CameraView(scan.scene, settings, asked.pixel_size_um * 1e-3, 7, of.angle_at, connected=scan.start)
-    frame = Exposed(3, of.frame, of.time, of.angle, of.time + 1.0, True, True, of.view)
+    frame = Exposed(3, of.frame, of.time, of.angle, of.time + 1.0, True, 0.0, of.view)
     seen, expected = asdict(view.shot(frame)), asdict(of)
     for name, value in expected["detector"].items():
         assert seen["detector"][name] == pytest.approx(value, rel=1e-12), name
@@ -38,7 +38,7 @@ def test_a_frame_without_motion_shows_the_middle_of_its_exposure(effects: tuple[
     """Effects of motion ask for the moments of the exposure themselves, from the trigger on."""
     settings = CameraSettings(0.01, TriggerSource.EXTERNAL, (0, 0, 64, 96))
     view = CameraView(shots.scene(*effects), settings, 4.6e-3, 1, lambda time: 0.4 + 4.0 * (time - 1000.0), 0.0)
-    assert view.shot(Exposed(0, 0, 1000.0, 0.4, 1000.1, True, True, 0)).angle == pytest.approx(seen)
+    assert view.shot(Exposed(0, 0, 1000.0, 0.4, 1000.1, True, 0.0, 0)).angle == pytest.approx(seen)
 
 
 def test_without_a_roi_it_is_the_whole_sensor() -> None:

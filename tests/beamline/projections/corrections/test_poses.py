@@ -238,7 +238,7 @@ def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) 
     views = np.arange(N)
     for head, columns, match in (
         ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
-        ("view,shift_col_px", (views, np.full(N, 41.0)), "view 0 is displaced by 41 columns and 0 rows"),
+        ("view,shift_col_px", (views, np.full(N, 321.0)), "view 0 is displaced by 321 columns and 0 rows"),
         ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
         ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),

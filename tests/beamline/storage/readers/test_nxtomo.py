@@ -33,13 +33,14 @@ def scans(draw: st.DrawFn) -> list[Frame]:
     return [
         Frame(
             counts=rng.integers(0, 65536, shape).astype(np.uint16),
-            kind=draw(st.sampled_from(FrameKind)),
+            kind=(kind := draw(st.sampled_from(FrameKind))),
             index=i,
             trigger=draw(st.integers(0, 2**40)),
             framestamp=draw(st.integers(-1, 2**40)),
             angle=draw(st.floats(-20, 20) | st.just(np.nan)),
             time=draw(st.floats(0, 4e9)),
             exposure=draw(st.floats(1e-6, 1e4)),
+            aside=draw(st.floats(0.1, 9)) if kind is FrameKind.WIDE_VIEW else 0.0,
         )
         for i in range(draw(st.integers(0, 6)))
     ]
@@ -51,7 +52,8 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
     shape = frames[0].counts.shape if frames else (2, 3)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.h5"
-        with NXtomoWriter(path, INFO, shape, clock=SteppedClock(EPOCH), flush_every=flush_every) as writer:
+        info = replace(INFO, wide_views=True)
+        with NXtomoWriter(path, info, shape, clock=SteppedClock(EPOCH), flush_every=flush_every) as writer:
             for frame in frames:
                 writer.append(frame, digest(frame.counts))
         with open_scan(path) as source:
@@ -61,7 +63,7 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
         np.testing.assert_array_equal(a.counts, b.counts)
         assert a.counts.dtype == np.uint16
         assert (a.kind, a.index, a.trigger, a.framestamp) == (b.kind, b.index, b.trigger, b.framestamp)
-        assert (a.time, a.exposure) == (b.time, b.exposure)
+        assert (a.time, a.exposure, a.aside) == (b.time, b.exposure, b.aside)
         np.testing.assert_allclose(a.angle, b.angle, rtol=1e-15)  # degrees in the file
 
 
