@@ -53,6 +53,8 @@ class PreparedProjections:
         energies: of the views, where they are of several scans; None: they are of one.
         recorded: what the volume's file says of several scans, by name; empty of one.
         laws: what the views leave of the laws that hold for all of them, in words, by name.
+        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, if that was given.
+        inside: the views show what lies in the volume alone: what the rest of the sample adds is taken off.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -77,6 +79,8 @@ class PreparedProjections:
     times: NDArray[np.float64] | None = None
     energies: Energies | None = None
     recorded: Mapping[str, Value] = field(default_factory=dict)
+    sample_radius: float | None = None
+    inside: bool = False
     stretch: float = 1.0
     laws: Mapping[str, str] = field(default_factory=dict)
 
@@ -122,8 +126,8 @@ class PreparedProjections:
     @property
     def ordinary(self) -> PreparedProjections:
         """The same views without wide ones, which show the sample more than half a field beside its usual place."""
-        aside = np.abs((cols := self.geometry.shifts[:, 0]) - np.median(cols)) > self.geometry.detector_shape[1] / 2
-        return self.of_views(np.flatnonzero(~aside)) if aside.any() else self
+        ordinary = self.geometry.ordinary
+        return self if ordinary.all() else self.of_views(np.flatnonzero(ordinary))
 
     def of_views(self, views: I64) -> PreparedProjections:
         """Some of the views used, by number and in this order; held-out views are unchanged."""

@@ -22,7 +22,7 @@ from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on
+from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on, without_outside
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
@@ -186,10 +186,10 @@ def runner_of(
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     """Reconstruct within a time budget, in slabs, or at once; returns the volume, and the views as used."""
     prepared = job.prepared
-    if job.options.budget is not None:
-        return _within_budget(job, job.options.budget)
-    if not job.slabs:
-        return _at_once(job, decided), prepared
+    if job.options.budget is not None or not job.slabs:
+        budget = job.options.budget
+        made, used = (_at_once(job, decided), prepared) if budget is None else _within_budget(job, budget)
+        return replace(made, outside=None), without_outside(used, made)
     made = _by_slabs(job, decided)
     if job.options.method.traits.direct and prepared.view_weights is not None:
         # For the record: FBP takes all rays alike, and so do its figures.

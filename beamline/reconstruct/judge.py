@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,18 +19,23 @@ from beamline.reconstruct.outcome import (
     needles_warning,
     not_begun_warning,
     odd_views_warning,
+    sample_radius_note,
     stray_mass_warning,
 )
 from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
 from recon.base.method import Reconstruction
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
+from recon.voxels.beyond_field import SAMPLE
 from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.matter_checks import StrayMass, Unexplained, lost_matter, stray_mass, stray_mass_share, unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
+_EDGES = 32  # views whose edges are looked at
 
 
 def judge(
@@ -52,6 +59,7 @@ def judge(
     if made.series is not None:  # each view shows a volume of its own time
         judged.metrics[made.method] = {"residual": made.series.residual, "seconds": made.seconds}
         return judged
+    judged.warn(sample_radius_note(made.settings, prepared))
     judged.look_at_residual()
     judged.look_for_stray_mass()
     judged.warn(needles_warning(made, prepared.geometry))
@@ -104,6 +112,18 @@ class VolumeLooks:
         """Whether the user stopped the reconstruction and waits for its end."""
         return self.made.ending.early
 
+    @cached_property
+    def shows_more(self) -> bool:
+        """Whether views show more than the volume: than a region, or than a field that does not hold all of the sample,
+        where what lies beside it was not taken off."""
+        geometry, data = self.prepared.geometry, self.prepared.projections.data
+        if self.context.region is not None and self.made.volume.grid.shape != Grid.matching(geometry).shape:
+            return True
+        if not self.direct:
+            return SAMPLE in self.made.settings and not self.prepared.inside
+        some = spread(np.arange(geometry.n_views), _EDGES)
+        return wider_than_field(data[some], geometry.select(some))
+
     @property
     def direct(self) -> bool:
         return by_name(self.made.method).traits.direct
@@ -127,10 +147,9 @@ class VolumeLooks:
         return f"Left out, as {why}: {', '.join(self.left_out)}."
 
     def measured(self, volume: Volume, seconds: float) -> dict[str, float]:
-        """Figures of merit; without residuals for a region, since the views show more than the region."""
-        grid, geometry = self.made.volume.grid, self.prepared.geometry
-        is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
-        figures = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
+        """Figures of merit; without residuals where the views show more than the volume."""
+        prepared = None if self.shows_more else self.prepared
+        figures = measure(volume, prepared, self.truth, self.context.phases.progress)
         return {**figures, "seconds": seconds}
 
     def look_at_residual(self) -> None:
@@ -140,7 +159,7 @@ class VolumeLooks:
         """
         made, prepared, seed = self.made, self.prepared, self.context.seed
         views, rng = prepared.projections.data, np.random.default_rng(seed)
-        if not self.direct:
+        if not (self.direct or self.shows_more):
             self.unexplained = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
         before = self.clock.now()
         figures = self.metrics[made.method] = self.measured(made.volume, made.seconds)
@@ -164,6 +183,8 @@ class VolumeLooks:
             self.warn(stray_mass_warning(made, self.stray))
 
     def look_for_odd_views(self) -> None:
+        if self.shows_more:
+            return
         if self.direct or self.has_time_for(_ODD_VIEWS):
             self.warn(odd_views_warning(self.made, self.prepared, self.context.selection, self.context.phases.progress))
         else:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
+from beamline.core.sinks import Note
 from beamline.core.text import count, spans
 from beamline.projections.flagged_frames import reasons, reference_images, returned_views, worst_frames
 from beamline.projections.prepared import PreparedProjections
@@ -26,6 +27,7 @@ from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.gaussians import NEEDLES_LIMIT, needles
 from recon.voxels import odd_views, view_weights
+from recon.voxels.beyond_field import SAMPLE, SampleRadius
 from recon.voxels.fbp import Filter
 from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, LostMatter, StrayMass, Unexplained
 
@@ -190,6 +192,20 @@ def lost_mass_warning(made: Reconstruction, beside_fbp: LostMatter) -> str:
     )
 
 
+def sample_radius_note(settings: Mapping[str, Any], prepared: PreparedProjections) -> str:
+    """How far the sample reaches beside the field, and what that leaves open; empty of one that ends within it."""
+    if SAMPLE not in settings:
+        return ""
+    radius, low, high, density = (settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
+    unit, field = prepared.length_unit, prepared.geometry.reach
+    known = "as was given" if low == high else f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
+    return Note(
+        f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the field "
+        f"({known}). All of it was reconstructed, and the field's part is written. The density in its middle is known "
+        f"to about {density:.1%}; wide views (scan.wide_views) make it surer."
+    )
+
+
 def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a
     volume of one density.
@@ -204,8 +220,7 @@ def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     return (
         f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the differences "
         f"along the rows of the views, where a volume of one density leaves {uniform:.3g}. The method ended in "
-        f"{made.seconds:.3g} s{steps}: give it more seconds, steps or iterations. If the sample is wider than the "
-        "field, its parts outside may be why: compare with --method fbp."
+        f"{made.seconds:.3g} s{steps}: give it more seconds, steps or iterations."
     )
 
 

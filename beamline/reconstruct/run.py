@@ -70,8 +70,21 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
         emission if alike else None,
         prepared.times if method.traits.in_time else None,
         prepared.energies if method.traits.by_energy else None,
+        prepared.sample_radius,
     )
     return data, geometry, use
+
+
+def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
+    """The views less what the sample outside the volume adds to them, in place: the volume is judged by these."""
+    if made.outside is None:
+        return prepared
+    for first in range(0, prepared.geometry.n_views, _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        prepared.projections.data[some] -= made.outside(prepared.geometry.select(some))
+    if (held := prepared.held_out) is not None:
+        held = held[0] - made.outside(held[1]), held[1]
+    return replace(prepared, held_out=held, inside=True)
 
 
 def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
@@ -98,6 +111,7 @@ def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
     )
 
 
+_AT_ONCE = 32  # views that are projected together
 _REPORT = 5.0  # s, its pictures
 _BYTES = 1e8  # of a volume, written and read back in a second
 _BUSIEST = 4.0  # largest slow-down of this by other programs

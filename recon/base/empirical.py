@@ -83,10 +83,8 @@ WILD_VIEWS = 0.1
 """Of the views, which may hold such pixels. It belongs to `WILD_PIXEL`."""
 
 EMPTY = 0.15
-"""Of a mean value: edges below are empty, as the air of a walnut with 0.07. Without: no box is wider, see `WIDER`."""
-
-WIDER = 1.2
-"""Width of a fit's box over the field, where the sample leaves it. Without: -1.2 dB on a region of interest."""
+"""Of a mean value: edges below are empty, as the air of a walnut with 0.07. Without: no box is wider than the field,
+-16 dB on grains that reach twice as far."""
 
 LIGHT_WEIGHT = 1e-4
 """Of total variation, as `FistaTv.tv_weight`, in trials of how far a sample reaches. Without, at ten times: grains that

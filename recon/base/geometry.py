@@ -252,7 +252,14 @@ class Geometry:
     def is_off_middle(self) -> bool:
         """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
         cols = self.detector_shape[1]
-        return abs(float((self.axis_col + self.offsets[:, 0]).mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
+        axis = (self.axis_col + self.offsets[:, 0])[self.ordinary]
+        return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
+
+    @property
+    def ordinary(self) -> NDArray[np.bool_]:
+        """[view] which views are no wide views: those show the sample stepped aside by more than half a field."""
+        aside = self.shifts[:, 0]
+        return np.asarray(np.abs(aside - np.median(aside)) <= self.detector_shape[1] / 2)
 
     @property
     def offsets(self) -> F64:
@@ -284,9 +291,9 @@ class Geometry:
     def reach(self) -> float:
         """mm from the rotation axis to the farthest column edge of any view, measured at the axis.
 
-        Rolled views count as straight ones. For a wide cone the value is limited to 0.7 sod.
+        Rolled views count as straight ones, wide views do not. For a wide cone the value is limited to 0.7 sod.
         """
-        cols, axis = self.detector_shape[1], self.axis_col + self.offsets[:, 0]
+        cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.ordinary]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
         return float(min(reach, _SHORT_OF_SOURCE * self.source_distance))
 

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.declared_types import check_arguments, check_settings, refusal
-from recon.base.empirical import WIDER
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 
@@ -84,26 +83,16 @@ class Grid:
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
-    def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
-        """The box that a fit covers: the whole field, in voxels of the requested size.
-
-        For a sample wider than the field (`wider`) the box is a fifth wider. Matter beyond the field is in every view.
-        Without voxels for it, a bright rim would appear inside.
+    def for_fit(cls, geometry: Geometry, wanted: Grid) -> Grid:
+        """The box that a fit covers: the whole field, or the requested one if that is wider, in voxels of its size.
 
         The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
         from which a fit can start.
         """
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
-        field = cls.of_field(geometry, edge)
-        return field.widened(WIDER, geometry) if wider else field
-
-    def widened(self, by: float, geometry: Geometry) -> Grid:
-        """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
-        nz, nx, _ = self.shape
-        most = math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6
-        across = max(nx, math.floor(min(by * nx, most)))
-        return replace(self, shape=(nz, across, across))
+        field, across = cls.of_field(geometry, edge), float(np.abs(wanted.edges[:, :2]).max())
+        return field.reaching(across, geometry) if across > field.edges[1, 0] + 2 * edge else field
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
         """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis, or

@@ -192,7 +192,7 @@ class LastRound:
             return stop()
 
         tell(self.fit.finish(max(end - plan.seconds - control.now(), 0.0), on_progress))
-        volume, gaussians, reached, sweeps = self.fit.snapshot(), self.fit.gaussians, history[-1], 0
+        volume, gaussians, reached, sweeps = self.fit.snapshot(problem.grid), self.fit.gaussians, history[-1], 0
         if plan.sweeps != 0 and gaussians is not None and not stop():
             late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
             volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)

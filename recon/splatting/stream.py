@@ -22,7 +22,7 @@ from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Progress
+from recon.base.method import Clock, DataUse, Progress, ReconProblem
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -49,7 +49,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.voxels.field_edges import wider_than_field
+from recon.voxels.beyond_field import sample_radius
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
@@ -310,11 +310,12 @@ class StreamingFit:
                     break
         return replace(self.progress(), steps=begun + steps)
 
-    def snapshot(self) -> Volume:
-        """The current volume, 1/mm; all zero before the first model."""
+    def snapshot(self, grid: Grid | None = None) -> Volume:
+        """The current volume, 1/mm, on a grid (None: that of the fit); all zero before the first model."""
+        grid = grid or self._grid
         if self._state is None:
-            return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
-        return fit.volume_of(averaged(self._state), self._grid, self._template, self._settings)
+            return Volume(np.zeros(grid.shape, np.float32), grid)
+        return fit.volume_of(averaged(self._state), grid, self._template, self._settings)
 
     def shown(self) -> BetterVolume:
         """The volume that predicts held-out views better: that of the model, or FBP of the views so far."""
@@ -372,10 +373,12 @@ class StreamingFit:
         every, data = self._template.at(self._angles), np.stack(self._data)
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
         geometry, seen = every.select(learnt), data[learnt]
-        wider = wider_than_field(data, every)
-        field = Grid.for_fit(self._template, self._grid, wider=wider)
+        wider = sample_radius(ReconProblem(data, every, self._grid, DataUse(), 0, "cpu"))
+        box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
+        field = Grid.for_fit(self._template, box)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
-        rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)
+        shape = (field.shape[0], *(math.ceil(n / coarser) for n in field.shape[1:]))
+        rough = Grid.for_fit(self._template, replace(field, shape=shape, voxel_size=coarser * field.voxel_size))
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
         if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
@@ -386,7 +389,7 @@ class StreamingFit:
             rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, learnt)))
             left = first_volume(seen - rendered * self._problem.scale, geometry, rough)
             volume = Volume(fit.volume_of(model, rough, self._template, self._settings).data + left.data, rough)
-            radius = math.inf if wider else geometry.reach
+            radius = geometry.reach if wider is None else math.inf
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, seen, geometry)
         self._problem = fit.problem_of(data, every, field, placed.density_unit, self._settings)

@@ -44,7 +44,6 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import unseen_residuals
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods import FistaTv, PnpDct
@@ -119,7 +118,7 @@ class _Views:
         )  # fmt: skip
         measured, trusted = data[used], None if weights is None else weights[used]
         p, p_weights, seen = join_pixels(measured, trusted, views, joined)
-        field = Grid.for_fit(seen, problem.grid, wider=wider_than_field(measured, views))
+        field = Grid.for_fit(seen, problem.grid)
         fitted = replace(problem, projections=measured, geometry=all_geometry.select(used), use=DataUse(trusted))
         return cls(all_geometry, data, weights, used, kept_back, joined, seen, p, p_weights, field, count, fitted)
 

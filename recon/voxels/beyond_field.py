@@ -1,4 +1,4 @@
-"""Beyond the field: how far a sample reaches that is wider than the field, and its volume in a box that holds all of it.
+"""Beyond the field: how far a sample reaches that is wider than the field, and its volume in a box that holds it all.
 
 Each view also sums the matter beside the field. A box of the field alone would push that matter into its rim, and make
 the middle too dense. So the views are explained by voxels, or Gaussians, as far as the sample reaches, and the field's
@@ -40,7 +40,7 @@ class SampleRadius:
 
     Attributes:
         radius: that predicts views held out best, or that was given, in mm.
-        low, high: mm, from which to which radius views are predicted as well, but for chance.
+        low, high: mm, from which to which radius views are predicted as well but for chance, and a step of the search.
         density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
     """
 
@@ -73,10 +73,7 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
     sample, grid = SampleRadius(*measured), problem.grid
     wide = grid.reaching(sample.radius, problem.geometry)
     result = method.run(replace(problem, grid=wide), control)
-    before = [
-        round((own - all_of_it) / grid.voxel_size)
-        for own, all_of_it in zip(grid.first[1:], wide.first[1:], strict=True)
-    ]
+    before = np.rint(np.subtract(grid.first[1:], wide.first[1:]) / grid.voxel_size).astype(int)
     y, x = (slice(first, first + n) for first, n in zip(before, grid.shape[1:], strict=True))
     whole = result.volume.data
 
@@ -101,11 +98,13 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
     leaves more unknown than the views tell. `DataUse.sample_radius` comes before.
     """
     data, geometry = problem.projections, problem.geometry
-    some = spread_views(geometry.angles, _VIEWS, np.arange(geometry.n_views))
+    own = np.flatnonzero(geometry.ordinary)
+    some = np.union1d(spread_views(geometry.angles[own], _VIEWS, own), np.flatnonzero(~geometry.ordinary))
     weights = problem.use.weights
-    views, rays = masked(data[some], None if weights is None else weights[some])
+    views, _ = masked(data[some], None if weights is None else weights[some])
     geometry = geometry.select(some)
-    if not wider_than_field(views, geometry):
+    ordinary = geometry.ordinary
+    if not wider_than_field(views[ordinary], geometry.select(np.flatnonzero(ordinary))):
         return None
     reach = geometry.reach
     if (given := problem.use.sample_radius) is not None:
@@ -130,7 +129,11 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
         least = best(_FINE ** (k / 2) for k in range(8))
     if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
         return None
-    alike = [ratio for ratio, (left, _) in tried.items() if not beyond_chance(left - tried[least][0], _ERRORS)]
+    alike = [
+        ratio
+        for ratio, (left, _) in tried.items()
+        if abs(math.log(ratio / least, _FINE)) < 1.5 or not beyond_chance(left - tried[least][0], _ERRORS)
+    ]
     densities = [tried[ratio][1] for ratio in alike]
     uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
     return SampleRadius(least * math.sqrt(_FINE) * reach, min(alike) * reach, max(alike) * reach, uncertain)

@@ -338,7 +338,10 @@ def direct(
     device: str = "cpu",
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
-    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU."""
+    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Wide views have no
+    part."""
+    if not (own := geometry.ordinary).all():
+        projections, geometry = projections[own], geometry.select(np.flatnonzero(own))
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
         return posed_direct(projections, geometry, grid, filter, on_block, device)
     if geometry.is_cone:

@@ -41,6 +41,7 @@ TERMS = tuple((i, j, k) for k in range(SLOW) for i, j in powers(ORDER))
 
 _MEAN = len(powers(ORDER))
 _VOXELS, _VIEWS = 2**15, 120  # at most; surfaces of the second order need no more
+_WIDER = 1.2  # than the field, where the sample is
 _ONE_IN = 6  # views held out
 _STEPS, _LEAST = 25, 0.04  # of conjugate gradients; share of a combination that no volume holds
 _CLIPPED, _ROBUST = 4.0, 4  # standard deviations, rounds
@@ -128,7 +129,7 @@ def background_memory(geometry: Geometry) -> int:
     factor = factor_within(geometry.detector_shape, _VOXELS)
     small = geometry.select(slice(min(geometry.n_views, _VIEWS))).binned(factor)
     rays = small.n_views * math.prod(small.detector_shape)
-    voxels = math.prod(Grid.for_fit(small, Grid.matching(small), wider=True).shape)
+    voxels = math.prod(Grid.matching(small).reaching(_WIDER * small.reach, small).shape)
     pixels = math.prod(geometry.detector_shape)
     return 4 * ((9 * len(TERMS) + 16) * rays + 12 * voxels + 6 * pixels)
 
@@ -170,7 +171,7 @@ class _Views:
             weight = np.broadcast_to(whole, data.shape).astype(np.float32)
         grid = Grid.matching(views)
         if wider_than_field(data, views):
-            grid = Grid.for_fit(views, grid, wider=True)
+            grid = grid.reaching(_WIDER * views.reach, views)
         terms = np.array([[_surface(one, time, shape, factor) for time in times[some]] for one in np.eye(len(TERMS))])
         # A background is smooth: thresholds on what views held out gain were found without sharpening.
         return cls(data, terms, weight, Projector(views, grid).plain, times[some])

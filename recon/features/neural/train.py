@@ -25,7 +25,6 @@ from recon.base.work import CLOCK, Costs, Work
 from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import first_volume
 from recon.voxels.direct import direct_work
-from recon.voxels.field_edges import wider_than_field
 from recon.voxels.voxel_problem import density_unit, iterative_memory
 
 CHUNK = 2**15  # Samples that one pass through the network takes
@@ -158,7 +157,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
-    grid = Grid.for_fit(geometry, problem.grid, wider=wider_than_field(data[used], seen))
+    grid = Grid.for_fit(geometry, problem.grid)
     unit = density_unit(first_volume(data[used], seen, grid).data)
     if unit <= 0 or not (data[used] > 0).any():
         raise ValueError("the views show no absorbing matter. A field needs views of a sample")
