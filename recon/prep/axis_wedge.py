@@ -32,7 +32,8 @@ class AxisEstimate:
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
-        method: "pair", "opposite views", "double wedge", "centre of mass" or "views held out".
+        method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn" or
+            "views held out".
     """
 
     value: float
@@ -218,9 +219,14 @@ def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
 
 
 def _power(part: Floats) -> int:
-    """Exponent of the frequency that weighs residuals: 2 if the rim is not air (bad low frequencies), otherwise 1."""
+    """Exponent of the frequency that weighs residuals: 2 if the field cuts matter off (bad low ones), otherwise 1."""
+    return 2 if is_cut_off(part) else 1
+
+
+def is_cut_off(part: NDArray[np.floating]) -> bool:
+    """Whether the first or last columns of line integrals [view, row, col] are not air."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
-    return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+    return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
 
 
 def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
