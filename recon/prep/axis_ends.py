@@ -6,18 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from recon.base.views import spread
 from recon.prep.axis_wedge import AxisEstimate, Floats, Search, few_rows, lowest, optimum, within
 
 ENDS = "ends of half a turn"
 _SIDE = 4  # views on each side of the join: they show how fast each structure moves
 _NOISE = 0.01  # of the power, in the views' covariance: what the field cuts off is not in it
 _FINER = 8  # candidates a column
-_BLOCKS, _JOINS = 8, 8  # blocks of views, and joins within each, at most
+_BLOCKS = 8  # of views, at most
 _MOST_COLS = 1024  # enough for 0.1 px
-_SURE = 0.3  # columns by which the median of these joins may be off
-
-_Spectra = NDArray[np.complex128]
+_SURE = 0.3  # columns by which the median of the joins within the scan may be off
+_CLEAR, _NEAR = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
 
 
 def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
@@ -26,10 +24,8 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
     The last views mirrored about the axis are those before the first one. The 4 views on each side of this join count
     as samples of a random process, whose covariance over the angle all views tell, for each frequency. The curve is
     the likelihood of each candidate: a generalised cross-correlation (Knapp & Carter 1976, IEEE Trans. ASSP 24, 320) of
-    several views, in which smooth matter counts little, and detail only as far as it stays alike from view to view.
-
-    Neighbouring views within the scan join where they are. How far off such joins are found, by the covariance of the
-    other views, tells how far off the axis may be.
+    several views. Views within the scan join where they are; how far off that is found, by the covariance of the other
+    views, tells how far off the axis may be.
 
     Args:
         projections: float32 [view, row, col], line integrals; a few rows are enough.
@@ -37,9 +33,8 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
         search: (lowest, highest) column; None: the middle half.
 
     Returns:
-        The curve is 0 where the ends fit as the median join within the scan does. The estimate is confident if the
-        median of these joins is right to 0.3 columns: packed grains of 1.5 to 3 times the field's width are then found
-        to 0.3 columns in 9 of 10 scans.
+        The curve is 0 where the ends fit as the median join within the scan does. Confident if the median of these is
+        right to 0.3 columns: 9 in 10 axes of packed grains in 1.5 to 3 times the field then were.
 
     Raises:
         ValueError: the views are not half a turn in even steps, or too few.
@@ -50,14 +45,20 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
     bin_ = -(-data.shape[2] // _MOST_COLS)
     cols = data.shape[2] // bin_
     data = data[..., : cols * bin_].reshape(*data.shape[:2], cols, bin_).mean(axis=3)
-    middle = (cols - 1) / 2
-    for blocks in (0, 0, _BLOCKS):  # windows, each about the axis that the last one showed
-        total = round(2 * min(max(middle, cols / 4), 3 * cols / 4 - 1))
-        offsets, curve, errors = _join(data[..., max(0, total - cols + 1) : min(total, cols - 1) + 1], times, blocks)
-        middle = total / 2 + lowest(offsets, curve)[0]
-    candidates = (total / 2 + offsets) * bin_ + (bin_ - 1) / 2
+    curve, error = np.full(_FINER * cols, np.inf), 0.0
+    totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}  # windows; those about the axes that they show:
+    for total in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in totals}:
+        candidates, values, errors = _join(data, total, times)
+        at = np.round(_FINER * candidates).astype(int)
+        if values.min() < curve.min():
+            error = float(np.median(errors)) * bin_
+        curve[at] = np.minimum(curve[at], values)
+    candidates, curve = np.flatnonzero(np.isfinite(curve)) / _FINER, curve[np.isfinite(curve)]
+    far = np.abs(candidates - candidates[curve.argmin()]) > cols / _NEAR
+    clear = curve[far].min() - curve.min() > _CLEAR
+    candidates = candidates * bin_ + (bin_ - 1) / 2
     value, _ = optimum(candidates, curve, search)
-    return AxisEstimate(value, *within(search, candidates, curve), bool(np.median(errors) * bin_ < _SURE), ENDS)
+    return AxisEstimate(value, *within(search, candidates, curve), bool(clear) and error < _SURE, ENDS)
 
 
 def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
@@ -66,61 +67,62 @@ def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
     turned = theta[order] - theta[order[0]]
     step = float(np.median(np.diff(turned)))
     order, turned = order[turned < np.pi + step / 2], turned[turned < np.pi + step / 2]
-    if order.size < 4 * _SIDE or step <= 0 or max(np.diff(turned).max(), np.pi - turned[-1]) > 2 * step:
+    if order.size < 4 * _SIDE or max(np.diff(turned).max(), np.pi - turned[-1]) > 2 * step:
         raise ValueError(f"the views are not half a turn in {4 * _SIDE} even steps or more")
     return order, np.concatenate((turned[-_SIDE:] - np.pi, turned[:_SIDE])) / step
 
 
-def _join(window: Floats, times: Floats, blocks: int) -> tuple[Floats, Floats, Floats]:
-    """Columns [candidate] from the window's middle to the axis, their mismatch, and errors [join] within the scan.
+def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floats]:
+    """Columns [candidate], their mismatch as axes, and errors [join] in columns of joins within the scan.
 
     Args:
-        window: [view, row, col]; `times` are those of its last and its first views.
-        blocks: of views, whose joins set the scale of the mismatch; 0: none.
+        data: [view, row, col]; `times` are those of its last and its first views.
+        total: twice the column about which the window lies.
     """
-    n, _, cols = window.shape
+    n, _, cols = data.shape
+    total = min(max(total, cols // 2), 3 * cols // 2)
+    window = data[..., max(0, total - cols + 1) : min(total, cols - 1) + 1]
+    cols = window.shape[2]
     mean, taper = window.mean(axis=0), np.hanning(cols + 2)[1:-1]
     seen = window - (mean + mean[:, ::-1]) / 2  # both ends share what is even, so that no seam is made
     seen = (seen - np.average(seen, axis=2, weights=taper)[..., None]) * taper
     length = fft.next_fast_len(2 * cols, real=True)
     spectra, late = (fft.rfft(each, length, axis=2)[..., 1:] for each in (seen, seen[-_SIDE:, :, ::-1]))
     steps = np.arange(-cols * _FINER // 4, cols * _FINER // 4 + 1)
-    offsets = steps / _FINER
-    overlap = np.correlate(taper, taper, "full")[cols - 1 :]
-    fall = np.sqrt(np.interp(2 * np.abs(offsets), np.arange(cols), overlap / overlap[0]))
 
-    def likelihood(late: _Spectra, early: _Spectra, weights: Floats) -> Floats:
+    def likelihood(late: NDArray[np.complex128], early: NDArray[np.complex128], weights: Floats) -> Floats:
         product = np.zeros(length * _FINER // 4 + 1, np.complex128)
         product[1 : spectra.shape[2] + 1] = np.einsum("irk,kij,jrk->k", late.conj(), weights, early)
-        return fft.irfft(product, 2 * (product.size - 1))[steps] / fall
+        return fft.irfft(product, 2 * (product.size - 1))[steps]
 
-    joins = list[Floats]()
-    for block in np.array_split(np.arange(n), min(blocks, n // (2 * _SIDE))) if blocks else ():
-        others = np.delete(np.arange(n), block)
-        weights, part = _weights(spectra, others, np.arange(2.0 * _SIDE)), spectra[block] - spectra[others].mean(axis=0)
-        first = spread(np.arange(_SIDE, block.size - _SIDE + 1), _JOINS)
-        joins += [likelihood(part[j - _SIDE : j], part[j : j + _SIDE], weights) for j in first]
-    curve = likelihood(late, spectra[:_SIDE], _weights(spectra, np.arange(n), times))
-    typical = float(np.median([each.max() for each in joins])) if joins else 1.0
-    return offsets, 1 - curve / typical, np.array([abs(lowest(offsets, -each)[0]) for each in joins])
-
-
-def _weights(spectra: _Spectra, used: NDArray[np.int64], times: Floats) -> Floats:
-    """[frequency, late, early] of products of views at these `times` (steps), by the covariance of the views `used`."""
-    n, lags, kept = len(spectra), np.arange(2 * _SIDE + 2), np.zeros(len(spectra), np.bool_)
-    centred, kept[used] = np.zeros_like(spectra), True
-    centred[used] = spectra[used] - spectra[used].mean(axis=0)
-    power = np.stack(
-        [
-            np.einsum("vrk,vrk->k", centred[: n - lag].conj(), centred[lag:]).real
-            / (kept[: n - lag] & kept[lag:]).sum()
-            for lag in lags
+    joins, products = list[Floats](), _products(spectra)
+    for block in np.array_split(np.arange(n), min(_BLOCKS, n // (2 * _SIDE))):
+        others = np.isin(np.arange(n), block, invert=True)
+        weights, part = (
+            _weights(products, others, np.arange(2.0 * _SIDE)),
+            spectra[block] - spectra[others].mean(axis=0),
+        )
+        parts = [
+            np.split(part[j : j + 2 * _SIDE], 2) for j in range(0, block.size - 2 * _SIDE + 1, 1 + block.size // 20)
         ]
-    )
+        joins += [likelihood(*pair, weights) for pair in parts]
+    offsets, typical = steps / _FINER, float(np.median([each.max() for each in joins]))
+    curve = 1 - likelihood(late, spectra[:_SIDE], _weights(products, np.ones(n, np.bool_), times)) / typical
+    return total / 2 + offsets, curve, np.array([abs(lowest(offsets, -each)[0]) for each in joins])
+
+
+def _products(spectra: NDArray[np.complex128]) -> list[Floats]:
+    """[lag] of [view, frequency]: products with the view so many steps later."""
+    x = spectra - spectra.mean(axis=0)
+    return [np.einsum("vrk,vrk->vk", x[: len(x) - lag].conj(), x[lag:]).real for lag in range(2 * _SIDE + 2)]
+
+
+def _weights(products: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
+    """[frequency, late, early] of products of views at these `times` (steps), by the covariance of the views `used`."""
+    power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in products])
     apart = np.abs(times[:, None] - times)
-    below = np.minimum(apart.astype(int), lags[-2])
+    below = np.minimum(apart.astype(int), len(products) - 2)
     share = (apart - below)[..., None]
-    covariance = np.moveaxis((1 - share) * power[below] + share * power[below + 1], 2, 0)
-    size, axes = np.linalg.eigh(covariance)
+    size, axes = np.linalg.eigh(np.moveaxis((1 - share) * power[below] + share * power[below + 1], 2, 0))
     inverse = np.einsum("kij,kj,klj->kil", axes, 1 / (np.maximum(size, 0) + _NOISE * power[0][:, None]), axes)
     return -inverse[:, :_SIDE, _SIDE:]
