@@ -244,7 +244,7 @@ def _unclear(estimate: AxisEstimate, binning: int) -> str:
         if len(columns) < _SIDE_BY_SIDE and min(abs(estimate.candidates[low] - each) for each in columns) > AGREE:
             columns.append(float(estimate.candidates[low]))
     first, *others = (f"{unbinned(column, binning):.2f}" for column in columns)
-    after = f"; after it {' and '.join(others)} agree best" if others else ""
+    after = f"; after it {' and '.join(others)} {'agree' if others[1:] else 'agrees'} best" if others else ""
     return (
         f"The rotation axis found, column {first}, is not a clear optimum{after}. Check the slices for doubled edges "
         "(`beamline sweep FILE axis=A:B:STEP` compares columns), or give --axis COLUMN."

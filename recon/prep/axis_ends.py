@@ -10,6 +10,7 @@ from recon.prep.axis_wedge import AxisEstimate, Floats, Search, few_rows, lowest
 
 ENDS = "ends of half a turn"
 _SIDE = 4  # views on each side of the join: they show how fast each structure moves
+_FEWEST = 8 * _SIDE  # views that tell their covariance without those of a join
 _NOISE = 0.01  # of the power, in the views' covariance: what the field cuts off is not in it
 _FINER = 8  # candidates a column
 _BLOCKS = 8  # of views, at most
@@ -67,8 +68,8 @@ def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
     turned = theta[order] - theta[order[0]]
     step = float(np.median(np.diff(turned)))
     order, turned = order[turned < np.pi + step / 2], turned[turned < np.pi + step / 2]
-    if order.size < 4 * _SIDE or max(np.diff(turned).max(), np.pi - turned[-1]) > 2 * step:
-        raise ValueError(f"the views are not half a turn in {4 * _SIDE} even steps or more")
+    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2 * step:
+        raise ValueError(f"the views are not half a turn in {_FEWEST} even steps or more")
     return order, np.concatenate((turned[-_SIDE:] - np.pi, turned[:_SIDE])) / step
 
 
@@ -102,10 +103,8 @@ def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floa
             _weights(products, others, np.arange(2.0 * _SIDE)),
             spectra[block] - spectra[others].mean(axis=0),
         )
-        parts = [
-            np.split(part[j : j + 2 * _SIDE], 2) for j in range(0, block.size - 2 * _SIDE + 1, 1 + block.size // 20)
-        ]
-        joins += [likelihood(*pair, weights) for pair in parts]
+        for j in range(_SIDE, block.size - _SIDE + 1, 1 + block.size // 20):
+            joins.append(likelihood(part[j - _SIDE : j], part[j : j + _SIDE], weights))
     offsets, typical = steps / _FINER, float(np.median([each.max() for each in joins]))
     curve = 1 - likelihood(late, spectra[:_SIDE], _weights(products, np.ones(n, np.bool_), times)) / typical
     return total / 2 + offsets, curve, np.array([abs(lowest(offsets, -each)[0]) for each in joins])
