@@ -12,9 +12,7 @@ ENDS = "ends of half a turn"
 _SIDE = 4  # views on each side of the join: they show how fast each structure moves
 _FEWEST = 8 * _SIDE  # views that tell their covariance without those of a join
 _NOISE = 0.01  # of the power, in the views' covariance: what the field cuts off is not in it
-_FINER = 8  # candidates a column
-_BLOCKS = 8  # of views, at most
-_MOST_COLS = 1024  # enough for 0.1 px
+_FINER, _BLOCKS = 8, 8  # candidates a column; blocks of views, at most
 _SURE = 0.3  # columns by which the median of the joins within the scan may be off
 _CLEAR, _NEAR = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
 
@@ -43,23 +41,19 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
     """
     order, times = _half_turn(np.asarray(angles, np.float64))
     data = few_rows(projections[order])
-    bin_ = -(-data.shape[2] // _MOST_COLS)
-    cols = data.shape[2] // bin_
-    data = data[..., : cols * bin_].reshape(*data.shape[:2], cols, bin_).mean(axis=3)
+    cols = data.shape[2]
     curve, error = np.full(_FINER * cols, np.inf), 0.0
     totals = {round(2 * share * cols) for share in (0.4, 0.5, 0.6)}  # windows; those about the axes that they show:
     for total in {round(2 * lowest(*_join(data, each, times)[:2])[0]) for each in totals}:
         candidates, values, errors = _join(data, total, times)
         at = np.round(_FINER * candidates).astype(int)
-        if values.min() < curve.min():
-            error = float(np.median(errors)) * bin_
+        error = float(np.median(errors)) if values.min() < curve.min() else error
         curve[at] = np.minimum(curve[at], values)
     candidates, curve = np.flatnonzero(np.isfinite(curve)) / _FINER, curve[np.isfinite(curve)]
-    far = np.abs(candidates - candidates[curve.argmin()]) > cols / _NEAR
-    clear = curve[far].min() - curve.min() > _CLEAR
-    candidates = candidates * bin_ + (bin_ - 1) / 2
     value, _ = optimum(candidates, curve, search)
-    return AxisEstimate(value, *within(search, candidates, curve), bool(clear) and error < _SURE, ENDS)
+    rivals = curve[np.abs(candidates - candidates[curve.argmin()]) > cols / _NEAR]
+    confident = bool(error < _SURE and rivals.min() - curve.min() > _CLEAR)
+    return AxisEstimate(value, *within(search, candidates, curve), confident, ENDS)
 
 
 def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
@@ -89,38 +83,35 @@ def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floa
     seen = (seen - np.average(seen, axis=2, weights=taper)[..., None]) * taper
     length = fft.next_fast_len(2 * cols, real=True)
     spectra, late = (fft.rfft(each, length, axis=2)[..., 1:] for each in (seen, seen[-_SIDE:, :, ::-1]))
-    steps = np.arange(-cols * _FINER // 4, cols * _FINER // 4 + 1)
+    offsets = np.arange(-cols * _FINER // 4, cols * _FINER // 4 + 1)
 
     def likelihood(late: NDArray[np.complex128], early: NDArray[np.complex128], weights: Floats) -> Floats:
         product = np.zeros(length * _FINER // 4 + 1, np.complex128)
         product[1 : spectra.shape[2] + 1] = np.einsum("irk,kij,jrk->k", late.conj(), weights, early)
-        return fft.irfft(product, 2 * (product.size - 1))[steps]
+        return fft.irfft(product, 2 * (product.size - 1))[offsets]
 
-    joins, products = list[Floats](), _products(spectra)
+    centred = spectra - spectra.mean(axis=0)
+    pairs = [(centred[: n - lag].conj() * centred[lag:]).real.sum(axis=1) for lag in range(2 * _SIDE + 2)]
+    joins = list[Floats]()
     for block in np.array_split(np.arange(n), min(_BLOCKS, n // (2 * _SIDE))):
-        others = np.isin(np.arange(n), block, invert=True)
-        weights, part = (
-            _weights(products, others, np.arange(2.0 * _SIDE)),
-            spectra[block] - spectra[others].mean(axis=0),
-        )
+        used = np.isin(np.arange(n), block, invert=True)
+        weights, part = _weights(pairs, used, np.arange(2.0 * _SIDE)), spectra[block] - spectra[used].mean(axis=0)
         for j in range(_SIDE, block.size - _SIDE + 1, 1 + block.size // 20):
             joins.append(likelihood(part[j - _SIDE : j], part[j : j + _SIDE], weights))
-    offsets, typical = steps / _FINER, float(np.median([each.max() for each in joins]))
-    curve = 1 - likelihood(late, spectra[:_SIDE], _weights(products, np.ones(n, np.bool_), times)) / typical
-    return total / 2 + offsets, curve, np.array([abs(lowest(offsets, -each)[0]) for each in joins])
+    curve = likelihood(late, spectra[:_SIDE], _weights(pairs, np.ones(n, np.bool_), times))
+    errors = np.array([abs(lowest(offsets / _FINER, -each)[0]) for each in joins])
+    return total / 2 + offsets / _FINER, 1 - curve / np.median([each.max() for each in joins]), errors
 
 
-def _products(spectra: NDArray[np.complex128]) -> list[Floats]:
-    """[lag] of [view, frequency]: products with the view so many steps later."""
-    x = spectra - spectra.mean(axis=0)
-    return [np.einsum("vrk,vrk->vk", x[: len(x) - lag].conj(), x[lag:]).real for lag in range(2 * _SIDE + 2)]
+def _weights(pairs: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
+    """[frequency, late, early] of products of views at these `times` (steps), by the covariance of the views `used`.
 
-
-def _weights(products: list[Floats], used: NDArray[np.bool_], times: Floats) -> Floats:
-    """[frequency, late, early] of products of views at these `times` (steps), by the covariance of the views `used`."""
-    power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in products])
+    Args:
+        pairs: [lag] of [view, frequency], products of a view with the one so many steps later.
+    """
+    power = np.stack([each[used[: len(each)] & used[used.size - len(each) :]].mean(axis=0) for each in pairs])
     apart = np.abs(times[:, None] - times)
-    below = np.minimum(apart.astype(int), len(products) - 2)
+    below = np.minimum(apart.astype(int), len(pairs) - 2)
     share = (apart - below)[..., None]
     size, axes = np.linalg.eigh(np.moveaxis((1 - share) * power[below] + share * power[below + 1], 2, 0))
     inverse = np.einsum("kij,kj,klj->kil", axes, 1 / (np.maximum(size, 0) + _NOISE * power[0][:, None]), axes)

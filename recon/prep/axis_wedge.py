@@ -32,8 +32,7 @@ class AxisEstimate:
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
-        method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn" or
-            "views held out".
+        method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn", "views held out".
     """
 
     value: float
@@ -198,7 +197,7 @@ def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     omega, fits = _wedge_residuals(part, theta)
     candidates = np.arange(0, part.shape[2] - 1 + _STEP / 2, _STEP)
     phase = 2 * np.outer(candidates, omega)
-    fits = fits * omega ** _power(part)
+    fits = fits * omega ** (2 if is_cut_off(part) else 1)
     curves = fits[0].sum(axis=1)[:, None] + fits[1] @ np.cos(phase).T + fits[2] @ np.sin(phase).T
     return candidates * bin_ + (bin_ - 1) / 2, curves / np.maximum(fits[0].sum(axis=1), 1e-30)[:, None]
 
@@ -216,11 +215,6 @@ def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
     cols = data.shape[2] // bin_
     part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
     return part, theta[views], bin_
-
-
-def _power(part: Floats) -> int:
-    """Exponent of the frequency that weighs residuals: 2 if the field cuts matter off (bad low ones), otherwise 1."""
-    return 2 if is_cut_off(part) else 1
 
 
 def is_cut_off(part: NDArray[np.floating]) -> bool:
@@ -242,7 +236,9 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimat
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    power = _power(part)  # one harmonic more and one less must give the same axis
+    power = (
+        2 if is_cut_off(part) else 1
+    )  # worse low frequencies; one harmonic more and one less must give the same axis
     curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
     value, depth = optimum(full, curve, search)
