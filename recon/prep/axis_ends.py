@@ -62,7 +62,7 @@ def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
     turned = theta[order] - theta[order[0]]
     step = float(np.median(np.diff(turned)))
     order, turned = order[turned < np.pi + step / 2], turned[turned < np.pi + step / 2]
-    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2 * step:
+    if order.size < _FEWEST or max(np.diff(turned).max(), np.pi - turned[-1]) > 2.5 * step:  # some of many: uneven
         raise ValueError(f"the views are not half a turn in {_FEWEST} even steps or more")
     return order, np.concatenate((turned[-_SIDE:] - np.pi, turned[:_SIDE])) / step
 
