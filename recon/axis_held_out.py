@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -44,8 +43,8 @@ def axis_by_views(
     """The axis column for which a volume of two thirds of the views predicts the other views best.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
-    best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,
-    a sample wider than the field is searched again, in a box of twice the field's width.
+    best candidate. A parabola through three candidates on finer pixels ends it. The box of a sample wider than its
+    field is twice as wide; half a turn of such a sample in parallel beam is better left to `find_axis`.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
@@ -67,21 +66,7 @@ def axis_by_views(
         raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {_LEAST_VIEWS} are needed")
     warn_of_other_quantity(projections)
     views = _Views(projections if lit is None else np.where(lit, projections, 0).astype(np.float32), geometry, lit)
-    if not wider_than_field(views.data, geometry):
-        return _search(views, progress, 1.0, near)
-    tried = 0
-
-    def counted(n: int) -> None:
-        nonlocal tried
-        tried = n
-        progress(n)
-
-    with suppress(AxisError):
-        estimate = _search(views, counted, 1.0, near)
-        if estimate.confident:
-            return estimate
-    before = tried
-    return _search(views, lambda n: progress(before + n), _WIDER, near)
+    return _search(views, progress, _WIDER if wider_than_field(views.data, geometry) else 1.0, near)
 
 
 @dataclass(frozen=True, eq=False)

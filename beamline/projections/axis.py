@@ -21,6 +21,8 @@ from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.base.views import spread, spread_views
 from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, closest_pair, find_axis
+from recon.prep.axis_ends import ENDS
+from recon.prep.axis_wedge import AGREE
 from recon.prep.correct import Projections
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
@@ -28,6 +30,7 @@ _AXIS_ROWS = 64
 _PAIR_AGREES = 0.75  # columns from one pair of opposite views to an axis that is given
 _PAIR_MISSES = 2.0  # columns by which such a pair may miss half a turn, at the edge of the field
 _CANDIDATES = 14  # of the axis of a cone, usually
+_SIDE_BY_SIDE = 3  # columns that a message names where the axis is uncertain
 
 
 def rotation_axis(
@@ -121,7 +124,7 @@ def _axis_by_views(
     axis_col = unbinned(estimate.value, binning)
     if stated is None:
         if not estimate.confident:
-            warn(_unclear(axis_col))
+            warn(_unclear(estimate, binning))
         return axis_col, estimate
     if not estimate.confident:
         warn(
@@ -166,7 +169,8 @@ def locate_axis(
     """Find the rotation axis, in columns of the full detector, from a band of rows of views spread over `frames`.
 
     An estimate without a clear optimum gives way to what the file states. If it states nothing and the views are
-    `all_there`, the estimate gives way to views held out; those of a part of the turn would mislead.
+    `all_there`, the estimate gives way to views held out; those of a part of the turn would mislead, and those of half
+    a turn of a sample wider than the field.
 
     Raises:
         DataError: no axis in the search range explains the views.
@@ -179,13 +183,13 @@ def locate_axis(
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:
         raise _not_found(source, error) from error
-    if all_there and not estimate.confident and source.axis_col is None:
+    if all_there and not estimate.confident and source.axis_col is None and estimate.method != ENDS:
         estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
     axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
         return axis_col, estimate
     if source.axis_col is None:
-        warn(_unclear(axis_col))
+        warn(_unclear(estimate, correction.binning))
         return axis_col, estimate
     warn(
         f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
@@ -233,8 +237,15 @@ def _not_found(source: ScanSource, error: Exception) -> DataError:
     )
 
 
-def _unclear(axis_col: float) -> str:
+def _unclear(estimate: AxisEstimate, binning: int) -> str:
+    curve, columns = estimate.curve, [estimate.value]
+    lows = 1 + np.flatnonzero((curve[1:-1] <= curve[:-2]) & (curve[1:-1] < curve[2:]))
+    for low in lows[np.argsort(curve[lows])]:  # the best first; one of those that are nearly the same
+        if len(columns) < _SIDE_BY_SIDE and min(abs(estimate.candidates[low] - each) for each in columns) > AGREE:
+            columns.append(float(estimate.candidates[low]))
+    first, *others = (f"{unbinned(column, binning):.2f}" for column in columns)
+    after = f"; after it {' and '.join(others)} {'agree' if others[1:] else 'agrees'} best" if others else ""
     return (
-        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum. Check the slices for doubled edges, "
-        "or give --axis COLUMN."
+        f"The rotation axis found, column {first}, is not a clear optimum{after}. Check the slices for doubled edges "
+        "(`beamline sweep FILE axis=A:B:STEP` compares columns), or give --axis COLUMN."
     )

@@ -113,10 +113,15 @@ class FollowedViews:
 
 
 _FIRST_VIEWS = 12  # fewer views do not determine an axis
+_UNKNOWN = (
+    "These views do not show the rotation axis yet: that of a sample wider than the field is known after half a turn. "
+    "Until then slices are about the middle of the detector, and no volume begins. --axis COLUMN gives the axis now; "
+    "optics.axis_col in the configuration states it in the files of later scans."
+)
 
 
 class AxisSearch:
-    """Repeats the search for the rotation axis each time the views have grown by half, and once at the end.
+    """Repeats the search for the rotation axis each time the views have grown by half, at half a turn, and at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.
@@ -129,7 +134,7 @@ class AxisSearch:
         self.col = source.axis_col if selection.axis_col is None else selection.axis_col
         self.estimate: AxisEstimate | None = None
         self.settled = self.col is not None
-        self._next = _FIRST_VIEWS
+        self._next, self._turned = _FIRST_VIEWS, 0.0
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
         """Search the axis in these views (rows of the file), if it is time. While the scan runs, only a clear optimum
@@ -141,19 +146,22 @@ class AxisSearch:
         if cone_of(self._source, self._selection) is not None:
             self.col, self.settled = stated_axis(self._source), True
             return
-        if views.size < self._next and not ended:
+        before, self._turned = self._turned, float(np.ptp(self._source.angles[views])) * (1 + 1.5 / views.size)
+        half = before < np.pi <= self._turned and views.size > _FIRST_VIEWS
+        if views.size < self._next and not half and not ended:
             return
         self._next, self.settled = views.size + views.size // 2, ended
         last_chance = ended and self.col is None
         try:
             warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
             axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
-        except DataError:
+            if estimate.confident or last_chance:
+                self.col, self.estimate = axis_col, estimate
+        except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise
-            return  # the views do not cover enough angles yet
-        if estimate.confident or last_chance:
-            self.col, self.estimate = axis_col, estimate
+        if self.col is None and self._turned > np.pi / 2:
+            self._warn(_UNKNOWN)
 
 
 GROWTH = 1.25  # growth of the views between predictions

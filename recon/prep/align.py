@@ -1,8 +1,9 @@
 """find_axis: the rotation axis from the data, with the curve of each estimate and whether it is reliable.
 
-Four methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle.
-Opposite views need a full turn. The double wedge needs views over about half a turn. The centre of mass takes any
-sector, but needs the whole sample in the field and air at zero.
+Five methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle.
+Opposite views need a full turn. The double wedge needs views over about half a turn, and the sample in the field. The
+ends of half a turn take a wider sample, but need small steps. The centre of mass takes any sector, but needs the whole
+sample in the field and air at zero.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from scipy.ndimage import uniform_filter1d
 
 from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
-from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
+from recon.prep.axis_ends import axis_from_ends
+from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, Search, few_rows, is_cut_off, lowest, optimum, within
 from recon.prep.axis_wedge import AxisError as AxisError
 from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
@@ -223,8 +225,8 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
-    If all views together give no axis, and they cover the full turn, pairs of opposite views do. The axis of a wide
-    field stands near an edge of the detector.
+    If all views together give no axis, and they cover the full turn, pairs of opposite views do: the axis of a wide
+    field stands near an edge of the detector. Of half a turn of a sample wider than the field, its two ends do.
 
     Args:
         projections: float32 [view, row, col], line integrals.
@@ -232,8 +234,8 @@ def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) 
         search: (lowest, highest) column; None: the whole detector.
 
     Returns:
-        The estimate from all views, or from opposite views or the pair if only these are confident. It is not
-        confident if they disagree.
+        The estimate from all views, or from opposite views, the ends or the pair if only these are confident. It is
+        not confident if they disagree.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -250,13 +252,12 @@ def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) 
     try:
         from_all = axis_from_sinogram(projections, theta, search)
     except AxisError:
-        if (from_opposites := _confident_opposites(projections, theta, search)) is not None:
-            return from_opposites
+        if (from_some := _from_some(projections, theta, search)) is not None:
+            return from_some
         raise
     if not from_all.confident:
-        if (from_opposites := _confident_opposites(projections, theta, search)) is not None:
-            return from_opposites
-        if _has_opposites(theta, projections.shape[2]):
+        from_all = _from_some(projections, theta, search) or from_all
+        if from_all.confident or _has_opposites(theta, projections.shape[2]):
             return from_all  # one pair tells less than all of them, which do not agree
     pair = closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
@@ -277,8 +278,11 @@ def _has_opposites(theta: Floats, cols: int) -> bool:
     return _opposite_pairs(theta, cols)[0].size >= _FEWEST_PAIRS
 
 
-def _confident_opposites(projections: NDArray[np.floating], theta: Floats, search: Search) -> AxisEstimate | None:
+def _from_some(projections: NDArray[np.floating], theta: Floats, search: Search) -> AxisEstimate | None:
+    """The axis by opposite views if they show it clearly; by the ends of half a turn if the field cuts the sample."""
     with suppress(ValueError):  # an AxisError is a ValueError, too
+        if not _has_opposites(theta, projections.shape[2]):
+            return axis_from_ends(projections, theta, search) if is_cut_off(projections) else None
         estimate = axis_from_opposites(projections, theta, search)
         return estimate if estimate.confident else None
     return None

@@ -32,7 +32,7 @@ class AxisEstimate:
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
-        method: "pair", "opposite views", "double wedge", "centre of mass" or "views held out".
+        method: "pair", "opposite views", "double wedge", "centre of mass", "ends of half a turn", "views held out".
     """
 
     value: float
@@ -197,7 +197,7 @@ def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     omega, fits = _wedge_residuals(part, theta)
     candidates = np.arange(0, part.shape[2] - 1 + _STEP / 2, _STEP)
     phase = 2 * np.outer(candidates, omega)
-    fits = fits * omega ** _power(part)
+    fits = fits * omega ** (2 if is_cut_off(part) else 1)
     curves = fits[0].sum(axis=1)[:, None] + fits[1] @ np.cos(phase).T + fits[2] @ np.sin(phase).T
     return candidates * bin_ + (bin_ - 1) / 2, curves / np.maximum(fits[0].sum(axis=1), 1e-30)[:, None]
 
@@ -217,10 +217,10 @@ def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
     return part, theta[views], bin_
 
 
-def _power(part: Floats) -> int:
-    """Exponent of the frequency that weighs residuals: 2 if the rim is not air (bad low frequencies), otherwise 1."""
+def is_cut_off(part: NDArray[np.floating]) -> bool:
+    """Whether the first or last columns of line integrals [view, row, col] are not air."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
-    return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+    return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
 
 
 def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
@@ -236,7 +236,9 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimat
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    power = _power(part)  # one harmonic more and one less must give the same axis
+    power = (
+        2 if is_cut_off(part) else 1
+    )  # worse low frequencies; one harmonic more and one less must give the same axis
     curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
     value, depth = optimum(full, curve, search)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,30 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
     assert history["n_views"][-1] == 30
     assert np.all(np.diff(history["seconds"]) > 0)  # one time, though the second fit began later
     assert metrics["residual"] < 0.1
+
+
+def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_told_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A full turn, that other looks would reach at 90 and 135 views; the half turn is there at 100."""
+    looks, told = list[int](), list[str]()
+    warn: Any = told.append
+    correction: Any = None
+    source: Any = SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8)), axis_col=None, cone=None)
+
+    def locate(source: Any, correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
+        looks.append(frames.size)
+        sure = source.angles[frames[-1]] > np.radians(175)
+        return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
+
+    monkeypatch.setattr(followed_views, "locate_axis", locate)
+    monkeypatch.setattr(followed_views, "cone_of", lambda source, selection: None)
+    search = followed_views.AxisSearch(source, Selection(), warn)
+    for n in range(1, 101):
+        search.look(correction, np.arange(n), False)
+        assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
+    assert looks[-2:] == [90, 100] and search.col == 20.7
+    assert len(set(told)) == 1 and "--axis COLUMN" in told[0] and "optics.axis_col" in told[0]
 
 
 @pytest.mark.slow
