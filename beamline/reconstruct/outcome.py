@@ -201,8 +201,8 @@ def sample_radius_note(settings: Mapping[str, Any], prepared: PreparedProjection
     known = "as was given" if low == high else f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
-        f"field ({known}). All of it was reconstructed, and the field's part is written. The density in its middle is known "
-        f"to about {density:.1%}; wide views (scan.wide_views) make it surer."
+        f"field ({known}). All of it was reconstructed, and the field's part is written. The density in its middle is "
+        f"known to about {density:.1%}; wide views (scan.wide_views) make it surer."
     )
 
 
