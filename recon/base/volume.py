@@ -17,6 +17,7 @@ from recon.base.declared_types import check_arguments, check_settings, refusal
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 
+_WIDE = 1.04  # over the field; rounding to whole voxels makes a box no wider
 COARSEST = 4.0
 """Pixels a voxel of a fit's box, at most. Without: fits of coarser volumes start from blurred matter; not measured."""
 
@@ -108,6 +109,10 @@ class Grid:
         y, x = (np.asarray(self.shape[1:]) + below + above).astype(int).tolist()
         middle = np.asarray(self.centre[1:]) + (above - below) / 2 * self.voxel_size
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
+
+    def is_wide(self, geometry: Geometry) -> bool:
+        """Whether the box is wider than the field, as one that holds a sample beyond it."""
+        return self.shape[2] * self.voxel_size > _WIDE * 2 * geometry.reach
 
     @property
     def spacing(self) -> tuple[float, float, float]:
