@@ -24,11 +24,10 @@ from beamline.reconstruct.outcome import (
 )
 from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
-from recon.base.method import Reconstruction
+from recon.base.method import SAMPLE, Reconstruction
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
-from recon.voxels.beyond_field import SAMPLE
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.matter_checks import StrayMass, Unexplained, lost_matter, stray_mass, stray_mass_share, unexplained

@@ -22,12 +22,11 @@ from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.scan import scan_ended
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.method import Reconstruction
+from recon.base.method import SAMPLE, Reconstruction, SampleRadius
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.gaussians import NEEDLES_LIMIT, needles
 from recon.voxels import odd_views, view_weights
-from recon.voxels.beyond_field import SAMPLE, SampleRadius
 from recon.voxels.fbp import Filter
 from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, LostMatter, StrayMass, Unexplained
 

@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
@@ -77,6 +77,31 @@ class Energies(Checked):
     cross_sections: F64
 
 
+SAMPLE = "sample_radius"
+"""Name of the decision on the radius, and how the settings begin that state it."""
+
+
+@dataclass(frozen=True)
+class SampleRadius:
+    """How far a sample reaches from the rotation axis, where it is wider than the field.
+
+    Attributes:
+        radius: that predicts views held out best, or that was given, in mm.
+        low, high: mm, from which to which radius views are predicted as well but for chance, and a step of the search.
+        density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
+    """
+
+    radius: float
+    low: float
+    high: float
+    density: float
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The values as settings of a result."""
+        return {SAMPLE if name == "radius" else f"{SAMPLE}_{name}": value for name, value in asdict(self).items()}
+
+
 @dataclass(frozen=True, eq=False)
 class DataUse(Checked):
     """How the projections are used.
@@ -100,7 +125,7 @@ class DataUse(Checked):
     emission: Any = None
     times: F64 | None = None
     energies: Energies | None = None
-    sample_radius: float | None = None
+    sample_radius: float | SampleRadius | None = None
 
 
 @dataclass(frozen=True, eq=False)

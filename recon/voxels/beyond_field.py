@@ -12,13 +12,14 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of, wider_than_field
@@ -27,32 +28,9 @@ from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines
 
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
+_LOOKS = 8  # views by which rows are chosen
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
 _ERRORS = 1.0  # standard errors by which radii predict alike
-
-SAMPLE = "sample_radius"
-"""Name of the decision on the radius, and how the settings begin that state it."""
-
-
-@dataclass(frozen=True)
-class SampleRadius:
-    """How far a sample reaches from the rotation axis, where it is wider than the field.
-
-    Attributes:
-        radius: that predicts views held out best, or that was given, in mm.
-        low, high: mm, from which to which radius views are predicted as well but for chance, and a step of the search.
-        density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
-    """
-
-    radius: float
-    low: float
-    high: float
-    density: float
-
-    @property
-    def settings(self) -> dict[str, float]:
-        """The values as settings of a result."""
-        return {SAMPLE if name == "radius" else f"{SAMPLE}_{name}": value for name, value in asdict(self).items()}
 
 
 def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -97,22 +75,21 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
     and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
     leaves more unknown than the views tell. `DataUse.sample_radius` comes before.
     """
-    data, geometry = problem.projections, problem.geometry
-    own = np.flatnonzero(geometry.ordinary)
-    some = np.union1d(spread_views(geometry.angles[own], _VIEWS, own), np.flatnonzero(~geometry.ordinary))
-    weights = problem.use.weights
-    views, _ = masked(data[some], None if weights is None else weights[some])
-    geometry = geometry.select(some)
-    ordinary = geometry.ordinary
-    if not wider_than_field(views[ordinary], geometry.select(np.flatnonzero(ordinary))):
-        return None
+    given, geometry = problem.use.sample_radius, problem.geometry
     reach = geometry.reach
-    if (given := problem.use.sample_radius) is not None:
+    if isinstance(given, SampleRadius):
+        return given
+    if given is not None:
         return SampleRadius(given, given, given, 0.0) if given > reach else None
-    if geometry.n_views < LEAST_VIEWS:
-        radius = _STEP * reach
-        return SampleRadius(radius, reach, _WIDEST * reach, 1.0)
-    trial = _Trial.of(views, geometry, problem, _COLS)
+    own = geometry.ordinary
+    used = np.flatnonzero(own)
+    some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
+    views, geometry = _some_rows(problem, some)
+    if not wider_than_field(views[own[some]], geometry.select(np.flatnonzero(own[some]))):
+        return None
+    if len(used) < LEAST_VIEWS:
+        return SampleRadius(_STEP * reach, reach, _WIDEST * reach, 1.0)
+    trial = _Trial.of(views, geometry, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
 
     def best(ratios: Iterable[float]) -> float:
@@ -124,7 +101,7 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
     first = best(_STEP**k for k in range(1 + math.floor(math.log(_WIDEST, _STEP))))
     least = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
     if least < _STEP:  # coarse voxels blur where the field ends
-        trial = _Trial.of(views, geometry, problem, 2 * _COLS)
+        trial = _Trial.of(views, geometry, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
     if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
@@ -137,6 +114,26 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
     densities = [tried[ratio][1] for ratio in alike]
     uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
     return SampleRadius(least * math.sqrt(_FINE) * reach, min(alike) * reach, max(alike) * reach, uncertain)
+
+
+def _factor(geometry: Geometry, columns: int) -> int:
+    """The binning that leaves at most so many columns."""
+    rows, cols = geometry.detector_shape
+    return max(1, min(rows, math.ceil(cols / columns)))
+
+
+def _some_rows(problem: ReconProblem, some: NDArray[np.intp]) -> tuple[F32, Geometry]:
+    """These views in the rows with most matter, of a cone in those in its middle, finite."""
+    data, geometry, weights = problem.projections, problem.geometry.select(some), problem.use.weights
+    look, height = masked(data[some[:: max(1, len(some) // _LOOKS)]])[0], _ROWS * _factor(geometry, _COLS)
+    rows = slice(0, geometry.detector_shape[0])
+    if not geometry.is_cone:
+        rows = busiest_rows(look, height)
+        geometry = geometry.rows(rows.start, rows.stop)
+    elif (middle := middle_of_cone(geometry, problem.grid, look, height)) is not None:
+        rows, geometry = middle[:2]
+    views = np.stack([data[view, rows] for view in some])
+    return masked(views, None if weights is None else np.stack([weights[view, rows] for view in some]))[0], geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,21 +150,12 @@ class _Trial:
     box: Grid
 
     @classmethod
-    def of(cls, views: F32, geometry: Geometry, problem: ReconProblem, columns: int) -> _Trial:
-        rows, cols = geometry.detector_shape
-        factor = max(1, min(rows, math.ceil(cols / columns)))
-        height = min(rows, factor * _ROWS)
-        if geometry.is_cone:
-            middle = middle_of_cone(geometry, problem.grid, views, height)
-            if middle is not None:
-                views, geometry = np.ascontiguousarray(views[:, middle[0]]), middle[1]
-        else:
-            some = busiest_rows(views, height)
-            views, geometry = np.ascontiguousarray(views[:, some]), geometry.rows(some.start, some.stop)
+    def of(cls, views: F32, geometry: Geometry, columns: int) -> _Trial:
+        factor = _factor(geometry, columns)
         views, geometry = bin_views(views, factor), geometry.binned(factor)
         box = Grid.matching(geometry)
-        if not geometry.rows_show_slices:
-            box = slab_of(geometry, box, 0, geometry.detector_shape[0])[1] if not geometry.is_cone else box
+        if not geometry.is_cone:
+            geometry, box = slab_of(geometry, box, 0, geometry.detector_shape[0])
         fitted, judges = split_views(geometry)
         return cls((views[fitted], geometry.select(fitted)), (views[judges], geometry.select(judges)), box)
 
