@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
@@ -38,6 +39,7 @@ _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
 _STEP_OF_LIGHT = 0.1  # of line integral, as the monitor's alarm `gain`
 _OF_LOCAL, _ALTERNATING = 3.0, 0.9  # times the change to the next view, as angles differ by so much; share of the views
+_BESIDE = np.radians(4.1)  # a slab 20 times as long as thick, wider than the field, is no spike in views so dense
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
@@ -204,7 +206,7 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size, what = (
             odd,
-            f"In frame {frames[at]} the whole view is off the views beside it by {odd:.2f} of line integral",
+            (f"Line integrals of all of frame {frames[at]} differ by {odd:.2f} from those of the views beside it"),
         )
     sentence = (
         f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
@@ -219,7 +221,9 @@ def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
     steps = np.diff(levels[order])
     there, back = steps[1:-2], steps[2:-1]
     around = np.maximum(np.abs(steps[:-3]), np.abs(steps[3:]))
-    off = np.where(there * back < 0, np.minimum(np.abs(there), np.abs(back)) - _OF_LOCAL * around, 0)
+    dense = sliding_window_view(np.diff(angles[order]), 4).max(axis=1) < _BESIDE
+    off = np.minimum(np.abs(there), np.abs(back)) - _OF_LOCAL * around
+    off[(there * back > 0) | ~dense] = 0
     return int(order[off.argmax() + 2]), float(off.max())
 
 
