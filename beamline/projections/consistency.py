@@ -204,10 +204,7 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
         size, what = usual, f"From view to view line integrals of the whole view rise and fall in turn by {usual:.2f}"
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
-        size, what = (
-            odd,
-            (f"Line integrals of all of frame {frames[at]} differ by {odd:.2f} from those of the views beside it"),
-        )
+        size, what = odd, f"Frame {frames[at]} differs as a whole by {odd:.2f} of line integral from those beside it"
     sentence = (
         f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
         "another scan are among them. Choose views that belong together with --views, or say which columns are air."
