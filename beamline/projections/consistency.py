@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
@@ -38,6 +39,7 @@ _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
 _STEP_OF_LIGHT = 0.1  # of line integral, as the monitor's alarm `gain`
 _OF_LOCAL, _ALTERNATING = 3.0, 0.9  # times the change to the next view, as angles differ by so much; share of the views
+_BESIDE = np.radians(4.1)  # a slab 20 times as long as thick, wider than the field, is no spike in views so dense
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
@@ -90,9 +92,8 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     geometry, data = prepared.geometry, prepared.projections.data
     wide = geometry.is_off_middle and covers_the_circle(geometry.angles)
     whole = geometry.rows_show_slices and not geometry.shifts.any() and not wide
-    few = len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS or selection.rows is not None
     known = prepared.measured is None and prepared.emission is None and prepared.projections.floored <= _FLOORED
-    if not whole or few or not known:
+    if not whole or len(data) < _LEAST_VIEWS or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
     edges = FieldEdges.of(data, geometry)
@@ -100,6 +101,8 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         return _reported(laws, warn)
+    if data.shape[1] < _LEAST_ROWS or selection.rows is not None:
+        return {}
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
@@ -199,11 +202,26 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
     )
     if usual > _STEP_OF_LIGHT and np.mean(steps[1:] * steps[:-1] < 0) > _ALTERNATING:
         size, what = usual, f"From view to view line integrals of the whole view rise and fall in turn by {usual:.2f}"
+    at, odd = _out_of_line(levels, angles)
+    if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
+        size, what = odd, f"Frame {frames[at]} differs as a whole by {odd:.2f} of line integral from those beside it"
     sentence = (
         f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
         "another scan are among them. Choose views that belong together with --views, or say which columns are air."
     )
     return Law("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
+
+
+def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
+    """The view most out of line with its neighbours in angle, and by how much more than these differ otherwise."""
+    order = np.argsort(angles, kind="stable")
+    steps = np.diff(levels[order])
+    there, back = steps[1:-2], steps[2:-1]
+    around = np.maximum(np.abs(steps[:-3]), np.abs(steps[3:]))
+    dense = sliding_window_view(np.diff(angles[order]), 4).max(axis=1) < _BESIDE
+    off = np.minimum(np.abs(there), np.abs(back)) - _OF_LOCAL * around
+    off[(there * back > 0) | ~dense] = 0
+    return int(order[off.argmax() + 2]), float(off.max())
 
 
 def _upside_down(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:

@@ -17,6 +17,7 @@ from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, cut_sentence, passing_sentence, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
@@ -29,6 +30,7 @@ from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.changed import JOINED_DEG
+from beamline.storage.rules.light import without_air
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
@@ -326,14 +328,21 @@ def assemble(
 
 
 def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
-    """Warn of matter beyond the field of view, and of the ring current where no air corrects it."""
-    edges = FieldEdges.of(prepared.projections.data, prepared.geometry)
-    if sides := edges.beyond():
-        warn(cut_sentence(sides))
-        if (change := uncorrected_current(source, selection)) and not any(prepared.projections.air_columns):
-            warn(change)
-    elif ranges := edges.passing():
-        warn(passing_sentence(ranges, prepared.geometry.n_views))
+    """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
+    projections, geometry = prepared.projections, prepared.geometry
+    edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
+    sides, ranges = edges.beyond(), edges.passing()
+    light = ""
+    if unlevelled and edges.mean > 0 and source.quantity == "counts" and selection.step(Air).model != "none":
+        light = without_air(source, edges.mean)
+    if sides:
+        warn(f"{cut_sentence(sides)} {light}".rstrip())
+    elif ranges:
+        warn(passing_sentence(ranges, geometry.n_views))
+    elif light:
+        warn(light)
+    if sides and unlevelled and (change := uncorrected_current(source, selection)):
+        warn(change)
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

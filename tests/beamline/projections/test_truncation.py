@@ -70,6 +70,19 @@ def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_curren
     assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
 
 
+@pytest.mark.parametrize("light", [1.0, 0.5], ids=["matter at the edges", "flats so dark that edges are near 0"])
+def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: float) -> None:
+    as_taken, told = prepare(scan(120.0, 1.8 * light), SELECTION)
+    mean = as_taken.projections.data.mean()
+    more = prepare(scan(120.0, 1.8 * light / 1.1), SELECTION)[0].projections.data.mean() - mean
+    (line,) = (line for line in told if "No column shows air" in line)
+    assert more == pytest.approx(0.095, abs=0.002)
+    share = re.search(r"by 0.095, (\d+)% of the mean", line)
+    assert share is not None
+    assert int(share[1]) == pytest.approx(100 * more / mean, rel=0.05)
+    assert "No exposure is stated" in line
+
+
 def test_columns_that_are_said_to_be_air_are_air() -> None:
     found, _ = prepare(scan(90.0), SELECTION.with_steps(Air("columns")))
     assert min(found.projections.air_columns) > 0

@@ -43,7 +43,9 @@ def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray, exposures: np.
 
 @pytest.mark.parametrize("radius", [20.0, 60.0])
 def test_references_of_the_light_of_the_views_are_not_told_of(radius: float) -> None:
-    assert "flats" not in told(*counts(radius)).replace("weaker than its flats", "")
+    unknown = told(*counts(radius)).partition("No column shows air")
+    assert "flats" not in unknown[0].replace("weaker than its flats", "")
+    assert bool(unknown[1]) == (radius == 60.0)
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0])
@@ -128,6 +130,21 @@ def test_a_step_and_turns_of_the_light_where_the_sample_fills_the_field() -> Non
     darks, flats, views = counts(60.0)
     views[::2] = (views[::2] - 100) * 0.7 + 100
     assert "rise and fall in turn by 0.36" in told(darks, flats, views)
+
+
+@pytest.mark.parametrize(("view", "factor"), [(2, 0.7), (30, 1.4)])
+@pytest.mark.parametrize("rows", [slice(0, 24), slice(10, 12)], ids=["all rows", "two rows"])
+def test_one_view_of_another_light_where_the_sample_fills_the_field(view: int, factor: float, rows: slice) -> None:
+    darks, flats, views = (each[:, rows] for each in counts(60.0))
+    assert "as a whole" not in told(darks, flats, views)
+    views[view] = (views[view] - 100) * factor + 100
+    assert f"Frame {10 + view} differs as a whole by 0.3" in told(darks, flats, views)
+
+
+def test_a_wide_sample_of_even_edges_that_looks_like_a_weak_beam_is_told_how_to_say_so() -> None:
+    darks, flats, views = counts(20.0)
+    views = (views - 100) * 0.5 + 100
+    assert "a sample wider than the field, give --air none." in told(darks, flats, views)
 
 
 def test_images_with_dark_and_bright_exchanged() -> None:
