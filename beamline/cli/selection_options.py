@@ -170,6 +170,7 @@ def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOpti
         rows=values["rows"],
         binning=values["binning"],
         axis_col=values["axis"],
+        sample_width=values["sample_width"],
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
         cone=values["cone"],
         seed=seed,
@@ -237,6 +238,13 @@ _BEFORE = (
         show_default=True,
         help="Rotation axis: column of the unbinned detector (0: centre of the first column used), or auto to find it. "
         "beamline sweep FILE axis=80:90:0.5 draws a slice by each of these axes.",
+    ),
+    option(
+        "--sample-width",
+        type=click.FloatRange(min=0, min_open=True),
+        metavar="MM",
+        help="Width of a sample that is wider than the field, which is reconstructed as wide as it is (in px where the "
+        "pixel size is unknown). Default: as the scan file says, or measured by views held out.",
     ),
 )
 _AFTER = (

@@ -322,9 +322,17 @@ def assemble(
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
+        sample_radius=_stated_radius(source, selection),
     )
     _warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
+
+
+def _stated_radius(source: ScanSource, selection: Selection) -> float | None:
+    """Half the width of the sample, as asked for or as the file says."""
+    stated = source.attributes.get("sample_diameter_mm") if pixel_size(source, selection) is not None else None
+    width = stated if selection.sample_width is None else selection.sample_width
+    return None if width is None else float(width) / 2
 
 
 def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:

@@ -17,7 +17,7 @@ from beamline.storage.recon_record import Value
 from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.method import Energies
+from recon.base.method import Energies, SampleRadius
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -53,7 +53,7 @@ class PreparedProjections:
         energies: of the views, where they are of several scans; None: they are of one.
         recorded: what the volume's file says of several scans, by name; empty of one.
         laws: what the views leave of the laws that hold for all of them, in words, by name.
-        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, if that was given.
+        sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or measured.
         inside: the views show what lies in the volume alone: what the rest of the sample adds is taken off.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
@@ -79,7 +79,7 @@ class PreparedProjections:
     times: NDArray[np.float64] | None = None
     energies: Energies | None = None
     recorded: Mapping[str, Value] = field(default_factory=dict)
-    sample_radius: float | None = None
+    sample_radius: float | SampleRadius | None = None
     inside: bool = False
     stretch: float = 1.0
     laws: Mapping[str, str] = field(default_factory=dict)
@@ -91,6 +91,12 @@ class PreparedProjections:
         grid, (z, y, x) = volume.grid, volume.grid.centre
         high = replace(grid, centre=(z * self.stretch, y, x), slice_pitch=grid.spacing[0] * self.stretch)
         return Volume(volume.data, high)
+
+    @property
+    def box(self) -> Grid:
+        """The box of the field, or as wide as the sample was measured to be."""
+        grid, sample = Grid.matching(self.geometry), self.sample_radius
+        return grid.reaching(sample.radius, self.geometry) if isinstance(sample, SampleRadius) else grid
 
     @property
     def kind(self) -> VoxelKind:

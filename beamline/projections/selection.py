@@ -32,6 +32,8 @@ class Selection:
         rows: (first, end) detector rows; None is all.
         binning: pixels averaged per side.
         axis_col: rotation axis in columns of the full detector; None finds it.
+        sample_width: across the beam, where the sample is wider than the field, in mm (in px where the pixel size is
+            unknown); None takes the file's, or measures it.
         pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         seed: of random view selections.
@@ -43,6 +45,7 @@ class Selection:
     rows: tuple[int, int] | None = None
     binning: int = 1
     axis_col: float | None = None
+    sample_width: float | None = None
     pixel_size_mm: float | None = None
     cone: tuple[float, float] | None = None
     seed: int = 0

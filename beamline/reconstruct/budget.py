@@ -7,15 +7,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from beamline.core.durations import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import binned, run_on
 from recon.assess.time_model import Choice, Speeds, duration_text, plans
 from recon.auto import LEFT, ROWS, part_of, predicts_best
-from recon.base.masks import masked
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
 from recon.base.work import Rates
@@ -23,7 +20,6 @@ from recon.methods import with_settings
 from recon.splatting.in_time import speeds_of
 from recon.splatting.initialise import default_count
 from recon.voxels.direct import has_direct_method
-from recon.voxels.field_edges import wider_than_field
 
 _RESERVE = 0.02  # share of the budget for unmeasured work
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
@@ -86,7 +82,6 @@ def within(
 
     Args:
         methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.
-            Iterations on voxels are none where the sample is wider than the field.
         largest: binning; None: any.
         rates: of this machine; None: measured, or those kept.
 
@@ -98,14 +93,11 @@ def within(
         ValueError: the views cannot be reconstructed.
     """
     now, geometry = control.now, prepared.geometry
-    speeds = speeds_of(geometry, Grid.matching(geometry), rates or MachineSpeed())
+    speeds = speeds_of(geometry, prepared.box, rates or MachineSpeed())
     begin = now()  # what is measured once on a machine is no part of a budget, as kernels that are compiled once
     unbinned = default_count(geometry, geometry.sample_pitch)  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
-    modelled = {name: method for name, method in taking.items() if method.traits.any_grid or method.traits.direct}
-    if any(method.traits.any_grid for method in modelled.values()) and _is_wider(prepared):
-        taking = modelled
     plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
     choices = plan.choices()
     choice, because = choices[0], ""
@@ -149,15 +141,6 @@ def _marked(
     return replace(result, seconds=seconds, chosen=chosen, settings={**result.settings, **settings})
 
 
-def _is_wider(prepared: PreparedProjections) -> bool:
-    """Some views show that the sample leaves the field; only methods with the trait `any_grid` model this."""
-    some = slice(None, None, max(1, prepared.geometry.n_views // 32))
-    problem = _problem_of(prepared, 0)
-    weights = problem.use.weights
-    views = masked(problem.projections[some], None if weights is None else weights[some])[0]
-    return wider_than_field(views, problem.geometry.select(np.arange(prepared.geometry.n_views)[some]))
-
-
 def _chosen(
     plan: _Budget, choices: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
 ) -> tuple[Choice, str]:
@@ -192,7 +175,7 @@ def _chosen(
 
 def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
     geometry, use = prepared.geometry, DataUse(prepared.ray_weights())
-    return ReconProblem(prepared.projections.data, geometry, Grid.matching(geometry), use, seed, "cpu")
+    return ReconProblem(prepared.projections.data, geometry, prepared.box, use, seed, "cpu")
 
 
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:

@@ -47,6 +47,7 @@ class ReconMemory:
         steps: bytes that the steps of the correction take.
         largest_step: name of the one that takes the most alone.
         bars: error bars are made, too.
+        radius: how far the sample reaches beyond the field, and its box with it, in mm; None: it ends within.
     """
 
     method: Method
@@ -56,6 +57,7 @@ class ReconMemory:
     steps: StepMemory = _NO_STEPS
     largest_step: str = ""
     bars: bool = False
+    radius: float | None = None
 
     @property
     def rows(self) -> int:
@@ -135,7 +137,8 @@ class ReconMemory:
         return _ROWS
 
     def _grid(self, rows: int) -> Grid:
-        return Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
+        grid = Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
+        return grid if self.radius is None else grid.reaching(self.radius, self.geometry)
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:

@@ -51,9 +51,11 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
+from recon.base.method import SampleRadius
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
+from recon.voxels.beyond_field import sample_radius
 
 _BATCH = 0.25  # of the memory: views during correction
 
@@ -122,8 +124,12 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     geometry = prepared.geometry
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
     weighted = differ and not options.method.traits.direct
-    needs = ReconMemory(options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty)
-    if plan.slabs:
+    sample = prepared.sample_radius
+    needs = ReconMemory(
+        options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
+        radius=sample.radius if isinstance(sample, SampleRadius) else None,
+    )  # fmt: skip
+    if plan.slabs or (needs.radius is not None and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
@@ -230,6 +236,9 @@ def prepare_within(
     prepared = prepare_projections(source, selection, warn, buffer, check, phases)
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
+    if not (options.method.traits.direct or options.method.traits.several):
+        views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
+        prepared = replace(prepared, sample_radius=sample_radius(*views))
     return prepared, of_views(source, options, plan, prepared)
 
 

@@ -329,6 +329,7 @@ def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
     return ScanInfo(
         sample=config.sample.name,
         title=config.sample.description,
+        diameter_mm=config.sample.diameter_mm,
         pixel_size_mm=pixel_size * config.devices.camera.binning,
         energy_kev=energy or optics.energy_kev,
         monochromator_kev=energy,

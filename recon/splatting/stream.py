@@ -22,7 +22,7 @@ from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, DataUse, Progress, ReconProblem
+from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -373,7 +373,7 @@ class StreamingFit:
         every, data = self._template.at(self._angles), np.stack(self._data)
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
         geometry, seen = every.select(learnt), data[learnt]
-        wider = sample_radius(ReconProblem(data, every, self._grid, DataUse(), 0, "cpu"))
+        wider = sample_radius(data, every)
         box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
         field = Grid.for_fit(self._template, box)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))

@@ -18,7 +18,7 @@ from recon.base.arrays import F32, F64, bin_views
 from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
+from recon.base.masks import RayWeights, masked
 from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
@@ -45,7 +45,7 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
     traits, decide = method.traits, control.decide or Decisions(problem.seed)
     if traits.direct or traits.several:
         return method.run(problem, control)
-    measured = decide(SAMPLE, lambda: _values(sample_radius(problem)))
+    measured = decide(SAMPLE, lambda: _values(_of_problem(problem)))
     if not measured:
         return method.run(problem, control)
     sample, grid = SampleRadius(*measured), problem.grid
@@ -68,14 +68,28 @@ def _values(sample: SampleRadius | None) -> list[float]:
     return [] if sample is None else list(asdict(sample).values())
 
 
-def sample_radius(problem: ReconProblem) -> SampleRadius | None:
+def _of_problem(problem: ReconProblem) -> SampleRadius | None:
+    use = problem.use
+    return sample_radius(problem.projections, problem.geometry, use.weights, use.sample_radius)
+
+
+def sample_radius(
+    projections: F32,
+    geometry: Geometry,
+    weights: F32 | RayWeights | None = None,
+    given: float | SampleRadius | None = None,
+) -> SampleRadius | None:
     """How far the sample reaches; None: not beyond the field, or its views see that it ends there.
 
     FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
     and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
-    leaves more unknown than the views tell. `DataUse.sample_radius` comes before.
+    leaves more unknown than the views tell.
+
+    Args:
+        projections: line integrals [view, row, col]; only some rows of some views are read.
+        weights: of the rays; those of weight 0 do not count.
+        given: mm, the radius where that is known.
     """
-    given, geometry = problem.use.sample_radius, problem.geometry
     reach = geometry.reach
     if isinstance(given, SampleRadius):
         return given
@@ -84,7 +98,7 @@ def sample_radius(problem: ReconProblem) -> SampleRadius | None:
     own = geometry.ordinary
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
-    views, geometry = _some_rows(problem, some)
+    views, geometry = _some_rows(projections, geometry, weights, some)
     if not wider_than_field(views[own[some]], geometry.select(np.flatnonzero(own[some]))):
         return None
     if len(used) < LEAST_VIEWS:
@@ -122,15 +136,17 @@ def _factor(geometry: Geometry, columns: int) -> int:
     return max(1, min(rows, math.ceil(cols / columns)))
 
 
-def _some_rows(problem: ReconProblem, some: NDArray[np.intp]) -> tuple[F32, Geometry]:
+def _some_rows(
+    data: F32, geometry: Geometry, weights: F32 | RayWeights | None, some: NDArray[np.intp]
+) -> tuple[F32, Geometry]:
     """These views in the rows with most matter, of a cone in those in its middle, finite."""
-    data, geometry, weights = problem.projections, problem.geometry.select(some), problem.use.weights
+    geometry = geometry.select(some)
     look, height = masked(data[some[:: max(1, len(some) // _LOOKS)]])[0], _ROWS * _factor(geometry, _COLS)
     rows = slice(0, geometry.detector_shape[0])
     if not geometry.is_cone:
         rows = busiest_rows(look, height)
         geometry = geometry.rows(rows.start, rows.stop)
-    elif (middle := middle_of_cone(geometry, problem.grid, look, height)) is not None:
+    elif (middle := middle_of_cone(geometry, Grid.matching(geometry), look, height)) is not None:
         rows, geometry = middle[:2]
     views = np.stack([data[view, rows] for view in some])
     return masked(views, None if weights is None else np.stack([weights[view, rows] for view in some]))[0], geometry

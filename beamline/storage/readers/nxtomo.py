@@ -406,6 +406,7 @@ NUMBERS = (
     ("saturation", "record/saturation", {"": 1.0}),
     ("distance_mm", "instrument/detector/distance", datasets.LENGTH_UNITS),
     ("source_distance_mm", "record/source_distance", datasets.LENGTH_UNITS),
+    ("sample_diameter_mm", "sample/diameter", datasets.LENGTH_UNITS),
 )
 
 

@@ -145,6 +145,7 @@ class ScanInfo:
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
         wide_views: whether some are planned.
+        diameter_mm: of the sample.
     """
 
     sample: str
@@ -164,6 +165,7 @@ class ScanInfo:
     monochromator_kev: float | None = None
     saturation: float | None = None
     wide_views: bool = False
+    diameter_mm: float | None = None
 
 
 def iso_time(seconds: float) -> str:
@@ -246,6 +248,7 @@ def _facts(file: h5py.File, info: ScanInfo) -> None:
         ("/entry/instrument/beam/incident_energy", info.energy_kev, "keV"),
         ("/entry/record/exposure", info.exposure, "s"),
         ("/entry/record/period", info.period, "s"),
+        ("/entry/sample/diameter", info.diameter_mm, "mm"),
         (AXIS_COL, info.axis_col, "pixel"),
     ):
         if value is not None:
