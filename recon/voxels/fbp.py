@@ -24,12 +24,10 @@ from recon.base.geometry import Geometry, require_views
 from recon.base.registry import unknown
 from recon.base.volume import Grid, bands_of, slices_of
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
+from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, sample_reach
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # filtered at a time
-_EDGE = 3  # columns at least, whose mean is the level at an edge
-NEAREST, FARTHEST, _STEP = 1.06, 10.0, 0.06  # half widths to the end of a sample; step of their logarithm
-CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
 
 
 def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -77,51 +75,75 @@ def _known(filter: str) -> None:
         raise ValueError(unknown("filter", filter, get_args(Filter)))
 
 
-def edge_levels(projections: F32) -> dict[float, F32]:
-    """Line integrals [view, row, side] at the left and the right edge of rows where a sample goes on beyond, else 0.
+@dataclass(frozen=True, eq=False)
+class ContinuedRows:
+    """Rows that end in matter, taken on beyond an edge as an ellipse about the rotation axis.
 
-    A sample is cut off where the mean of the views at the edge is a tenth of that in the middle, and not noise. They
-    are sorted by how far the sample reaches, in half widths of the row, by the ellipse that goes on as the mean of the
-    views does at the edge (Hsieh et al. 2004, Med. Phys. 31, 2385).
+    Such a row makes a rim and loses the middle of a volume, for the filter takes what is beyond for air (Lewitt 1979,
+    Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
+
+    Attributes:
+        filtered: float32 [row, side, col], what filtering brings into a row, and into the columns of zeros beside it,
+            if it goes on beyond an edge from 1; 0 where it ends in air.
     """
-    cols = projections.shape[-1]
-    n = min(max(_EDGE, cols // 100), cols)
-    m = max(cols // 8, n)
-    sides = np.stack([part.mean(axis=-1) for part in (projections[..., :n], projections[..., cols - n :])], axis=-1)
-    level, mean = sides.mean(axis=0), projections.mean(axis=0)
-    cut = (level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST)
-    if not cut.any() or cols <= 2 * m:  # no columns within, or too few to tell how it goes on
-        return {}
-    # The square of an ellipse falls as the square of the way from its middle, which is taken to be that of the row.
-    inner = np.stack([mean[:, m : m + n].mean(axis=-1), mean[:, cols - m - n : cols - m].mean(axis=-1)], axis=-1)
-    edge, within = 1 - n / cols, 1 - (2 * m + n) / cols
-    fall = np.maximum(inner**2 - level**2, 0) / (edge**2 - within**2) if edge > within else np.zeros_like(level)
-    reach = np.sqrt(edge**2 + level**2 / np.maximum(fall, level**2 / FARTHEST**2 + 1e-30))
-    step = np.round(np.log(np.clip(reach, NEAREST, FARTHEST)) / _STEP)
-    found = {}
-    for k in np.unique(step[cut]).tolist():
-        found[math.exp(k * _STEP)] = np.where(cut & (step == k), sides, np.float32(0)).astype(np.float32)
-    return found
+
+    filtered: F32
+
+    @classmethod
+    def of(
+        cls, mean: F32, geometry: Geometry, beyond: F64, zeros: tuple[int, int], filter: Filter, radius: float | None
+    ) -> ContinuedRows | None:
+        """The continuation of rows by the mean of their views [row, col]; None where all end in air.
+
+        Args:
+            beyond: [view, side], weights of what lies beyond the edges.
+            zeros: columns beside the rows that are wanted, too.
+            radius: of the sample, mm; None: `sample_reach`.
+        """
+        cut = ends_in_matter(mean) & beyond.any(axis=0)
+        if not cut.any():
+            return None
+        cols, axis = mean.shape[1], geometry.axis_col + float(geometry.offsets[:, 0].mean())
+        edges = np.array([axis + 0.5, cols - 0.5 - axis])
+        filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
+        for rows in np.array_split(np.arange(len(mean)), max(1, len(mean) // SLICES)):
+            rows = rows[cut[rows].any(axis=1)]
+            if not rows.size:
+                continue
+            least = float(np.abs(edges[cut[rows].any(axis=0)]).max())
+            reach = sample_reach(mean[rows], axis) if radius is None else _reach(radius, geometry)
+            reach = min(max(reach, least), FARTHEST * edges.max())
+            length = max(*zeros, math.ceil(reach - edges.min()))
+            fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))
+            sides = np.zeros((2, fall.size), np.float32)
+            sides[0, :length], sides[1, length + cols :] = fall[:length], fall[length + cols :]
+            sides /= np.maximum(edge_levels(fall[length : length + cols]), 1e-6 * reach)[:, None]
+            beyond_them = filter_projections(sides, geometry.sample_pitch, filter)
+            filtered[rows] = cut[rows, :, None] * beyond_them[:, length - zeros[0] : length + cols + zeros[1]]
+        return cls(filtered)
+
+    def added(self, views: F32, beyond: F64) -> F32:
+        """What the continuation adds to filtered views [..., row, col], by the weights [..., side] beyond their edges.
+
+        Args:
+            views: float32 [..., row, col], not weighed.
+        """
+        levels = (edge_levels(views) * beyond[..., None, :]).astype(np.float32)
+        return levels[..., :1] * self.filtered[:, 0] + levels[..., 1:] * self.filtered[:, 1]
 
 
-def beyond_edges(cols: int, zeros: tuple[int, int], pixel_pitch: float, filter: Filter, reach: float) -> F32:
-    """[side, col]: what filtering brings inside if a row goes on beyond an edge, from 1, as an ellipse does.
+def _reach(radius: float, geometry: Geometry) -> float:
+    """Columns from the axis to the image of a sample of this radius (mm)."""
+    return radius / geometry.sample_pitch / math.sqrt(max(1 - (radius / geometry.sod) ** 2, 0.01))
 
-    A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
-    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
 
-    Args:
-        cols: of the row with the columns of zeros, which do not belong to it.
-        reach: from its middle to the ellipse's end, in half widths of the row.
-    """
-    half = (cols - sum(zeros)) / 2
-    length = math.ceil((FARTHEST * 1.1 - 1) * half)
-    u = 1 + (np.arange(length) + 0.5) / half
-    fall = np.sqrt(np.clip(reach**2 - u**2, 0, None) / (reach**2 - 1))
-    first, last = length + zeros[0], length + cols - zeros[1]
-    beyond = np.zeros((2, cols + 2 * length), np.float32)
-    beyond[0, first - length : first], beyond[1, last : last + length] = fall[::-1], fall
-    return filter_projections(beyond, pixel_pitch, filter)[:, length : length + cols]
+def columns_beside(geometry: Geometry, zeros: tuple[int, int], radius: float | None) -> tuple[int, int]:
+    """Columns of zeros beside the views, as many as it takes to see a sample of this radius (mm)."""
+    if radius is None:
+        return zeros
+    axis, reach = geometry.axis_col + geometry.offsets[:, 0], math.ceil(_reach(radius, geometry))
+    right = reach - (geometry.detector_shape[1] - 1 - float(axis.max()))
+    return max(zeros[0], math.ceil(reach - float(axis.min()))), max(zeros[1], math.ceil(right))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +153,8 @@ class FbpPlan:
     Attributes:
         geometry, grid, filter: as given.
         share: float32 [view, 1, col], quadrature weight of each ray.
+        beyond: [view, side], of what lies beyond the edges.
+        radius: of the sample, mm; None: as its rows tell.
         column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
             holds for all slices.
         zeros: columns of zeros to add before and after these.
@@ -142,6 +166,8 @@ class FbpPlan:
     grid: Grid
     filter: Filter
     share: F32
+    beyond: F64
+    radius: float | None
     column_shares: F64 | None
     zeros: tuple[int, int]
     rows: F64
@@ -160,7 +186,7 @@ class FbpPlan:
         return int(low), int(np.clip(math.floor(rows.max() + shifts.max()) + 1, low, last)) + 1
 
 
-def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
+def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius: float | None = None) -> FbpPlan:
     """The part of `fbp` that does not depend on the data; with a skew all rows are at the angle of the middle one.
 
     Raises:
@@ -174,16 +200,18 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
+    zeros = columns_beside(geometry, zeros, radius)
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
     cols = geometry.detector_shape[1] + sum(zeros)
     back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
     if is_gridded(geometry, grid, filter):
         response = partial(ramp, pixel_pitch=1.0, filter=filter)
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
-    share, rows = weights.astype(np.float32)[:, None], z + geometry.axis_row
+    share, rows = weights[:, None, 1:-1].astype(np.float32), z + geometry.axis_row
     differ = geometry.shifts[:, 1].any() and not seen_by(geometry, rows).all()
+    shares = column_shares(geometry)[0] if differ else None
     return FbpPlan(
-        geometry, grid, filter, share, column_shares(geometry)[0] if differ else None, zeros, rows, back_project
+        geometry, grid, filter, share, weights[:, (0, -1)], radius, shares, zeros, rows, back_project
     )  # fmt: skip
 
 
@@ -218,9 +246,9 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     share = _shares_of(plan, rows)
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
     low, end = plan.rows_of(part)
-    beyond = edge_levels(projections[:, low - first : end - first])
-    for sides in beyond.values():
-        sides[..., np.array(plan.zeros) > 0] = 0  # what is beyond this edge is seen by the opposite views
+    own = slice(low - first, end - first)
+    mean = projections[:, own].mean(axis=0)
+    continued = ContinuedRows.of(mean, geometry, plan.beyond, plan.zeros, plan.filter, plan.radius)
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
@@ -228,10 +256,9 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         if any(plan.zeros):
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
-        for reach, sides in beyond.items():
-            levels = _slab(sides[views], geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
-            levels *= plan.share[views][..., (0, -1)]
-            filtered += levels @ beyond_edges(filtered.shape[2], plan.zeros, geometry.pixel_pitch, plan.filter, reach)
+        if continued is not None:
+            added = continued.added(projections[views, own], plan.beyond[views])
+            filtered += _slab(added, geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)
@@ -247,7 +274,7 @@ def _shares_of(plan: FbpPlan, rows: F64) -> F32:
     if seen.all():
         return plan.share
     weights = [slice_weights(plan.geometry, some, plan.column_shares) for some in seen.T]
-    return np.stack(weights, axis=1).astype(np.float32)
+    return np.stack(weights, axis=1)[..., 1:-1].astype(np.float32)
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
@@ -278,6 +305,7 @@ def fbp(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
+    radius: float | None = None,
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
@@ -293,6 +321,8 @@ def fbp(
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
+        radius: of a sample that is wider than the field, mm: there its rows end, and so far voxels of a wider grid have
+            values. None: as `sample_reach` tells, and values within the field.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
@@ -306,7 +336,7 @@ def fbp(
     if out is None:
         out = np.empty(grid.shape, np.float32)
     for band, views in bands_of(geometry, grid):
-        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter)
+        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter, radius)
         for part in plan.blocks:
             fbp_block(plan, projections, 0, part, out[band][part])
             on_block(band.start + part.stop, len(out))

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import EMPTY, ENOUGH_MATTER
@@ -21,6 +22,44 @@ LEAST = 0.1
 _VIEWS, _ROWS, _PARTS = 32, 128, 4  # looked at, about; parts of the views
 _FEWEST = 2  # of the views looked at, in which matter goes out of the field
 _FULL = 0.5  # share of the fullest row's mass that a row needs
+
+CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
+FARTHEST = 10.0  # distances of the farther edge from the axis, to the end of a sample
+_EDGE = 3  # columns at least, whose mean is the level at an edge
+_OUTER = 0.4  # of the way to the farther edge: what lies within may be a core
+
+
+def edge_levels(rows: F32) -> F32:
+    """Line integrals [..., side] at the left and the right edge of rows [..., col]."""
+    cols = rows.shape[-1]
+    n = min(max(_EDGE, cols // 100), cols)
+    return np.stack([part.mean(axis=-1) for part in (rows[..., :n], rows[..., cols - n :])], axis=-1)
+
+
+def ends_in_matter(mean: F32) -> NDArray[np.bool_]:
+    """Whether a sample goes on beyond the edges of rows [row, side], by the mean of the views [row, col].
+
+    There the level at the edge is a tenth of that in the middle, and not noise.
+    """
+    level = edge_levels(mean)
+    return np.asarray((level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST))
+
+
+def sample_reach(mean: F32, axis: float) -> float:
+    """Columns from the axis to where the mean of the views [row, col] ends, if it falls as an ellipse about it.
+
+    The square of an ellipse is a line over the square of the way from its middle. The line through all columns errs
+    least on grains, the outer ones are right about a dense core, which makes all others too short: the longer counts.
+    Beside the fall at the edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385) FBP of packed grains gains 0.6 dB where
+    the can is twice as wide as the field. Far where nothing falls.
+    """
+    way, square = (np.arange(mean.shape[1]) - axis) ** 2, (np.asarray(mean, np.float64) ** 2).mean(axis=0)
+    ends = []
+    for part in (way >= 0, way >= (1 - _OUTER) ** 2 * way.max()):
+        apart = way[part] - way[part].mean()
+        fall = max(-float(apart @ square[part]) / max(float(apart @ apart), 1e-30), 1e-30)
+        ends.append(math.sqrt(way[part].mean() + square[part].mean() / fall))
+    return max(ends)
 
 
 @dataclass(frozen=True)
