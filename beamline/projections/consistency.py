@@ -331,10 +331,11 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
     )
 
 
-def cut_sentence(sides: dict[str, float]) -> str:
-    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`."""
+def cut_sentence(sides: dict[str, float], continued: bool) -> str:
+    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
+    smooth = "FBP continues the views smoothly beyond the edge; the" if continued else "The"
     return (
         f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "
-        "absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
-        "columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
+        f"absolute, and those at the rim are uncertain. {smooth} edge columns are not used as air. If they are air, "
+        "and the beam is weaker than its flats, give --air columns."
     )

@@ -37,6 +37,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
@@ -326,7 +327,7 @@ def _warn_of_the_field(
     """Warn of matter beyond the field of view, and of the ring current where no air corrects it."""
     edges = FieldEdges.of(projections.data, geometry)
     if sides := edges.beyond():
-        warn(cut_sentence(sides))
+        warn(cut_sentence(sides, edges.continued and has_direct_method(geometry)))
         if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
             warn(change)
     elif ranges := edges.passing():

@@ -26,7 +26,7 @@ from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.back_project import SLICES, nanoseconds
 from recon.voxels.devices import voxel_device
-from recon.voxels.fbp import ContinuedRows, Filter, columns_beside, fbp, fbp_memory, filter_projections, ramp
+from recon.voxels.fbp import Filter, columns_beside, continuation, continued, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
@@ -114,8 +114,8 @@ def fdk(
         raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
     if not geometry.is_straight:
         raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
-    weights, zeros, continued = _weights(projections, geometry, grid, filter, radius)
-    prepare = partial(_prepared_views, beyond=zeros, continued=continued, filter=filter)
+    weights, zeros, beyond = _weights(projections, geometry, grid, filter, radius)
+    prepare = partial(_prepared_views, zeros=zeros, beyond=beyond, filter=filter)
     return _by_slabs(projections, geometry, grid, weights, prepare, _along_columns, on_block)
 
 
@@ -126,8 +126,8 @@ views before the voxels."""
 
 def _weights(
     projections: F32, geometry: Geometry, grid: Grid, filter: Filter, radius: float | None
-) -> tuple[F64, tuple[int, int], ContinuedRows | None]:
-    """Weights [view, 1 + col + 1] and columns of zeros as `ray_weights`, and how rows that end in matter go on.
+) -> tuple[F64, tuple[int, int], F32 | None]:
+    """Weights [view, 1 + col + 1] and columns of zeros as `ray_weights`, and the `continuation`.
 
     Raises:
         ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
@@ -150,7 +150,8 @@ def _weights(
     mean = np.zeros(geometry.detector_shape, np.float32)
     for view in some:
         mean += projections[view] / np.float32(some.size)
-    return weights, zeros, ContinuedRows.of(mean, geometry, weights[:, (0, -1)], zeros, filter, radius)
+    beyond, weights = continuation(mean, geometry, weights, zeros, filter, radius)
+    return weights, zeros, beyond
 
 
 def _by_slabs(
@@ -181,22 +182,21 @@ def _by_slabs(
 
 
 def _prepared_views(
-    views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], continued: ContinuedRows | None,
-    filter: Filter,
-) -> tuple[F32, tuple[Any, ...]]:  # fmt: skip
+    views: F32, geometry: Geometry, weights: F64, zeros: tuple[int, int], beyond: F32 | None, filter: Filter
+) -> tuple[F32, tuple[Any, ...]]:
     """Views times the weights [view, 1 + col + 1] and the cosine of each ray, filtered, with columns beyond them.
     Shape [view, col + 2, row + 2], the rim twice."""
     rows, cols = geometry.detector_shape
-    out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
+    out = np.empty((geometry.n_views, sum(zeros) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):
         cosine = _cosine(geometry, view)
         # The ramp is that of a detector at the rotation axis.
-        weighed = np.pad((views[view] * (weights[view, 1:-1] * cosine)).astype(np.float32), ((0, 0), beyond))
+        weighed = np.pad((views[view] * (weights[view, 1:-1] * cosine)).astype(np.float32), ((0, 0), zeros))
         filtered = filter_projections(weighed, geometry.sample_pitch, filter)
-        if continued is not None:
-            filtered += continued.added(views[view] * cosine, weights[view, (0, -1)])
+        if beyond is not None:
+            filtered += continued(beyond, views[view] * cosine, weights[view])
         out[view] = np.pad(filtered.T, 1, mode="edge")
-    origin = geometry.axis_col + geometry.shifts[:, 0] + beyond[0], geometry.axis_row + geometry.shifts[:, 1]
+    origin = geometry.axis_col + geometry.shifts[:, 0] + zeros[0], geometry.axis_row + geometry.shifts[:, 1]
     turn = np.cos(geometry.angles), np.sin(geometry.angles)
     return out, (*turn, *origin, geometry.sod, geometry.sdd, geometry.pixel_pitch)
 
@@ -263,7 +263,7 @@ def posed_direct(
             "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
             "iterative method or r2"
         )
-    weights, zeros, continued = _weights(projections, geometry, grid, filter, radius)
+    weights, zeros, beyond = _weights(projections, geometry, grid, filter, radius)
     gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
 
     def prepare(views: F32, part: Geometry, weights: F64) -> tuple[Any, tuple[Any, ...]]:
@@ -273,10 +273,10 @@ def posed_direct(
             prepared = np.stack([_prepared(views[v], part, v, weights[v, 1:-1], zeros, next(responses)) for v in each])
         else:
             prepared = gpu.filtered(views, part, weights[:, 1:-1], zeros, responses)
-        if continued is not None:
-            for v in each:
-                image = views[v] * _cosine(part, v) if part.is_cone else views[v]
-                added = continued.added(image, weights[v, (0, -1)] * abs(math.cos(part.roll[v])))
+        for v in each:
+            if beyond is not None:
+                image = views[v] * (_cosine(part, v) if part.is_cone else 1)
+                added = continued(beyond, image, weights[v] * abs(math.cos(part.roll[v])))
                 prepared[v] += voxel_device(device).array(np.ascontiguousarray(added.T))
         origins = np.array([part.origin(v) for v in each])
         origins[:, 0] += zeros[0]

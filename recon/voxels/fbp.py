@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numba import get_num_threads
@@ -28,6 +28,7 @@ from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, samp
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # filtered at a time
+_FEW = 5  # columns
 
 
 def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -75,75 +76,69 @@ def _known(filter: str) -> None:
         raise ValueError(unknown("filter", filter, get_args(Filter)))
 
 
-@dataclass(frozen=True, eq=False)
-class ContinuedRows:
-    """Rows that end in matter, taken on beyond an edge as an ellipse about the rotation axis.
+def continuation(
+    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter,
+    radius: float | None,
+) -> tuple[F32 | None, NDArray[Any]]:  # fmt: skip
+    """What filtering brings inside [row, side, col], zeros counted, if rows go on beyond an edge from 1 as an ellipse.
 
-    Such a row makes a rim and loses the middle of a volume, for the filter takes what is beyond for air (Lewitt 1979,
-    Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
+    It is 0 where the mean of the views [row, col] ends in air, or an opposite view sees on.
 
-    Attributes:
-        filtered: float32 [row, side, col], what filtering brings into a row, and into the columns of zeros beside it,
-            if it goes on beyond an edge from 1; 0 where it ends in air.
+    A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
+    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
+
+    Args:
+        weights: [view, 1 + col + 1], of `ray_weights`.
+        radius: of the sample, mm; None: the `sample_reach` of sixteen rows and more together.
+
+    Returns:
+        None where no row goes on, and the weights. Of rows that do, they are those at the axis in all columns where one
+        edge lies a few columns farther out than the other: too few for shares to change over, and the ellipse has them.
     """
-
-    filtered: F32
-
-    @classmethod
-    def of(
-        cls, mean: F32, geometry: Geometry, beyond: F64, zeros: tuple[int, int], filter: Filter, radius: float | None
-    ) -> ContinuedRows | None:
-        """The continuation of rows by the mean of their views [row, col]; None where all end in air.
-
-        Args:
-            beyond: [view, side], weights of what lies beyond the edges.
-            zeros: columns beside the rows that are wanted, too.
-            radius: of the sample, mm; None: `sample_reach`.
-        """
-        cut = ends_in_matter(mean) & beyond.any(axis=0)
-        if not cut.any():
-            return None
-        cols, axis = mean.shape[1], geometry.axis_col + float(geometry.offsets[:, 0].mean())
-        edges = np.array([axis + 0.5, cols - 0.5 - axis])
-        filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
-        for rows in np.array_split(np.arange(len(mean)), max(1, len(mean) // SLICES)):
-            rows = rows[cut[rows].any(axis=1)]
-            if not rows.size:
-                continue
-            least = float(np.abs(edges[cut[rows].any(axis=0)]).max())
-            reach = sample_reach(mean[rows], axis) if radius is None else _reach(radius, geometry)
-            reach = min(max(reach, least), FARTHEST * edges.max())
-            length = max(*zeros, math.ceil(reach - edges.min()))
-            fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))
-            sides = np.zeros((2, fall.size), np.float32)
-            sides[0, :length], sides[1, length + cols :] = fall[:length], fall[length + cols :]
-            sides /= np.maximum(edge_levels(fall[length : length + cols]), 1e-6 * reach)[:, None]
-            beyond_them = filter_projections(sides, geometry.sample_pitch, filter)
-            filtered[rows] = cut[rows, :, None] * beyond_them[:, length - zeros[0] : length + cols + zeros[1]]
-        return cls(filtered)
-
-    def added(self, views: F32, beyond: F64) -> F32:
-        """What the continuation adds to filtered views [..., row, col], by the weights [..., side] beyond their edges.
-
-        Args:
-            views: float32 [..., row, col], not weighed.
-        """
-        levels = (edge_levels(views) * beyond[..., None, :]).astype(np.float32)
-        return levels[..., :1] * self.filtered[:, 0] + levels[..., 1:] * self.filtered[:, 1]
+    cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
+    axis = float(axes.mean())
+    edges = np.array([axis + 0.5, cols - 0.5 - axis])
+    if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW:
+        weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
+    cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
+    there = np.flatnonzero(cut.any(axis=1))
+    if not there.size:
+        return None, given
+    filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
+    for rows in np.array_split(there, max(1, there.size // SLICES)):
+        reach = sample_reach(mean[rows], axis) if radius is None else _columns_to(radius, geometry)
+        reach = min(max(reach, *np.abs(edges * cut[rows].any(axis=0))), FARTHEST * edges.max())
+        length = max(*zeros, math.ceil(reach - edges.min()))
+        fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))
+        sides = np.zeros((2, fall.size), np.float32)
+        sides[0, :length], sides[1, length + cols :] = fall[:length], fall[length + cols :]
+        sides /= np.maximum(edge_levels(fall[length : length + cols]), 1e-6 * reach)[:, None]
+        wide = filter_projections(sides, geometry.sample_pitch, filter)
+        filtered[rows] = cut[rows, :, None] * wide[:, length - zeros[0] : length + cols + zeros[1]]
+    return filtered, weights
 
 
-def _reach(radius: float, geometry: Geometry) -> float:
-    """Columns from the axis to the image of a sample of this radius (mm)."""
+def continued(beyond: F32, views: F32, weights: NDArray[np.floating]) -> F32:
+    """To add to filtered views: a `continuation` times the edges of views [..., row, col] and their weights [..., col].
+
+    Args:
+        weights: as `continuation`; `views` are without them.
+    """
+    levels = (edge_levels(views) * weights[..., None, (0, -1)]).astype(np.float32)
+    return levels[..., :1] * beyond[:, 0] + levels[..., 1:] * beyond[:, 1]
+
+
+def _columns_to(radius: float, geometry: Geometry) -> float:
     return radius / geometry.sample_pitch / math.sqrt(max(1 - (radius / geometry.sod) ** 2, 0.01))
 
 
 def columns_beside(geometry: Geometry, zeros: tuple[int, int], radius: float | None) -> tuple[int, int]:
-    """Columns of zeros beside the views, as many as it takes to see a sample of this radius (mm)."""
+    """Columns of zeros beside the views, as many as show a sample of this radius (mm)."""
     if radius is None:
         return zeros
-    axis, reach = geometry.axis_col + geometry.offsets[:, 0], math.ceil(_reach(radius, geometry))
-    right = reach - (geometry.detector_shape[1] - 1 - float(axis.max()))
-    return max(zeros[0], math.ceil(reach - float(axis.min()))), max(zeros[1], math.ceil(right))
+    axis, reach = geometry.axis_col + geometry.offsets[:, 0], _columns_to(radius, geometry) + 1
+    beside = reach - axis.min(), reach + axis.max() - geometry.detector_shape[1]
+    return max(zeros[0], math.ceil(beside[0])), max(zeros[1], math.ceil(beside[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +147,7 @@ class FbpPlan:
 
     Attributes:
         geometry, grid, filter: as given.
-        share: float32 [view, 1, col], quadrature weight of each ray.
-        beyond: [view, side], of what lies beyond the edges.
+        share: float32 [view, 1, 1 + col + 1], weight of each ray, and of what lies beyond the edges.
         radius: of the sample, mm; None: as its rows tell.
         column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
             holds for all slices.
@@ -166,7 +160,6 @@ class FbpPlan:
     grid: Grid
     filter: Filter
     share: F32
-    beyond: F64
     radius: float | None
     column_shares: F64 | None
     zeros: tuple[int, int]
@@ -207,12 +200,10 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius:
     if is_gridded(geometry, grid, filter):
         response = partial(ramp, pixel_pitch=1.0, filter=filter)
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
-    share, rows = weights[:, None, 1:-1].astype(np.float32), z + geometry.axis_row
+    share, rows = weights.astype(np.float32)[:, None], z + geometry.axis_row
     differ = geometry.shifts[:, 1].any() and not seen_by(geometry, rows).all()
     shares = column_shares(geometry)[0] if differ else None
-    return FbpPlan(
-        geometry, grid, filter, share, weights[:, (0, -1)], radius, shares, zeros, rows, back_project
-    )  # fmt: skip
+    return FbpPlan(geometry, grid, filter, share, radius, shares, zeros, rows, back_project)
 
 
 def fbp_memory(views: int, cols: int) -> int:
@@ -243,21 +234,21 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         ValueError: values are not finite.
     """
     geometry, rows = plan.geometry, plan.rows[part]
-    share = _shares_of(plan, rows)
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
     low, end = plan.rows_of(part)
     own = slice(low - first, end - first)
     mean = projections[:, own].mean(axis=0)
-    continued = ContinuedRows.of(mean, geometry, plan.beyond, plan.zeros, plan.filter, plan.radius)
+    beyond, weights = continuation(mean, geometry, plan.share[:, 0], plan.zeros, plan.filter, plan.radius)
+    share = weights[:, None] if plan.column_shares is None else _shares_of(plan, rows, plan.column_shares)
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
-        weighed *= share[views]
+        weighed *= share[views, :, 1:-1]
         if any(plan.zeros):
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
-        if continued is not None:
-            added = continued.added(projections[views, own], plan.beyond[views])
+        if beyond is not None:
+            added = continued(beyond, projections[views, own], weights[views])
             filtered += _slab(added, geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
@@ -266,15 +257,13 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     plan.back_project(columns, out)
 
 
-def _shares_of(plan: FbpPlan, rows: F64) -> F32:
-    """Weights of the rays of some slices, float32 [view, slice or 1, col]."""
-    if plan.column_shares is None:
-        return plan.share
+def _shares_of(plan: FbpPlan, rows: F64, shares: F64) -> F32:
+    """Weights of the rays of some slices, float32 [view, slice or 1, 1 + col + 1]."""
     seen = seen_by(plan.geometry, rows)
     if seen.all():
         return plan.share
-    weights = [slice_weights(plan.geometry, some, plan.column_shares) for some in seen.T]
-    return np.stack(weights, axis=1)[..., 1:-1].astype(np.float32)
+    weights = [slice_weights(plan.geometry, some, shares) for some in seen.T]
+    return np.stack(weights, axis=1).astype(np.float32)
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:

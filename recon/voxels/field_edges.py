@@ -70,12 +70,14 @@ class FieldEdges:
         levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
         mean: of the views.
         of_views: line integral at these edges [view] of the `views` that were looked at.
+        continued: whether some row ends in matter there, which FBP and FDK continue.
     """
 
     levels: Mapping[str, float]
     mean: float
     of_views: Mapping[str, F64] = field(default_factory=dict)
     views: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    continued: bool = False
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
@@ -106,7 +108,10 @@ class FieldEdges:
             for side, values in edges.items()
         }
         of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
-        return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))), of_views, views)
+        some = np.nan_to_num(some)
+        cut = ends_in_matter(some.mean(axis=0))
+        continued = any(cut[:, int(side == "right")].any() for side in edges)
+        return cls(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, views, continued)
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
         """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.

@@ -121,10 +121,7 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Share [view, 1 + col + 1] of each ray of a full turn in what it and its opposite measure, and columns of zeros.
-
-    See `ray_weights` for the first and the last.
-    """
+    """Share [view, 1 + col + 1] of each ray of a full turn in what it and its opposite measure, and zeros beside."""
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     return _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
 
