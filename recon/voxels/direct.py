@@ -98,9 +98,8 @@ def fdk(
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: of the volume; None: `Grid.matching(geometry)`.
-        filter: "ram-lak", "shepp-logan" or "hann".
+        filter, radius: as of `fbp`.
         on_block: told how many of how many layers are done, counted by their views.
-        radius: as of `fbp`.
 
     Returns:
         float32 [z, y, x], 1/mm.
@@ -114,20 +113,21 @@ def fdk(
         raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
     if not geometry.is_straight:
         raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
-    weights, zeros, beyond = _weights(projections, geometry, grid, filter, radius)
-    prepare = partial(_prepared_views, zeros=zeros, beyond=beyond, filter=filter)
-    return _by_slabs(projections, geometry, grid, weights, prepare, _along_columns, on_block)
+    prepare = partial(_prepared_views, filter=filter)
+    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, _along_columns, on_block)
 
 
-Prepare = Callable[[F32, Geometry, F64], tuple[Any, tuple[Any, ...]]]
-"""Some views, weighed and filtered, by their geometry and the weights of their rays; and what a kernel takes of the
-views before the voxels."""
+Prepare = Callable[[F32, Geometry, F64, tuple[int, int], F32 | None], tuple[Any, tuple[Any, ...]]]
+"""Some views, weighed and filtered, by their geometry, the weights of their rays, columns of zeros beside them and what
+lies beyond; and what a kernel takes of the views before the voxels."""
 
 
-def _weights(
-    projections: F32, geometry: Geometry, grid: Grid, filter: Filter, radius: float | None
-) -> tuple[F64, tuple[int, int], F32 | None]:
-    """Weights [view, 1 + col + 1] and columns of zeros as `ray_weights`, and the `continuation`.
+def _by_slabs(
+    projections: F32, geometry: Geometry, grid: Grid, way: tuple[Filter, float | None], prepare: Prepare,
+    kernel: Callable[..., None], on_block: Callable[[int, int], None], device: str = "cpu",
+) -> F32:  # fmt: skip
+    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device; `way`: filter and
+    radius of `fbp`.
 
     Raises:
         ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
@@ -145,24 +145,10 @@ def _weights(
         )
     weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
     weights *= np.cos(geometry.tilt)[:, None]  # the part of Fourier space between two views shrinks by it
-    zeros = columns_beside(geometry, zeros, radius)
-    some = spread(np.arange(geometry.n_views), _LOOKED_AT)
-    mean = np.zeros(geometry.detector_shape, np.float32)
-    for view in some:
-        mean += projections[view] / np.float32(some.size)
-    beyond, weights = continuation(mean, geometry, weights, zeros, filter, radius)
-    return weights, zeros, beyond
-
-
-def _by_slabs(
-    projections: F32, geometry: Geometry, grid: Grid, weights: F64, prepare: Prepare, kernel: Callable[..., None],
-    on_block: Callable[[int, int], None], device: str = "cpu",
-) -> F32:  # fmt: skip
-    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device.
-
-    Raises:
-        ValueError: values are not finite.
-    """
+    zeros = columns_beside(geometry, zeros, way[1])
+    looked_at = spread(np.arange(geometry.n_views), _LOOKED_AT)
+    mean = sum(projections[view] / np.float32(looked_at.size) for view in looked_at)
+    beyond, weights = continuation(mean, geometry, weights, zeros, *way)
     z, y, x = grid.coordinates()
     there = voxel_device(device)
     volume = there.zeros((y.size, x.size, z.size))
@@ -170,7 +156,7 @@ def _by_slabs(
     for start in range(0, geometry.n_views, slab):
         some = slice(start, start + slab)
         part = geometry.select(some)
-        prepared, of_views = prepare(projections[some], part, weights[some])
+        prepared, of_views = prepare(projections[some], part, weights[some], zeros, beyond)
         if not math.isfinite(float(prepared.max()) - float(prepared.min())):  # of any device; the filter spreads both
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         samples = _SAMPLES * part.n_views * x.size * z.size
@@ -263,10 +249,11 @@ def posed_direct(
             "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
             "iterative method or r2"
         )
-    weights, zeros, beyond = _weights(projections, geometry, grid, filter, radius)
     gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
 
-    def prepare(views: F32, part: Geometry, weights: F64) -> tuple[Any, tuple[Any, ...]]:
+    def prepare(
+        views: F32, part: Geometry, weights: F64, zeros: tuple[int, int], beyond: F32 | None
+    ) -> tuple[Any, tuple[Any, ...]]:
         each, (rows, cols) = range(part.n_views), part.detector_shape
         responses = (_response(rows, cols + sum(zeros), float(roll), part.sample_pitch, filter) for roll in part.roll)
         if gpu is None:
@@ -284,7 +271,7 @@ def posed_direct(
         return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
 
     kernel = _along_rays if gpu is None else gpu.back_project
-    return _by_slabs(projections, geometry, grid, weights, prepare, kernel, on_block, device)
+    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, kernel, on_block, device)
 
 
 Response = tuple[int, tuple[int, int], F32]

@@ -77,27 +77,20 @@ def _known(filter: str) -> None:
 
 
 def continuation(
-    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter,
-    radius: float | None,
-) -> tuple[F32 | None, NDArray[Any]]:  # fmt: skip
+    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter, radius: float | None
+) -> tuple[F32 | None, NDArray[Any]]:
     """What filtering brings inside [row, side, col], zeros counted, if rows go on beyond an edge from 1 as an ellipse.
 
-    It is 0 where the mean of the views [row, col] ends in air, or an opposite view sees on.
-
     A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
-    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
-
-    Args:
-        weights: [view, 1 + col + 1], of `ray_weights`.
-        radius: of the sample, mm; None: the `sample_reach` of sixteen rows and more together.
+    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells. The ellipse ends at
+    the radius of the sample (mm), or at the `sample_reach` of the mean of the views [row, col], sixteen rows together.
 
     Returns:
-        None where no row goes on, and the weights. Of rows that do, they are those at the axis in all columns where one
-        edge lies a few columns farther out than the other: too few for shares to change over, and the ellipse has them.
+        0 for rows that end in air, None if all do; and the weights [view, 1 + col + 1] of `ray_weights`. If a row goes
+        on, and one edge lies a few columns farther out, too few for shares to change over, all are those at the axis.
     """
     cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
-    axis = float(axes.mean())
-    edges = np.array([axis + 0.5, cols - 0.5 - axis])
+    edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
     if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW:
         weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
     cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
@@ -119,11 +112,7 @@ def continuation(
 
 
 def continued(beyond: F32, views: F32, weights: NDArray[np.floating]) -> F32:
-    """To add to filtered views: a `continuation` times the edges of views [..., row, col] and their weights [..., col].
-
-    Args:
-        weights: as `continuation`; `views` are without them.
-    """
+    """To add to filtered views: `continuation` times the edges of the views [..., row, col] and their weights."""
     levels = (edge_levels(views) * weights[..., None, (0, -1)]).astype(np.float32)
     return levels[..., :1] * beyond[:, 0] + levels[..., 1:] * beyond[:, 1]
 
@@ -147,8 +136,8 @@ class FbpPlan:
 
     Attributes:
         geometry, grid, filter: as given.
-        share: float32 [view, 1, 1 + col + 1], weight of each ray, and of what lies beyond the edges.
-        radius: of the sample, mm; None: as its rows tell.
+        share: float32 [view, 1, 1 + col + 1], quadrature weight of each ray, see `ray_weights`.
+        radius: as of `fbp`.
         column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
             holds for all slices.
         zeros: columns of zeros to add before and after these.
@@ -310,8 +299,7 @@ def fbp(
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
-        radius: of a sample that is wider than the field, mm: there its rows end, and so far voxels of a wider grid have
-            values. None: as `sample_reach` tells, and values within the field.
+        radius: of a sample wider than the field, mm: its rows end there, and voxels of a wider grid have values so far.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).

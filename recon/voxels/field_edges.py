@@ -37,10 +37,7 @@ def edge_levels(rows: F32) -> F32:
 
 
 def ends_in_matter(mean: F32) -> NDArray[np.bool_]:
-    """Whether a sample goes on beyond the edges of rows [row, side], by the mean of the views [row, col].
-
-    There the level at the edge is a tenth of that in the middle, and not noise.
-    """
+    """Whether rows [row, side] of the mean of the views [row, col] end at a tenth of their depth, and not in noise."""
     level = edge_levels(mean)
     return np.asarray((level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST))
 
@@ -48,10 +45,9 @@ def ends_in_matter(mean: F32) -> NDArray[np.bool_]:
 def sample_reach(mean: F32, axis: float) -> float:
     """Columns from the axis to where the mean of the views [row, col] ends, if it falls as an ellipse about it.
 
-    The square of an ellipse is a line over the square of the way from its middle. The line through all columns errs
-    least on grains, the outer ones are right about a dense core, which makes all others too short: the longer counts.
-    Beside the fall at the edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385) FBP of packed grains gains 0.6 dB where
-    the can is twice as wide as the field. Far where nothing falls.
+    The square of an ellipse is a line over the square of the way from its middle. All columns tell it best, only outer
+    ones beside a dense core, which makes it too short: the longer counts. By the edges alone (Hsieh et al. 2004, Med.
+    Phys. 31, 2385) FBP of packed grains loses 0.6 dB where the can is twice as wide as the field.
     """
     way, square = (np.arange(mean.shape[1]) - axis) ** 2, (np.asarray(mean, np.float64) ** 2).mean(axis=0)
     ends = []
@@ -109,9 +105,8 @@ class FieldEdges:
         }
         of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
         some = np.nan_to_num(some)
-        cut = ends_in_matter(some.mean(axis=0))
-        continued = any(cut[:, int(side == "right")].any() for side in edges)
-        return cls(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, views, continued)
+        cut = ends_in_matter(some.mean(axis=0))[:, [int(side == "right") for side in edges]]
+        return cls(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, views, bool(cut.any()))
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
         """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.

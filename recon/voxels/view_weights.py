@@ -110,8 +110,8 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     view from the other side would be missing.
 
     Returns:
-        [view, 1 + col + 1], the first and the last of what lies beyond the edges, and the columns of zeros to add
-        before and after these. What an opposite view sees beyond an edge has no weight there.
+        [view, 1 + col + 1], first and last of what lies beyond the edges (0 where an opposite view sees it), and the
+        columns of zeros to add before and after the others.
     """
     both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1] + 2, axis=1)
     if not covers_the_circle(geometry.angles):
