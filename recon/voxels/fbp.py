@@ -83,7 +83,7 @@ def continuation(
 
     A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
     (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells. The ellipse ends at
-    the radius of the sample (mm), or at the `sample_reach` of the mean of the views [row, col], sixteen rows together.
+    the radius of the sample (mm), or at the `sample_reach` of the mean of the views [row, col].
 
     Returns:
         0 for rows that end in air, None if all do; and the weights [view, 1 + col + 1] of `ray_weights`. If a row goes
@@ -98,16 +98,16 @@ def continuation(
     if not there.size:
         return None, given
     filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
-    for rows in np.array_split(there, max(1, there.size // SLICES)):
-        reach = sample_reach(mean[rows], axis) if radius is None else _columns_to(radius, geometry)
-        reach = min(max(reach, *np.abs(edges * cut[rows].any(axis=0))), FARTHEST * edges.max())
+    ends = sample_reach(mean, axis) if radius is None else np.full(len(mean), _columns_to(radius, geometry))
+    for row in there:
+        reach = min(max(ends[row], *np.abs(edges * cut[row])), FARTHEST * edges.max())
         length = max(*zeros, math.ceil(reach - edges.min()))
         fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))
         sides = np.zeros((2, fall.size), np.float32)
         sides[0, :length], sides[1, length + cols :] = fall[:length], fall[length + cols :]
         sides /= np.maximum(edge_levels(fall[length : length + cols]), 1e-6 * reach)[:, None]
         wide = filter_projections(sides, geometry.sample_pitch, filter)
-        filtered[rows] = cut[rows, :, None] * wide[:, length - zeros[0] : length + cols + zeros[1]]
+        filtered[row] = cut[row, :, None] * wide[:, length - zeros[0] : length + cols + zeros[1]]
     return filtered, weights
 
 

@@ -62,7 +62,7 @@ def test_views_that_end_in_air_are_filtered_as_ever() -> None:
 @pytest.mark.parametrize("radius", [33.0, 48.0, 64.0, 96.0])
 @pytest.mark.parametrize("core", [0.0, 15.0])
 def test_the_end_of_a_sample_shows_in_the_fall_of_its_rows(radius: float, core: float) -> None:
-    """A dense core makes the whole row fall steeply, and grains the columns near the edge."""
+    """A dense core makes the whole row fall steeply; noise then has the outer columns alone."""
     u = np.arange(COLS) - 30.0
     mean = 0.02 * np.sqrt(radius**2 - u**2) + 0.06 * np.sqrt(np.clip(core**2 - u**2, 0, None))
     assert sample_reach(mean[None].astype(np.float32), 30.0) == pytest.approx(radius, rel=0.01)
