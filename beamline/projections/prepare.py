@@ -40,6 +40,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
@@ -344,7 +345,8 @@ def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepa
     if unlevelled and edges.mean > 0 and source.quantity == "counts" and selection.step(Air).model != "none":
         light = without_air(source, edges.mean)
     if sides:
-        warn(f"{cut_sentence(sides)} {light}".rstrip())
+        continued = edges.continued and has_direct_method(geometry)
+        warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
     elif ranges:
         warn(passing_sentence(ranges, geometry.n_views))
     elif light:

@@ -19,18 +19,20 @@ from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.back_project import SLICES, nanoseconds
 from recon.voxels.devices import voxel_device
-from recon.voxels.fbp import Filter, fbp, fbp_memory, filter_projections, ramp
+from recon.voxels.fbp import Filter, columns_beside, continuation, continued, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
 _f = np.float32
 _SAMPLES = 4  # samples of a projector that take as long as a voxel in a view
+_LOOKED_AT = 32  # views, whose mean tells how rows go on: more are not in memory
 SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 
 
@@ -83,19 +85,20 @@ def fdk(
     grid: Grid | None = None,
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
+    radius: float | None = None,
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
     Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
     interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
     both (see `fan_shares`). A short scan, of 180 degrees and the fan's angle or more, must see it in every view (see
-    `cone_weights`). Matter that views cut off brightens the rim. A voxel that a view does not see gets nothing from it.
+    `cone_weights`). Rows that end in matter go on as in `fbp`. A voxel that a view does not see gets nothing from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: of the volume; None: `Grid.matching(geometry)`.
-        filter: "ram-lak", "shepp-logan" or "hann".
+        filter, radius: as of `fbp`.
         on_block: told how many of how many layers are done, counted by their views.
 
     Returns:
@@ -110,24 +113,21 @@ def fdk(
         raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
     if not geometry.is_straight:
         raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
-    return _by_slabs(
-        projections, geometry, grid, cone_weights, partial(_prepared_views, filter=filter), _along_columns, on_block
-    )
+    prepare = partial(_prepared_views, filter=filter)
+    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, _along_columns, on_block)
 
 
-Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[Any, tuple[Any, ...]]]
-"""Some views, weighed and filtered, by their geometry, the weights of their rays and columns of zeros beside them; and
-what a kernel takes of the views before the voxels."""
+Prepare = Callable[[F32, Geometry, F64, tuple[int, int], F32 | None], tuple[Any, tuple[Any, ...]]]
+"""Some views, weighed and filtered, by their geometry, the weights of their rays, columns of zeros beside them and what
+lies beyond; and what a kernel takes of the views before the voxels."""
 
 
 def _by_slabs(
-    projections: F32, geometry: Geometry, grid: Grid, weights_of: Callable[[Geometry], tuple[F64, tuple[int, int]]],
-    prepare: Prepare,
-    kernel: Callable[..., None],
-    on_block: Callable[[int, int], None],
-    device: str = "cpu",
+    projections: F32, geometry: Geometry, grid: Grid, way: tuple[Filter, float | None], prepare: Prepare,
+    kernel: Callable[..., None], on_block: Callable[[int, int], None], device: str = "cpu",
 ) -> F32:  # fmt: skip
-    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device.
+    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device; `way`: filter and
+    radius of `fbp`.
 
     Raises:
         ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
@@ -143,7 +143,12 @@ def _by_slabs(
         raise ValueError(
             f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
         )
-    weights, zeros = weights_of(geometry)
+    weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
+    weights *= np.cos(geometry.tilt)[:, None]  # the part of Fourier space between two views shrinks by it
+    zeros = columns_beside(geometry, zeros, way[1])
+    looked_at = spread(np.arange(geometry.n_views), _LOOKED_AT)
+    mean = sum(projections[view] / np.float32(looked_at.size) for view in looked_at)
+    beyond, weights = continuation(mean, geometry, weights, zeros, *way)
     z, y, x = grid.coordinates()
     there = voxel_device(device)
     volume = there.zeros((y.size, x.size, z.size))
@@ -151,7 +156,7 @@ def _by_slabs(
     for start in range(0, geometry.n_views, slab):
         some = slice(start, start + slab)
         part = geometry.select(some)
-        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
+        prepared, of_views = prepare(projections[some], part, weights[some], zeros, beyond)
         if not math.isfinite(float(prepared.max()) - float(prepared.min())):  # of any device; the filter spreads both
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         samples = _SAMPLES * part.n_views * x.size * z.size
@@ -163,23 +168,30 @@ def _by_slabs(
 
 
 def _prepared_views(
-    views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter
+    views: F32, geometry: Geometry, weights: F64, zeros: tuple[int, int], beyond: F32 | None, filter: Filter
 ) -> tuple[F32, tuple[Any, ...]]:
-    """Views times the weights [view, col] and the cosine of each ray, filtered. Columns of zeros stand before and
-    after. Shape [view, col + 2, row + 2], the rim twice."""
+    """Views times the weights [view, 1 + col + 1] and the cosine of each ray, filtered, with columns beyond them.
+    Shape [view, col + 2, row + 2], the rim twice."""
     rows, cols = geometry.detector_shape
-    out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
+    out = np.empty((geometry.n_views, sum(zeros) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):
-        col0, row0 = geometry.origin(view)
-        u = (np.arange(cols) - col0) * geometry.pixel_pitch
-        v = (np.arange(rows) - row0) * geometry.pixel_pitch
-        cosine = geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
+        cosine = _cosine(geometry, view)
         # The ramp is that of a detector at the rotation axis.
-        weighed = np.pad((views[view] * (weights[view] * cosine)).astype(np.float32), ((0, 0), beyond))
-        out[view] = np.pad(filter_projections(weighed, geometry.sample_pitch, filter).T, 1, mode="edge")
-    origin = geometry.axis_col + geometry.shifts[:, 0] + beyond[0], geometry.axis_row + geometry.shifts[:, 1]
+        weighed = np.pad((views[view] * (weights[view, 1:-1] * cosine)).astype(np.float32), ((0, 0), zeros))
+        filtered = filter_projections(weighed, geometry.sample_pitch, filter)
+        if beyond is not None:
+            filtered += continued(beyond, views[view] * cosine, weights[view])
+        out[view] = np.pad(filtered.T, 1, mode="edge")
+    origin = geometry.axis_col + geometry.shifts[:, 0] + zeros[0], geometry.axis_row + geometry.shifts[:, 1]
     turn = np.cos(geometry.angles), np.sin(geometry.angles)
     return out, (*turn, *origin, geometry.sod, geometry.sdd, geometry.pixel_pitch)
+
+
+def _cosine(geometry: Geometry, view: int) -> F64:
+    """Cosine [row, col] of the rays of a cone to its central one."""
+    (rows, cols), (col0, row0) = geometry.detector_shape, geometry.origin(view)
+    u, v = (np.arange(cols) - col0) * geometry.pixel_pitch, (np.arange(rows) - row0) * geometry.pixel_pitch
+    return np.asarray(geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2))
 
 
 @njit(**OPTIONS)
@@ -222,12 +234,13 @@ def posed_direct(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     device: str = "cpu",
+    radius: float | None = None,
 ) -> F32:
     """Reconstruct views in any pose [view, row, col]; see `fbp` and `fdk` for arguments, result and errors.
 
     Two things differ from them. The ramp runs along the direction of the detector that is across the rotation axis,
     which a rolled detector's rows are not. Each voxel takes the filtered views where its own ray meets the detector, so
-    no view is resampled. A tilted view weighs cos(tilt): the part of Fourier space between two views shrinks by it.
+    no view is resampled. A tilted view weighs cos(tilt). What lies beyond an edge is smooth from row to row.
 
     Weights of columns that are measured twice count rolled and tilted views as straight ones.
     """
@@ -236,27 +249,29 @@ def posed_direct(
             "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
             "iterative method or r2"
         )
-
-    def weights_of(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-        weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
-        return weights * np.cos(geometry.tilt)[:, None], zeros
-
     gpu = None if device == "cpu" else import_module("recon.kernels.gpu.back_project")
 
-    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[Any, tuple[Any, ...]]:
+    def prepare(
+        views: F32, part: Geometry, weights: F64, zeros: tuple[int, int], beyond: F32 | None
+    ) -> tuple[Any, tuple[Any, ...]]:
         each, (rows, cols) = range(part.n_views), part.detector_shape
         responses = (_response(rows, cols + sum(zeros), float(roll), part.sample_pitch, filter) for roll in part.roll)
         if gpu is None:
-            prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, next(responses)) for v in each])
+            prepared = np.stack([_prepared(views[v], part, v, weights[v, 1:-1], zeros, next(responses)) for v in each])
         else:
-            prepared = gpu.filtered(views, part, weights, zeros, responses)
+            prepared = gpu.filtered(views, part, weights[:, 1:-1], zeros, responses)
+        for v in each:
+            if beyond is not None:
+                image = views[v] * (_cosine(part, v) if part.is_cone else 1)
+                added = continued(beyond, image, weights[v] * abs(math.cos(part.roll[v])))
+                prepared[v] += voxel_device(device).array(np.ascontiguousarray(added.T))
         origins = np.array([part.origin(v) for v in each])
         origins[:, 0] += zeros[0]
         distances = (part.sod, part.sdd) if part.is_cone else (0.0, 0.0)
         return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
 
     kernel = _along_rays if gpu is None else gpu.back_project
-    return _by_slabs(projections, geometry, grid, weights_of, prepare, kernel, on_block, device)
+    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, kernel, on_block, device)
 
 
 Response = tuple[int, tuple[int, int], F32]
@@ -281,9 +296,7 @@ def _prepared(
     rows, cols = geometry.detector_shape
     weighed = image * weights
     if geometry.is_cone:
-        col0, row0 = geometry.origin(view)
-        u, v = (np.arange(cols) - col0) * geometry.pixel_pitch, (np.arange(rows) - row0) * geometry.pixel_pitch
-        weighed *= geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
+        weighed *= _cosine(geometry, view)
     beyond, shape, gain = response
     wide = np.pad(np.pad(weighed, ((0, 0), zeros)), ((beyond, beyond), (0, 0)), mode="edge").astype(np.float32)
     filtered = fft.irfft2(fft.rfft2(wide, shape) * gain, shape)
@@ -336,6 +349,7 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
     device: str = "cpu",
+    radius: float | None = None,
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
     and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Wide views have no
@@ -343,10 +357,10 @@ def direct(
     if not (own := geometry.ordinary).all():
         projections, geometry = projections[own], geometry.select(np.flatnonzero(own))
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
-        return posed_direct(projections, geometry, grid, filter, on_block, device)
+        return posed_direct(projections, geometry, grid, filter, on_block, device, radius)
     if geometry.is_cone:
-        return fdk(projections, geometry, grid, filter, on_block)
-    return fbp(projections, geometry, grid, filter, on_block, out)
+        return fdk(projections, geometry, grid, filter, on_block, radius)
+    return fbp(projections, geometry, grid, filter, on_block, out, radius)
 
 
 def direct_work(geometry: Geometry, grid: Grid) -> Work:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numba import get_num_threads
@@ -24,12 +24,11 @@ from recon.base.geometry import Geometry, require_views
 from recon.base.registry import unknown
 from recon.base.volume import Grid, bands_of, slices_of
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
+from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, sample_reach
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # filtered at a time
-_EDGE = 3  # columns at least, whose mean is the level at an edge
-NEAREST, FARTHEST, _STEP = 1.06, 10.0, 0.06  # half widths to the end of a sample; step of their logarithm
-CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
+_FEW = 5  # columns
 
 
 def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
@@ -77,51 +76,58 @@ def _known(filter: str) -> None:
         raise ValueError(unknown("filter", filter, get_args(Filter)))
 
 
-def edge_levels(projections: F32) -> dict[float, F32]:
-    """Line integrals [view, row, side] at the left and the right edge of rows where a sample goes on beyond, else 0.
-
-    A sample is cut off where the mean of the views at the edge is a tenth of that in the middle, and not noise. They
-    are sorted by how far the sample reaches, in half widths of the row, by the ellipse that goes on as the mean of the
-    views does at the edge (Hsieh et al. 2004, Med. Phys. 31, 2385).
-    """
-    cols = projections.shape[-1]
-    n = min(max(_EDGE, cols // 100), cols)
-    m = max(cols // 8, n)
-    sides = np.stack([part.mean(axis=-1) for part in (projections[..., :n], projections[..., cols - n :])], axis=-1)
-    level, mean = sides.mean(axis=0), projections.mean(axis=0)
-    cut = (level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST)
-    if not cut.any() or cols <= 2 * m:  # no columns within, or too few to tell how it goes on
-        return {}
-    # The square of an ellipse falls as the square of the way from its middle, which is taken to be that of the row.
-    inner = np.stack([mean[:, m : m + n].mean(axis=-1), mean[:, cols - m - n : cols - m].mean(axis=-1)], axis=-1)
-    edge, within = 1 - n / cols, 1 - (2 * m + n) / cols
-    fall = np.maximum(inner**2 - level**2, 0) / (edge**2 - within**2) if edge > within else np.zeros_like(level)
-    reach = np.sqrt(edge**2 + level**2 / np.maximum(fall, level**2 / FARTHEST**2 + 1e-30))
-    step = np.round(np.log(np.clip(reach, NEAREST, FARTHEST)) / _STEP)
-    found = {}
-    for k in np.unique(step[cut]).tolist():
-        found[math.exp(k * _STEP)] = np.where(cut & (step == k), sides, np.float32(0)).astype(np.float32)
-    return found
-
-
-def beyond_edges(cols: int, zeros: tuple[int, int], pixel_pitch: float, filter: Filter, reach: float) -> F32:
-    """[side, col]: what filtering brings inside if a row goes on beyond an edge, from 1, as an ellipse does.
+def continuation(
+    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter, radius: float | None
+) -> tuple[F32 | None, NDArray[Any]]:
+    """What filtering brings inside [row, side, col], zeros counted, if rows go on beyond an edge from 1 as an ellipse.
 
     A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
-    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
+    (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells. The ellipse ends at
+    the radius of the sample (mm), or at the `sample_reach` of the mean of the views [row, col].
 
-    Args:
-        cols: of the row with the columns of zeros, which do not belong to it.
-        reach: from its middle to the ellipse's end, in half widths of the row.
+    Returns:
+        0 for rows that end in air, None if all do; and the weights [view, 1 + col + 1] of `ray_weights`. If a row goes
+        on, and one edge lies a few columns farther out, too few for shares to change over, all are those at the axis.
     """
-    half = (cols - sum(zeros)) / 2
-    length = math.ceil((FARTHEST * 1.1 - 1) * half)
-    u = 1 + (np.arange(length) + 0.5) / half
-    fall = np.sqrt(np.clip(reach**2 - u**2, 0, None) / (reach**2 - 1))
-    first, last = length + zeros[0], length + cols - zeros[1]
-    beyond = np.zeros((2, cols + 2 * length), np.float32)
-    beyond[0, first - length : first], beyond[1, last : last + length] = fall[::-1], fall
-    return filter_projections(beyond, pixel_pitch, filter)[:, length : length + cols]
+    cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
+    edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
+    if not geometry.is_cone and np.abs(2 * axes + 1 - cols).max() <= _FEW:
+        weights = np.repeat(weights[:, round(axis) + 1, None], cols + 2, axis=1)
+    cut = ends_in_matter(mean) & weights[:, (0, -1)].any(axis=0)
+    there = np.flatnonzero(cut.any(axis=1))
+    if not there.size:
+        return None, given
+    filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
+    ends = sample_reach(mean, axis) if radius is None else np.full(len(mean), _columns_to(radius, geometry))
+    for row in there:
+        reach = min(max(ends[row], *np.abs(edges * cut[row])), FARTHEST * edges.max())
+        length = max(*zeros, math.ceil(reach - edges.min()))
+        fall = np.sqrt(np.maximum(reach**2 - (np.arange(-length, cols + length) - axis) ** 2, 0))
+        sides = np.zeros((2, fall.size), np.float32)
+        sides[0, :length], sides[1, length + cols :] = fall[:length], fall[length + cols :]
+        sides /= np.maximum(edge_levels(fall[length : length + cols]), 1e-6 * reach)[:, None]
+        wide = filter_projections(sides, geometry.sample_pitch, filter)
+        filtered[row] = cut[row, :, None] * wide[:, length - zeros[0] : length + cols + zeros[1]]
+    return filtered, weights
+
+
+def continued(beyond: F32, views: F32, weights: NDArray[np.floating]) -> F32:
+    """To add to filtered views: `continuation` times the edges of the views [..., row, col] and their weights."""
+    levels = (edge_levels(views) * weights[..., None, (0, -1)]).astype(np.float32)
+    return levels[..., :1] * beyond[:, 0] + levels[..., 1:] * beyond[:, 1]
+
+
+def _columns_to(radius: float, geometry: Geometry) -> float:
+    return radius / geometry.sample_pitch / math.sqrt(max(1 - (radius / geometry.sod) ** 2, 0.01))
+
+
+def columns_beside(geometry: Geometry, zeros: tuple[int, int], radius: float | None) -> tuple[int, int]:
+    """Columns of zeros beside the views, as many as show a sample of this radius (mm)."""
+    if radius is None:
+        return zeros
+    axis, reach = geometry.axis_col + geometry.offsets[:, 0], _columns_to(radius, geometry) + 1
+    beside = reach - axis.min(), reach + axis.max() - geometry.detector_shape[1]
+    return max(zeros[0], math.ceil(beside[0])), max(zeros[1], math.ceil(beside[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +136,8 @@ class FbpPlan:
 
     Attributes:
         geometry, grid, filter: as given.
-        share: float32 [view, 1, col], quadrature weight of each ray.
+        share: float32 [view, 1, 1 + col + 1], quadrature weight of each ray, see `ray_weights`.
+        radius: as of `fbp`.
         column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
             holds for all slices.
         zeros: columns of zeros to add before and after these.
@@ -142,6 +149,7 @@ class FbpPlan:
     grid: Grid
     filter: Filter
     share: F32
+    radius: float | None
     column_shares: F64 | None
     zeros: tuple[int, int]
     rows: F64
@@ -160,7 +168,7 @@ class FbpPlan:
         return int(low), int(np.clip(math.floor(rows.max() + shifts.max()) + 1, low, last)) + 1
 
 
-def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
+def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius: float | None = None) -> FbpPlan:
     """The part of `fbp` that does not depend on the data; with a skew all rows are at the angle of the middle one.
 
     Raises:
@@ -174,6 +182,7 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
+    zeros = columns_beside(geometry, zeros, radius)
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
     cols = geometry.detector_shape[1] + sum(zeros)
     back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
@@ -182,9 +191,8 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
     share, rows = weights.astype(np.float32)[:, None], z + geometry.axis_row
     differ = geometry.shifts[:, 1].any() and not seen_by(geometry, rows).all()
-    return FbpPlan(
-        geometry, grid, filter, share, column_shares(geometry)[0] if differ else None, zeros, rows, back_project
-    )  # fmt: skip
+    shares = column_shares(geometry)[0] if differ else None
+    return FbpPlan(geometry, grid, filter, share, radius, shares, zeros, rows, back_project)
 
 
 def fbp_memory(views: int, cols: int) -> int:
@@ -215,23 +223,22 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         ValueError: values are not finite.
     """
     geometry, rows = plan.geometry, plan.rows[part]
-    share = _shares_of(plan, rows)
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
     low, end = plan.rows_of(part)
-    beyond = edge_levels(projections[:, low - first : end - first])
-    for sides in beyond.values():
-        sides[..., np.array(plan.zeros) > 0] = 0  # what is beyond this edge is seen by the opposite views
+    own = slice(low - first, end - first)
+    mean = projections[:, own].mean(axis=0)
+    beyond, weights = continuation(mean, geometry, plan.share[:, 0], plan.zeros, plan.filter, plan.radius)
+    share = weights[:, None] if plan.column_shares is None else _shares_of(plan, rows, plan.column_shares)
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
-        weighed *= share[views]
+        weighed *= share[views, :, 1:-1]
         if any(plan.zeros):
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
-        for reach, sides in beyond.items():
-            levels = _slab(sides[views], geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
-            levels *= plan.share[views][..., (0, -1)]
-            filtered += levels @ beyond_edges(filtered.shape[2], plan.zeros, geometry.pixel_pitch, plan.filter, reach)
+        if beyond is not None:
+            added = continued(beyond, projections[views, own], weights[views])
+            filtered += _slab(added, geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)
@@ -239,14 +246,12 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     plan.back_project(columns, out)
 
 
-def _shares_of(plan: FbpPlan, rows: F64) -> F32:
-    """Weights of the rays of some slices, float32 [view, slice or 1, col]."""
-    if plan.column_shares is None:
-        return plan.share
+def _shares_of(plan: FbpPlan, rows: F64, shares: F64) -> F32:
+    """Weights of the rays of some slices, float32 [view, slice or 1, 1 + col + 1]."""
     seen = seen_by(plan.geometry, rows)
     if seen.all():
         return plan.share
-    weights = [slice_weights(plan.geometry, some, plan.column_shares) for some in seen.T]
+    weights = [slice_weights(plan.geometry, some, shares) for some in seen.T]
     return np.stack(weights, axis=1).astype(np.float32)
 
 
@@ -278,6 +283,7 @@ def fbp(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
+    radius: float | None = None,
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
@@ -293,6 +299,7 @@ def fbp(
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
+        radius: of a sample wider than the field, mm: its rows end there, and voxels of a wider grid have values so far.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
@@ -306,7 +313,7 @@ def fbp(
     if out is None:
         out = np.empty(grid.shape, np.float32)
     for band, views in bands_of(geometry, grid):
-        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter)
+        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter, radius)
         for part in plan.blocks:
             fbp_block(plan, projections, 0, part, out[band][part])
             on_block(band.start + part.stop, len(out))

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import EMPTY, ENOUGH_MATTER
@@ -22,6 +23,46 @@ _VIEWS, _ROWS, _PARTS = 32, 128, 4  # looked at, about; parts of the views
 _FEWEST = 2  # of the views looked at, in which matter goes out of the field
 _FULL = 0.5  # share of the fullest row's mass that a row needs
 
+CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
+FARTHEST = 10.0  # distances of the farther edge from the axis, to the end of a sample
+_EDGE = 3  # columns at least, whose mean is the level at an edge
+_OUTER = 0.25  # of the way to the farther edge: what lies within may be a core
+_ALIKE = 80  # times the variance of columns that err each by itself: 30 give 0.4 dB less in a can of 3 times the field
+
+
+def edge_levels(rows: F32) -> F32:
+    """Line integrals [..., side] at the left and the right edge of rows [..., col]."""
+    cols = rows.shape[-1]
+    n = min(max(_EDGE, cols // 100), cols)
+    return np.stack([part.mean(axis=-1) for part in (rows[..., :n], rows[..., cols - n :])], axis=-1)
+
+
+def ends_in_matter(mean: F32) -> NDArray[np.bool_]:
+    """Whether rows [row, side] of the mean of the views [row, col] end at a tenth of their depth, and not in noise."""
+    level = edge_levels(mean)
+    return np.asarray((level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST))
+
+
+def sample_reach(mean: F32, axis: float) -> F64:
+    """Columns [row] from the axis to where the mean of the views [row, col] ends, if it falls as an ellipse about it.
+
+    The square of an ellipse is a line over the square of the way from its middle. The outer columns show it beside a
+    dense core, all show it better among grains. So their slopes are averaged, by the variance of the outer columns'
+    slope and the square of their difference. By the edges alone (Hsieh et al. 2004, Med. Phys. 31, 2385) FBP of packed
+    grains loses 0.4 dB where the can is twice as wide as the field.
+    """
+    way, squares = (np.arange(mean.shape[1]) - axis) ** 2, np.asarray(mean, np.float64) ** 2
+    slopes = []
+    for part in (way >= 0, outer := way >= (1 - _OUTER) ** 2 * way.max()):
+        apart = way[part] - way[part].mean()
+        slopes.append(-(squares[:, part] @ apart) / max(float(apart @ apart), 1e-30))
+    level = squares[:, outer].mean(axis=1)
+    rest = squares[:, outer] - level[:, None] + slopes[1][:, None] * apart
+    variance = _ALIKE * (rest**2).mean(axis=1) / max(float(apart @ apart), 1e-30)
+    differ = slopes[0] - slopes[1]
+    fall = slopes[1] + differ * variance / (variance + differ**2 + 1e-30)
+    return np.asarray(np.sqrt(way[outer].mean() + level / np.maximum(fall, 1e-30)))
+
 
 @dataclass(frozen=True)
 class FieldEdges:
@@ -31,12 +72,14 @@ class FieldEdges:
         levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
         mean: of the views.
         of_views: line integral at these edges [view] of the `views` that were looked at.
+        continued: whether some row ends in matter there, which FBP and FDK continue.
     """
 
     levels: Mapping[str, float]
     mean: float
     of_views: Mapping[str, F64] = field(default_factory=dict)
     views: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    continued: bool = False
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
@@ -67,7 +110,9 @@ class FieldEdges:
             for side, values in edges.items()
         }
         of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
-        return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))), of_views, views)
+        some = np.nan_to_num(some)
+        cut = ends_in_matter(some.mean(axis=0))[:, [int(side == "right") for side in edges]]
+        return cls(levels, float(np.median(some.mean(axis=(1, 2)))), of_views, views, bool(cut.any()))
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
         """The edges beyond which the sample extends, with their line integrals; empty if it is within the field.

@@ -12,7 +12,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.views import spread_views
 from recon.base.volume import Grid
-from recon.voxels.fbp import beyond_edges, edge_levels, fbp, filter_projections
+from recon.voxels.fbp import continuation, continued, fbp, filter_projections
 from recon.voxels.view_weights import angular_weights, ray_weights
 
 _SIDE = 511  # voxels: of more, views are binned
@@ -86,18 +86,15 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
     It is on lines along the axis, through points (x, y) [2, point] in mm.
     """
     weights, zeros = ray_weights(geometry)
-    shares, pitch = weights.astype(np.float32)[:, None], geometry.pixel_pitch
     out = np.zeros((points.shape[1], data.shape[1]), np.float32)
-    edges = edge_levels(data)
-    for sides in edges.values():
-        sides[..., np.array(zeros) > 0] = 0
+    beyond, weights = continuation(data.mean(axis=0), geometry, weights, zeros, "hann", None)
+    shares, pitch = weights.astype(np.float32)[:, None, 1:-1], geometry.pixel_pitch
     for first in range(0, geometry.n_views, _AT_ONCE):
         part = slice(first, first + _AT_ONCE)
         weighed = np.pad(data[part] * shares[part], ((0, 0), (0, 0), zeros))
         filtered = filter_projections(weighed, pitch, "hann")
-        for reach, sides in edges.items():
-            levels = sides[part] * shares[part][..., (0, -1)]
-            filtered += levels @ beyond_edges(filtered.shape[2], zeros, pitch, "hann", reach)
+        if beyond is not None:
+            filtered += continued(beyond, data[part], weights[part])
         columns = np.ascontiguousarray(filtered.transpose(0, 2, 1))
         for angle, shift, view in zip(geometry.angles[part], geometry.shifts[part, 0], columns, strict=True):
             at = (points[0] * math.cos(angle) + points[1] * math.sin(angle)) / pitch

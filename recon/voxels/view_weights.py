@@ -110,9 +110,10 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     view from the other side would be missing.
 
     Returns:
-        [view, col], and the columns of zeros to add before and after these.
+        [view, 1 + col + 1], first and last of what lies beyond the edges (0 where an opposite view sees it), and the
+        columns of zeros to add before and after the others.
     """
-    both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1], axis=1)
+    both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1] + 2, axis=1)
     if not covers_the_circle(geometry.angles):
         return both, (0, 0)
     share, beyond = column_shares(geometry)
@@ -120,7 +121,7 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Share [view, col] of each ray of a full turn in what it and its opposite measure, and columns of zeros beside."""
+    """Share [view, 1 + col + 1] of each ray of a full turn in what it and its opposite measure, and zeros beside."""
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     return _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
 
@@ -136,7 +137,7 @@ def seen_by(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
 
 
 def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F64:
-    """Quadrature weights [view, col] of the rays of one slice, from the views alone that see it; 0 for the others.
+    """Weights [view, 1 + col + 1] of the rays of one slice, from the views alone that see it; 0 for the others.
 
     As `ray_weights`: views that step along the axis see each slice from angles of its own, some of them more often.
 
@@ -144,7 +145,7 @@ def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F6
         seen: [view].
         share: `column_shares` of all views.
     """
-    weights = np.zeros((geometry.n_views, geometry.detector_shape[1]))
+    weights = np.zeros(share.shape)
     if not seen.any():
         return weights
     angles = geometry.angles[seen]
@@ -180,11 +181,11 @@ def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     another view of the circle. The axis of all views is taken to be their mean; near the detector's middle all is 1/2.
 
     Returns:
-        [col], and the columns of zeros to add before and after these.
+        [1 + col + 1] and columns of zeros, as `ray_weights`.
     """
     cols = geometry.detector_shape[1]
     if not geometry.is_off_middle:
-        return np.full(cols, 0.5), (0, 0)
+        return np.full(cols + 2, 0.5), (0, 0)
     axis = np.array([geometry.axis_col + geometry.shifts[:, 0].mean()])
     share, beyond = _shares(cols, axis, axis)
     return share[0], beyond
@@ -198,7 +199,7 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     spreads this over all of it (Silver 2000, Med. Phys. 27, 773).
 
     Returns:
-        [view, col], and the columns of zeros to add before and after these.
+        [view, 1 + col + 1] and columns of zeros, as `ray_weights`.
 
     Raises:
         ValueError: no view sees some rays of the field.
@@ -220,7 +221,7 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     fall = np.clip((arc - beta[:, None]) / (most + gamma), 0, 2)
     weights = np.empty_like(gamma)
     weights[order] = (np.sin(np.pi / 4 * rise) * np.sin(np.pi / 4 * fall)) ** 2 * cells[:, None]
-    return weights, (0, 0)
+    return np.pad(weights, ((0, 0), (1, 1)), mode="edge"), (0, 0)
 
 
 def missing_arc(geometry: Geometry) -> float:
@@ -299,7 +300,7 @@ def _fan_angles(geometry: Geometry) -> F64:
 
 
 def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
-    """Shares [view, col] of views about `axis` [view], opposite ones about `opposite`; zeros before and after."""
+    """Shares [view, 1 + col + 1] about `axis` [view], opposite views about `opposite`; zeros before and after."""
     left, right = -0.5 - axis, cols - 0.5 - axis
     mirrored_left, mirrored_right = opposite + 0.5 - cols, opposite + 0.5
     low, high = np.maximum(left, mirrored_left), np.minimum(right, mirrored_right)
@@ -307,6 +308,8 @@ def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:
     share = 0.5 + _rise(u - high[:, None], right - mirrored_right, high - low)
     share += _rise(low[:, None] - u, mirrored_left - left, high - low)
     share[high <= low] = 1
+    far = np.where(right > mirrored_right, share[:, -1], 1 - share[:, 0])  # of what lies beyond the right edge
+    share = np.column_stack((1 - far, share, far))
     before, after = (math.ceil(wanted.max() - 1e-6) for wanted in (left - mirrored_left, mirrored_right - right))
     most = 2 * cols  # an axis farther off leaves a hole in the middle that no filter fills
     return share, (min(max(0, before), most), min(max(0, after), most))

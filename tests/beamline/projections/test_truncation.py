@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from beamline.projections.consistency import cut_sentence
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
@@ -44,6 +45,19 @@ def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: fl
     c = (np.arange(64) - 31.5)[None]
     middle = volume[np.hypot(c, c.T) < 28].mean()
     assert middle == pytest.approx(MU, rel=0.1)
+
+
+def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
+    """Not of edges far below the depth in the middle: FBP takes them for air in a beam that has changed."""
+    u = np.arange(SHAPE[1]) - 31.5
+    lines = np.broadcast_to(0.13 + 2.0 * (np.abs(u) < 8), (VIEWS, *SHAPE)).astype(np.float32)
+    geometry = Geometry.parallel(ANGLES, SHAPE)
+    low, high = FieldEdges.of(lines, geometry), FieldEdges.of(lines + np.float32(0.3), geometry)
+    assert set(low.beyond()) == set(high.beyond()) == {"left", "right"}
+    for edges, continues in ((low, False), (high, True)):
+        assert edges.continued == continues == ("FBP continues" in cut_sentence(edges.beyond(), edges.continued))
+    _, (line,) = prepare(scan(90.0), SELECTION)
+    assert "FBP continues the views smoothly beyond the edge; the edge columns are not used as air" in line
 
 
 def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_with_its_views() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,9 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.fbp import beyond_edges, edge_levels, fbp, filter_projections
+from recon.voxels.direct import direct
+from recon.voxels.fbp import continuation, continued, fbp, filter_projections
+from recon.voxels.field_edges import ends_in_matter, sample_reach
 
 COLS, VIEWS = 64, 120
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -51,8 +55,18 @@ def test_the_part_in_the_field_is_that_of_a_wide_detector() -> None:
 def test_views_that_end_in_air_are_filtered_as_ever() -> None:
     lines = disc(COLS, 24, 0.01)
     noise = np.random.default_rng(0).normal(0, 0.005, lines.shape).astype(np.float32)
-    assert edge_levels(lines + noise) == {}
-    assert edge_levels(lines + np.float32(0.001)) == {}
+    assert not ends_in_matter((lines + noise).mean(axis=0)).any()
+    assert not ends_in_matter((lines + np.float32(0.001)).mean(axis=0)).any()
+
+
+@pytest.mark.parametrize("radius", [33.0, 48.0, 64.0, 96.0])
+@pytest.mark.parametrize("core", [0.0, 15.0])
+def test_the_end_of_a_sample_shows_in_the_fall_of_its_rows(radius: float, core: float) -> None:
+    """A dense core makes the whole row fall steeply; noise then has the outer columns alone."""
+    u = np.arange(COLS) - 30.0
+    mean = 0.02 * np.sqrt(radius**2 - u**2) + 0.06 * np.sqrt(np.clip(core**2 - u**2, 0, None))
+    assert sample_reach(mean[None].astype(np.float32), 30.0) == pytest.approx(radius, rel=0.01)
+    assert sample_reach(np.ones((1, COLS), np.float32), 30.0) > 1e3  # nothing falls
 
 
 @pytest.mark.parametrize("cols", range(1, 8))
@@ -65,23 +79,56 @@ def test_rows_are_cut_each_by_itself() -> None:
     lines = disc(COLS, 24, 0.01)
     lines[:, 1] = disc(COLS, 90, 0.01)[:, 1]
     geometry = Geometry.parallel(ANGLES, (3, COLS))
-    (levels,) = edge_levels(lines).values()
-    assert not levels[:, [0, 2]].any() and levels[:, 1].all()
+    np.testing.assert_array_equal(ends_in_matter(lines.mean(axis=0)), [[False] * 2, [True] * 2, [False] * 2])
     inside = disc(COLS, 24, 0.01)
     np.testing.assert_array_equal(fbp(lines, geometry)[[0, 2]], fbp(inside, geometry)[[0, 2]])
 
 
-@pytest.mark.parametrize("zeros", [(0, 0), (10, 0), (0, 10)])
-def test_what_is_beyond_an_edge_is_filtered_with_what_is_inside(zeros: tuple[int, int]) -> None:
-    """By the whole ellipse, of which the row sees the middle."""
-    u = (np.arange(4 * COLS) + 0.5 - 2 * COLS) / (COLS / 2)
-    ellipse = np.sqrt(np.clip(1.5**2 - u**2, 0, None) / (1.5**2 - 1))
-    inside = np.abs(u) < 1
-    whole = filter_projections(ellipse[None].astype(np.float32))[0][inside]
-    row = np.pad(ellipse[inside], zeros)[None].astype(np.float32)
-    sides = beyond_edges(COLS + sum(zeros), zeros, 1.0, "ram-lak", 1.5)
-    found = (filter_projections(row)[0] + np.ones(2, np.float32) @ sides)[zeros[0] : zeros[0] + COLS]
-    np.testing.assert_allclose(found, whole, atol=2e-5)
+@pytest.mark.parametrize("zeros", [(0, 0), (10, 0), (3, 10)])
+@pytest.mark.parametrize("radius", [None, 48.0])
+def test_what_is_beyond_an_edge_is_filtered_with_what_is_inside(zeros: tuple[int, int], radius: float | None) -> None:
+    """By the whole ellipse, of which the row sees the middle, and so into the columns beside it."""
+    u = np.arange(4 * COLS) + 0.5 - 2 * COLS
+    ellipse = np.sqrt(np.clip(48.0**2 - u**2, 0, None))[None].astype(np.float32)
+    row = ellipse[:, np.abs(u) < COLS / 2]
+    weights = np.ones((1, COLS + 2))
+    beyond, _ = continuation(row, Geometry.parallel([0.0], (1, COLS)), weights, zeros, "ram-lak", radius)
+    assert beyond is not None
+    found = filter_projections(np.pad(row, ((0, 0), zeros))) + continued(beyond, row[None], weights)[0]
+    there = slice(3 * COLS // 2 - zeros[0], 5 * COLS // 2 + zeros[1])
+    np.testing.assert_allclose(found, filter_projections(ellipse)[:, there], atol=2e-3 * float(row.max()))
+
+
+BEAMS = {
+    "parallel": partial(Geometry.parallel, detector_shape=(3, COLS)),
+    "tilted": partial(Geometry.parallel, detector_shape=(3, COLS), tilt=1e-4),
+    "cone": partial(Geometry.cone, detector_shape=(3, COLS), pixel_pitch=2.0, sod=1e4, sdd=2e4),
+    "rolled cone": partial(Geometry.cone, detector_shape=(3, COLS), pixel_pitch=2.0, sod=1e4, sdd=2e4, roll=1e-4),
+}
+
+
+@pytest.mark.parametrize("beam", BEAMS)
+@pytest.mark.parametrize("off", [0.0, 0.01, 0.3, 0.5, 2.0, 3.0, 8.0])
+def test_a_full_turn_is_continued_wherever_its_axis_is(beam: str, off: float) -> None:
+    """Beside the middle one edge lies farther out than the other; neither may lose what is beyond."""
+    axis = (COLS - 1) / 2 + off
+    u = np.arange(COLS) - axis
+    lines = 2 * 0.01 * np.sqrt(64.0**2 - u**2)
+    views = np.broadcast_to(lines, (120, 3, COLS)).astype(np.float32)
+    geometry = BEAMS[beam](np.linspace(0, 2 * np.pi, 120, endpoint=False), axis_col=axis)
+    field = Grid((1, COLS, COLS))
+    volume = direct(views, geometry, field, "hann")[0]
+    away = np.hypot(*np.meshgrid(*field.coordinates()[1:]))
+    seen = 30.5 - ("cone" in beam) * off % 8  # out to the nearer edge, where no shares of a circle are taken
+    np.testing.assert_allclose(volume[away < seen], 0.01, rtol=0.06)
+
+
+def test_the_radius_of_a_sample_gives_a_wider_grid_its_values() -> None:
+    geometry, wide = Geometry.parallel(ANGLES, (3, COLS)), Grid((1, 3 * COLS // 2, 3 * COLS // 2))
+    away = np.hypot(*np.meshgrid(*wide.coordinates()[1:]))
+    known, unknown = (direct(disc(COLS, 45, 0.01), geometry, wide, "hann", radius=r)[0] for r in (45.0, None))
+    assert known[(away > 34) & (away < 42)].mean() == pytest.approx(0.01, rel=0.03)
+    assert unknown[(away > 34) & (away < 42)].mean() < 0.008
 
 
 def test_a_full_turn_about_an_axis_off_the_middle_is_not_extended_at_the_side_near_it() -> None:

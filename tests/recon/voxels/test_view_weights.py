@@ -33,6 +33,7 @@ def test_every_line_has_its_weight_once(n: int, cols: int, twice: int, seed: int
     angles = np.random.default_rng(seed).permutation(full_turn(2 * n)) + 0.3
     geometry = Geometry.parallel(angles, (1, cols), axis_col=twice / 2)
     weights, (before, after) = ray_weights(geometry)
+    weights = weights[:, 1:-1]
     assert weights.shape == (2 * n, cols) and weights.min() >= 0
     assert before == min(max(0, cols - 1 - twice), 2 * cols) and after == min(max(0, twice - cols + 1), 2 * cols)
     for view, angle in enumerate(angles):
@@ -44,12 +45,22 @@ def test_every_line_has_its_weight_once(n: int, cols: int, twice: int, seed: int
             assert weights[view, col] + other == pytest.approx(np.pi / n)
 
 
+@given(cols=st.integers(1, 30), axis_col=st.floats(-20, 50))
+def test_what_lies_beyond_the_edges_has_its_weight_once(cols: int, axis_col: float) -> None:
+    """At the edge which lies farther from the axis, unless that is a column's fraction farther; else at both."""
+    weights, zeros = ray_weights(Geometry.parallel(full_turn(8), (1, cols), axis_col=axis_col))
+    ends = weights[:, (0, -1)]
+    np.testing.assert_allclose(ends.sum(axis=1), np.pi / 4)
+    if max(zeros) > 1:
+        np.testing.assert_array_equal(ends[:, zeros.index(max(zeros))], 0)
+
+
 @pytest.mark.parametrize("span", [np.pi, 1.3 * np.pi])
 def test_columns_are_alike_where_no_full_turn_is(span: float) -> None:
     angles = np.linspace(0, span, 60, endpoint=False)
     weights, zeros = ray_weights(Geometry.parallel(angles, (1, 40), axis_col=7.0))
     assert zeros == (0, 0)
-    np.testing.assert_array_equal(weights, np.repeat(angular_weights(angles)[:, None], 40, 1))
+    np.testing.assert_array_equal(weights, np.repeat(angular_weights(angles)[:, None], 42, 1))
 
 
 @pytest.mark.parametrize("n", [8, 9, 360])
@@ -174,7 +185,7 @@ def test_both_measurements_of_a_ray_of_a_short_scan_weigh_one_together(arc: floa
     geometry = Geometry.fan(np.random.default_rng(0).permutation(angles), cols, 1.0, 150.0, 300.0)
     weights, zeros = cone_weights(geometry)
     assert zeros == (0, 0) and missing_arc(geometry) == 0 and weights.min() >= 0
-    share = weights / (np.deg2rad(arc) / n)
+    share = weights[:, 1:-1] / (np.deg2rad(arc) / n)
     order = np.argsort(geometry.angles)
     at, gamma = geometry.angles[order], np.arctan((np.arange(cols) - 20) / 300.0)
     sums = np.zeros((n, cols))
