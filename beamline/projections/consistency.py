@@ -351,9 +351,9 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 def cut_sentence(sides: dict[str, float], continued: bool) -> str:
     """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
-    smooth = "FBP continues the views beyond it, with densities off by tens of per cent; " * continued
+    fbp = "FBP continues the views beyond it, with densities off by tens of per cent; other" if continued else "Iterative"
     return (
-        f"{beyond_the_field(sides)} {smooth}other methods reconstruct the sample as wide as it is. Wide views "
+        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
         "(scan.wide_views, some tens of exposures more) or a full turn with the axis near an edge (twice the views) "
         "show the rest. The edge columns are not used as air. If they are air, and the beam is weaker than its flats, "
         "give --air columns."

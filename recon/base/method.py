@@ -86,7 +86,8 @@ class SampleRadius:
     """How far a sample reaches from the rotation axis, where it is wider than the field.
 
     Attributes:
-        radius: that predicts views held out best, or that was given, in mm.
+        radius: that predicts views held out best, or that was given, in mm: half the width of a square box, so that it
+            lies between that of a round sample and 0.886 of it, where areas are equal.
         low, high: mm, from which to which radius views are predicted as well but for chance, and a step of the search.
         density: relative uncertainty of the density in the middle: half of what it changes from `low` to `high`.
     """

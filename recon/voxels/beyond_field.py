@@ -83,7 +83,8 @@ def sample_radius(
 
     FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
     and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
-    leaves more unknown than the views tell.
+    leaves more unknown than the views tell. The search errs to the short side, so the next radius up is taken: where
+    it is right, densities change by 2 %.
 
     Args:
         projections: line integrals [view, row, col]; only some rows of some views are read.
@@ -127,7 +128,7 @@ def sample_radius(
     ]
     densities = [tried[ratio][1] for ratio in alike]
     uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
-    return SampleRadius(least * math.sqrt(_FINE) * reach, min(alike) * reach, max(alike) * reach, uncertain)
+    return SampleRadius(least * _FINE * reach, min(alike) * reach, max(alike) * reach, uncertain)
 
 
 def _factor(geometry: Geometry, columns: int) -> int:
