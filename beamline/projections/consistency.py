@@ -351,7 +351,7 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 def cut_sentence(sides: dict[str, float], continued: bool) -> str:
     """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
-    fbp = "FBP continues the views beyond it, with densities off by tens of per cent; other" if continued else "Iterative"
+    fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
     return (
         f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
         "(scan.wide_views, some tens of exposures more) or a full turn with the axis near an edge (twice the views) "

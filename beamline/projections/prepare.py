@@ -340,17 +340,14 @@ def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepa
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
     edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
-    sides, ranges = edges.beyond(), edges.passing()
-    light = ""
-    if unlevelled and edges.mean > 0 and source.quantity == "counts" and selection.step(Air).model != "none":
-        light = without_air(source, edges.mean)
-    if sides:
+    if sides := edges.beyond():
+        light = ""
+        if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
+            light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
         warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
-    elif ranges:
+    elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))
-    elif light:
-        warn(light)
     if sides and unlevelled and (change := uncorrected_current(source, selection)):
         warn(change)
 

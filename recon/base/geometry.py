@@ -259,7 +259,8 @@ class Geometry:
     def ordinary(self) -> NDArray[np.bool_]:
         """[view] which views are no wide views: those show the sample stepped aside by more than half a field."""
         aside = self.shifts[:, 0]
-        return np.asarray(np.abs(aside - np.median(aside)) <= self.detector_shape[1] / 2)
+        usual = np.sort(aside)[(aside.size - 1) // 2]
+        return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)
 
     @property
     def offsets(self) -> F64:

@@ -188,6 +188,7 @@ class ReconProblem:
 
     Attributes:
         projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
+        wide: the grid holds a sample beyond the field.
     """
 
     projections: F32
@@ -196,6 +197,7 @@ class ReconProblem:
     use: DataUse
     seed: int
     device: str
+    wide: bool = False
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from recon.base.declared_types import check_arguments, check_settings, refusal
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 
-_WIDE = 1.04  # over the field; rounding to whole voxels makes a box no wider
 COARSEST = 4.0
 """Pixels a voxel of a fit's box, at most. Without: fits of coarser volumes start from blurred matter; not measured."""
 
@@ -84,16 +83,18 @@ class Grid:
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
-    def for_fit(cls, geometry: Geometry, wanted: Grid) -> Grid:
-        """The box that a fit covers: the whole field, or the requested one if that is wider, in voxels of its size.
+    def for_fit(cls, geometry: Geometry, wanted: Grid, *, wide: bool = False) -> Grid:
+        """The box that a fit covers: the whole field, in voxels of the requested size.
+
+        `wide`: it reaches as far as the requested one, which holds a sample beyond the field.
 
         The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
         from which a fit can start.
         """
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
-        field, across = cls.of_field(geometry, edge), float(np.abs(wanted.edges[:, :2]).max())
-        return field.reaching(across, geometry) if across > field.edges[1, 0] + 2 * edge else field
+        field = cls.of_field(geometry, edge)
+        return field.reaching(float(np.abs(wanted.edges[:, :2]).max()), geometry) if wide else field
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
         """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis, or
@@ -109,10 +110,6 @@ class Grid:
         y, x = (np.asarray(self.shape[1:]) + below + above).astype(int).tolist()
         middle = np.asarray(self.centre[1:]) + (above - below) / 2 * self.voxel_size
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
-
-    def is_wide(self, geometry: Geometry) -> bool:
-        """Whether the box is wider than the field, as one that holds a sample beyond it."""
-        return self.shape[2] * self.voxel_size > _WIDE * 2 * geometry.reach
 
     @property
     def spacing(self) -> tuple[float, float, float]:

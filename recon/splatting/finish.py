@@ -112,12 +112,14 @@ class _Planning:
     """The trials as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is.
 
     Attributes:
+        wide: as of `ReconProblem`.
         apart: the fit takes matter beyond the box off the views.
     """
 
     fit: Fit
     control: RunControl
     settings: FitSettings
+    wide: bool
     iterations: int = 1
     tried: Candidates = field(default_factory=Candidates)
     apart: bool = False
@@ -150,7 +152,7 @@ class _Planning:
         seen, cols = whole.projector, trial.all_columns.cols
         weights = None if whole.weight is None else projection_images(whole.weight)
         data, use = projection_images(whole.views), DataUse(weights)
-        views = ReconProblem(data, seen.geometry, seen.grid, use, 0, seen.device)
+        views = ReconProblem(data, seen.geometry, seen.grid, use, 0, seen.device, self.wide)
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -234,7 +236,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     if not data.any():
         return Candidates()
     watch, decide = _Watch(control, problem.geometry.n_views, fits=True), Decisions(problem.seed)
-    method = _Planning(fit, control, settings)
+    method = _Planning(fit, control, settings, problem.wide)
     projector = Projector(problem.geometry, problem.grid, device=problem.device)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
     tried = method.tried

@@ -195,7 +195,7 @@ class LastRound:
         volume, gaussians, reached, sweeps = self.fit.snapshot(problem.grid), self.fit.gaussians, history[-1], 0
         if plan.sweeps != 0 and gaussians is not None and not stop():
             late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
-            if problem.grid.is_wide(problem.geometry):
+            if problem.wide:
                 # Gaussians that learnt while views came leave the offset of the middle open: -2 dB on grains.
                 volume, sweeps = FistaTv().run(problem, late).volume, FistaTv.iterations
                 plan = plan._replace(sweeps=self.method.finish)

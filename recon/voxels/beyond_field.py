@@ -50,7 +50,7 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
         return method.run(problem, control)
     sample, grid = SampleRadius(*measured), problem.grid
     wide = grid.reaching(sample.radius, problem.geometry)
-    result = method.run(replace(problem, grid=wide), control)
+    result = method.run(replace(problem, grid=wide, wide=True), control)
     before = np.rint(np.subtract(grid.first[1:], wide.first[1:]) / grid.voxel_size).astype(int)
     y, x = (slice(first, first + n) for first, n in zip(before, grid.shape[1:], strict=True))
     whole = result.volume.data
@@ -99,10 +99,14 @@ def sample_radius(
     own = geometry.ordinary
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
-    views, geometry = _some_rows(projections, geometry, weights, some)
-    if not wider_than_field(views[own[some]], geometry.select(np.flatnonzero(own[some]))):
+    measured = _some_rows(projections, geometry, weights, some)
+    if measured is None:
         return None
-    if len(used) < LEAST_VIEWS:
+    views, geometry = measured
+    used = np.flatnonzero(geometry.ordinary)
+    if not wider_than_field(views[used], geometry.select(used)):
+        return None
+    if used.size < LEAST_VIEWS:
         return SampleRadius(_STEP * reach, reach, _WIDEST * reach, 1.0)
     trial = _Trial.of(views, geometry, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
@@ -139,10 +143,11 @@ def _factor(geometry: Geometry, columns: int) -> int:
 
 def _some_rows(
     data: F32, geometry: Geometry, weights: F32 | RayWeights | None, some: NDArray[np.intp]
-) -> tuple[F32, Geometry]:
-    """These views in the rows with most matter, of a cone in those in its middle, finite."""
+) -> tuple[F32, Geometry] | None:
+    """The measured ones of these views, in the rows with most matter, of a cone in those in its middle; None: none."""
     geometry = geometry.select(some)
-    look, height = masked(data[some[:: max(1, len(some) // _LOOKS)]])[0], _ROWS * _factor(geometry, _COLS)
+    look = np.nan_to_num(data[some[:: max(1, len(some) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0)
+    height = _ROWS * _factor(geometry, _COLS)
     rows = slice(0, geometry.detector_shape[0])
     if not geometry.is_cone:
         rows = busiest_rows(look, height)
@@ -150,7 +155,12 @@ def _some_rows(
     elif (middle := middle_of_cone(geometry, Grid.matching(geometry), look, height)) is not None:
         rows, geometry = middle[:2]
     views = np.stack([data[view, rows] for view in some])
-    return masked(views, None if weights is None else np.stack([weights[view, rows] for view in some]))[0], geometry
+    known = np.isfinite(views)
+    if weights is not None:
+        known &= np.stack([weights[view, rows] for view in some]) > 0
+    if not (seen := np.flatnonzero(known.any(axis=(1, 2)))).size:
+        return None
+    return masked(views[seen], known[seen].astype(np.float32))[0], geometry.select(seen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ _ERRORS = 1.0  # standard errors of the difference, up to which two candidates p
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-_FEWEST_ROWS = 4  # of a trial in a wide box
+_WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
 SUBSETS, TV_STEPS = 9, 3  # of a trial
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
 TRIALS = 4
@@ -52,7 +52,7 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 def _trial_rows(geometry: Geometry, grid: Grid) -> int:
     """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
     share = 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
-    return max(_FEWEST_ROWS, round(TRIAL_ROWS * share)) if grid.is_wide(geometry) else TRIAL_ROWS
+    return TRIAL_ROWS if share > _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:

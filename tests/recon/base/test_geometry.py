@@ -140,7 +140,7 @@ def _edges(geometry: Geometry, view: int) -> np.ndarray:
     return np.stack((u, z))
 
 
-moves = st.lists(st.tuples(st.floats(-30, 30), st.floats(-30, 30)), min_size=1, max_size=4)
+moves = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-30, 30)), min_size=1, max_size=4)
 
 
 @given(
@@ -151,6 +151,7 @@ def test_the_field_holds_every_ray_and_no_more(
     rows: int, cols: int, axis: tuple[float, float], pitch: float, coarser: float,
     shifts: list[tuple[float, float]], cone: bool,
 ) -> None:  # fmt: skip
+    shifts = [(col * cols / 2, row) for col, row in shifts]  # farther aside would be wide views
     angles, how = 0.7 * np.arange(len(shifts)), {"axis_row": axis[1], "shifts": shifts}
     if cone:
         views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis_col=axis[0], **how)

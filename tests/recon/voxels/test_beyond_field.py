@@ -80,9 +80,7 @@ def test_the_fields_part_is_right_where_a_box_of_the_field_is_far_off(
     wide: tuple[np.ndarray, np.ndarray], made: recon.Reconstruction
 ) -> None:
     views, truth = wide
-    alone = METHOD.run(
-        ReconProblem(views, GEOMETRY, recon.Grid.matching(GEOMETRY), DataUse(), 0, "cpu"), RunControl()
-    )
+    alone = METHOD.run(ReconProblem(views, GEOMETRY, recon.Grid.matching(GEOMETRY), DataUse(), 0, "cpu"), RunControl())
     by_fbp = recon.reconstruct(views, GEOMETRY, "fbp").volume.data
     assert made.volume.grid == recon.Grid.matching(GEOMETRY)
     assert error(made.volume.data, truth) < 0.9 * error(by_fbp, truth)
