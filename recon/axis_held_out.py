@@ -168,8 +168,7 @@ class _Judge:
         moved = (axis_col - self.views.geometry.axis_col) / self.bin
         views = replace(self._views, axis_col=self._views.axis_col + moved)
         if self._grid is None or not self.accuracy.one_grid:
-            grid = Grid.matching(views)
-            self._grid = grid if self.width == 1 else grid.reaching(self.width * views.reach, views)
+            self._grid = Grid.matching(views).widened(self.width, views)
         method, lit = FistaTv(self.accuracy.sweeps, _TV_WEIGHT), 1 if self._lit is None else self._lit
         unseen, images = predicted_views(method, self.binned, views, self._grid, self._lit, _ONE_IN)
         measured = self.binned[unseen] * lit

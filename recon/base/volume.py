@@ -83,10 +83,10 @@ class Grid:
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
-    def for_fit(cls, geometry: Geometry, wanted: Grid, *, wide: bool = False) -> Grid:
+    def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field, in voxels of the requested size.
 
-        `wide`: it reaches as far as the requested one, which holds a sample beyond the field.
+        `wider`: it reaches as far as the requested one, which holds a sample beyond the field.
 
         The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
         from which a fit can start.
@@ -94,7 +94,14 @@ class Grid:
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
         field = cls.of_field(geometry, edge)
-        return field.reaching(float(np.abs(wanted.edges[:, :2]).max()), geometry) if wide else field
+        return field.reaching(float(np.abs(wanted.edges[:, :2]).max()), geometry) if wider else field
+
+    def widened(self, by: float, geometry: Geometry) -> Grid:
+        """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
+        nz, nx, _ = self.shape
+        most = math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6
+        across = max(nx, math.floor(min(by * nx, most)))
+        return replace(self, shape=(nz, across, across))
 
     def reaching(self, radius: float, geometry: Geometry) -> Grid:
         """The box with whole voxels added around the axis until it reaches `radius` in mm from the rotation axis, or

@@ -375,11 +375,11 @@ class StreamingFit:
         geometry, seen = every.select(learnt), data[learnt]
         wider = sample_radius(data, every)
         box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
-        field = Grid.for_fit(self._template, box, wide=wider is not None)
+        field = Grid.for_fit(self._template, box, wider=wider is not None)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
         shape = (field.shape[0], *(math.ceil(n / coarser) for n in field.shape[1:]))
         rough = replace(field, shape=shape, voxel_size=coarser * field.voxel_size)
-        rough = Grid.for_fit(self._template, rough, wide=wider is not None)
+        rough = Grid.for_fit(self._template, rough, wider=wider is not None)
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
         if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear

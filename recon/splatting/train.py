@@ -118,7 +118,7 @@ class _Views:
         )  # fmt: skip
         measured, trusted = data[used], None if weights is None else weights[used]
         p, p_weights, seen = join_pixels(measured, trusted, views, joined)
-        field = Grid.for_fit(seen, problem.grid, wide=problem.wide)
+        field = Grid.for_fit(seen, problem.grid, wider=problem.wide)
         fitted = replace(problem, projections=measured, geometry=all_geometry.select(used), use=DataUse(trusted))
         return cls(all_geometry, data, weights, used, kept_back, joined, seen, p, p_weights, field, count, fitted)
 

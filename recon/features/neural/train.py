@@ -157,7 +157,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
-    grid = Grid.for_fit(geometry, problem.grid, wide=problem.wide)
+    grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], seen, grid).data)
     if unit <= 0 or not (data[used] > 0).any():
         raise ValueError("the views show no absorbing matter. A field needs views of a sample")

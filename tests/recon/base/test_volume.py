@@ -98,10 +98,10 @@ def test_small_shifts_leave_the_matching_volume_the_size_of_the_detector() -> No
 def test_a_fit_of_a_wider_sample_gets_a_wider_box() -> None:
     grid = Grid((10, 30, 30))
     views = Geometry.parallel(TURN, (10, 30))
-    assert Grid.for_fit(views, grid.reaching(18, views), wide=True) == Grid((10, 36, 36))
+    assert Grid.for_fit(views, grid.reaching(18, views), wider=True) == Grid((10, 36, 36))
     assert Grid.for_fit(views, grid.reaching(18, views)) == Grid.for_fit(views, grid)
     near = Geometry.cone(TURN, (10, 30), 1.0, 23.0, 23.0)
-    field, box = Grid.for_fit(near, grid), Grid.for_fit(near, grid.reaching(18, near), wide=True)
+    field, box = Grid.for_fit(near, grid), Grid.for_fit(near, grid.reaching(18, near), wider=True)
     assert field.shape[1] < box.shape[1] < 36 and np.hypot(*box.edges[1][:2]) < near.sod
 
 
