@@ -106,7 +106,6 @@ REMOVED: dict[str, Removed] = {
     "SPREAD": Removed(1.0, FITS),
     "WILD_PIXEL": Removed(math.inf, ("one wild pixel",), recon.R2(steps=400)),
     "EMPTY": Removed(math.inf, ("region",)),
-    "WIDER": Removed(1.0, ("region",)),
     "PACE": Removed(1.0, FITS, _fit(pace=1.0)),
     "VIEWS_A_STEP": Removed(1, FITS, _fit(views_per_step=1)),
     "NARROWEST": Removed(0.128, (*FITS, "shell, cone"), _fit(smallest=0.128)),
