@@ -29,7 +29,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.field_edges import wider_than_field
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.matter_checks import StrayMass, Unexplained, lost_matter, stray_mass, stray_mass_share, unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
@@ -121,7 +121,7 @@ class VolumeLooks:
         if not self.direct:
             return SAMPLE in self.made.settings and not self.prepared.inside
         some = spread(np.arange(geometry.n_views), _EDGES)
-        return wider_than_field(data[some], geometry.select(some))
+        return bool(FieldEdges.of(data[some], geometry.select(some)).beyond())
 
     @property
     def direct(self) -> bool:

@@ -129,7 +129,7 @@ def background_memory(geometry: Geometry) -> int:
     factor = factor_within(geometry.detector_shape, _VOXELS)
     small = geometry.select(slice(min(geometry.n_views, _VIEWS))).binned(factor)
     rays = small.n_views * math.prod(small.detector_shape)
-    voxels = math.prod(Grid.matching(small).widened(_WIDER, small).shape)
+    voxels = math.prod(Grid.for_fit(small, Grid.matching(small)).widened(_WIDER, small).shape)
     pixels = math.prod(geometry.detector_shape)
     return 4 * ((9 * len(TERMS) + 16) * rays + 12 * voxels + 6 * pixels)
 
@@ -171,7 +171,7 @@ class _Views:
             weight = np.broadcast_to(whole, data.shape).astype(np.float32)
         grid = Grid.matching(views)
         if wider_than_field(data, views):
-            grid = grid.widened(_WIDER, views)
+            grid = Grid.for_fit(views, grid).widened(_WIDER, views)
         terms = np.array([[_surface(one, time, shape, factor) for time in times[some]] for one in np.eye(len(TERMS))])
         # A background is smooth: thresholds on what views held out gain were found without sharpening.
         return cls(data, terms, weight, Projector(views, grid).plain, times[some])
