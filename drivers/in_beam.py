@@ -112,7 +112,7 @@ class StageSampleMover:
         self._motor.put(OUTSIDE)
 
     def back(self, aside: float = 0.0) -> None:
-        """Move the sample back, or `aside`. Raises DeviceError if it did not arrive."""
+        """Move the sample into the beam, `aside` mm from its place. Raises DeviceError if it did not arrive."""
         self._motor.put(INSIDE, aside * self._rad_per_mm if aside else 0.0)
 
 
@@ -252,6 +252,9 @@ class ManualSampleMover(_Manual):
         self._bring("out", "Move the sample out of the beam.")
 
     def back(self, aside: float = 0.0) -> None:
+        if aside:
+            advice = "Name a stage that moves it (devices.sample_mover)."
+            raise DeviceError("sample mover", f"nobody moves it by hand {aside:g} mm aside", advice=advice)
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 

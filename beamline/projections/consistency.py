@@ -204,7 +204,8 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
         size, what = usual, f"From view to view line integrals of the whole view rise and fall in turn by {usual:.2f}"
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
-        size, what = odd, f"Frame {frames[at]} differs as a whole by {odd:.2f} of line integral from those beside it"
+        size, more = odd, f"by {odd:.2f} of line integral more than these change"
+        what = f"Frame {frames[at]} differs as a whole from those beside it, {more}"
     sentence = (
         f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
         "another scan are among them. Choose views that belong together with --views, or say which columns are air."
@@ -354,7 +355,7 @@ def cut_sentence(sides: dict[str, float], continued: bool) -> str:
     fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
     return (
         f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
-        "(scan.wide_views, some tens of exposures more) or a full turn with the axis near an edge (twice the views) "
+        "(scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice the views) "
         "show the rest. The edge columns are not used as air. If they are air, and the beam is weaker than its flats, "
         "give --air columns."
     )

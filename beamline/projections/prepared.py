@@ -54,7 +54,7 @@ class PreparedProjections:
         recorded: what the volume's file says of several scans, by name; empty of one.
         laws: what the views leave of the laws that hold for all of them, in words, by name.
         sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or measured.
-        inside: the views show what lies in the volume alone: what the rest of the sample adds is taken off.
+        inside: what the sample outside the volume adds to the views was subtracted from them.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -91,6 +91,11 @@ class PreparedProjections:
         grid, (z, y, x) = volume.grid, volume.grid.centre
         high = replace(grid, centre=(z * self.stretch, y, x), slice_pitch=grid.spacing[0] * self.stretch)
         return Volume(volume.data, high)
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether the sample was measured, and is wider than the field."""
+        return isinstance(self.sample_radius, SampleRadius)
 
     @property
     def box(self) -> Grid:

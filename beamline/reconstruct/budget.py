@@ -175,7 +175,7 @@ def _chosen(
 
 def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
     geometry, use = prepared.geometry, DataUse(prepared.ray_weights())
-    return ReconProblem(prepared.projections.data, geometry, prepared.box, use, seed, "cpu")
+    return ReconProblem(prepared.projections.data, geometry, prepared.box, use, seed, "cpu", prepared.is_wide)
 
 
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:

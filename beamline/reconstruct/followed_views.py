@@ -134,7 +134,7 @@ class AxisSearch:
         self.col = source.axis_col if selection.axis_col is None else selection.axis_col
         self.estimate: AxisEstimate | None = None
         self.settled = self.col is not None
-        self._next, self._turned = _FIRST_VIEWS, 0.0
+        self._next, self._turned, self._told = _FIRST_VIEWS, 0.0, False
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
         """Search the axis in these views (rows of the file), if it is time. While the scan runs, only a clear optimum
@@ -160,7 +160,8 @@ class AxisSearch:
         except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise
-        if self.col is None and self._turned > np.pi / 2:
+        if self.col is None and np.pi / 2 < self._turned < np.pi and not self._told:
+            self._told = True
             self._warn(_UNKNOWN)
 
 

@@ -25,7 +25,6 @@ from beamline.reconstruct.outcome import (
 from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
 from recon.base.method import SAMPLE, Reconstruction
-from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
@@ -34,7 +33,6 @@ from recon.voxels.matter_checks import StrayMass, Unexplained, lost_matter, stra
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
-_EDGES = 32  # views whose edges are looked at
 
 
 def judge(
@@ -120,8 +118,7 @@ class VolumeLooks:
             return True
         if not self.direct:
             return SAMPLE in self.made.settings and not self.prepared.inside
-        some = spread(np.arange(geometry.n_views), _EDGES)
-        return bool(FieldEdges.of(data[some], geometry.select(some)).beyond())
+        return bool(FieldEdges.of(data, geometry).beyond())
 
     @property
     def direct(self) -> bool:

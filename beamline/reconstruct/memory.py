@@ -47,7 +47,7 @@ class ReconMemory:
         steps: bytes that the steps of the correction take.
         largest_step: name of the one that takes the most alone.
         bars: error bars are made, too.
-        radius: how far the sample reaches beyond the field, and its box with it, in mm; None: it ends within.
+        radius: mm from the rotation axis to the end of a sample wider than the field; None: it ends within.
     """
 
     method: Method

@@ -197,12 +197,18 @@ def sample_radius_note(settings: Mapping[str, Any], prepared: PreparedProjection
         return ""
     radius, low, high, density = (settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
     unit, field = prepared.length_unit, prepared.geometry.reach
-    known, sure = "as was given", ""
-    if low < high:
+    known, sure = "as given", ""
+    if density == 1:
+        known = "assumed: there are too few views to measure it"
+    elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
         sure = (
-            f" The density in its middle is known to about {density:.1%}; wide views (scan.wide_views) make it surer."
+            f" Densities near the axis are uncertain by about {density:.1%}; wide views (scan.wide_views) reduce that."
         )
+    return Note(
+        f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
+        f"field ({known}). The whole sample was reconstructed; only the part within the field is written.{sure}"
+    )
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
         f"field ({known}). All of it was reconstructed, and the field's part is written.{sure}"

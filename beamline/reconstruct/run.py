@@ -76,7 +76,8 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
 
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
-    """The views less what the sample outside the volume adds to them, in place: the volume is judged by these."""
+    """Subtract, in place, what the sample outside the volume adds to the views; the volume, and FBP beside it, are
+    judged by the rest. Where nothing is known to lie outside they stay."""
     if made.outside is None:
         return prepared
     for first in range(0, prepared.geometry.n_views, _AT_ONCE):

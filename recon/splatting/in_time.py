@@ -197,7 +197,8 @@ class LastRound:
             late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
                 # Gaussians that learnt while views came leave the offset of the middle open: -2 dB on grains.
-                volume, sweeps = FistaTv().run(problem, late).volume, FistaTv.iterations
+                made = FistaTv().run(problem, late)
+                volume, sweeps = made.volume, len(made.history)
                 plan = plan._replace(sweeps=self.method.finish)
             else:
                 volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)

@@ -26,7 +26,7 @@ from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.back_project import SLICES, nanoseconds
 from recon.voxels.devices import voxel_device
-from recon.voxels.fbp import Filter, columns_beside, continuation, continued, fbp, fbp_memory, filter_projections, ramp
+from recon.voxels.fbp import Filter, continuation, continued, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
@@ -85,7 +85,6 @@ def fdk(
     grid: Grid | None = None,
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
-    radius: float | None = None,
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
@@ -98,7 +97,7 @@ def fdk(
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: of the volume; None: `Grid.matching(geometry)`.
-        filter, radius: as of `fbp`.
+        filter: as of `fbp`.
         on_block: told how many of how many layers are done, counted by their views.
 
     Returns:
@@ -114,7 +113,7 @@ def fdk(
     if not geometry.is_straight:
         raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
     prepare = partial(_prepared_views, filter=filter)
-    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, _along_columns, on_block)
+    return _by_slabs(projections, geometry, grid, filter, prepare, _along_columns, on_block)
 
 
 Prepare = Callable[[F32, Geometry, F64, tuple[int, int], F32 | None], tuple[Any, tuple[Any, ...]]]
@@ -123,11 +122,10 @@ lies beyond; and what a kernel takes of the views before the voxels."""
 
 
 def _by_slabs(
-    projections: F32, geometry: Geometry, grid: Grid, way: tuple[Filter, float | None], prepare: Prepare,
+    projections: F32, geometry: Geometry, grid: Grid, filter: Filter, prepare: Prepare,
     kernel: Callable[..., None], on_block: Callable[[int, int], None], device: str = "cpu",
 ) -> F32:  # fmt: skip
-    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device; `way`: filter and
-    radius of `fbp`.
+    """Back-project views [view, row, col], some at a time, to [z, y, x], with a kernel of the device.
 
     Raises:
         ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
@@ -145,10 +143,9 @@ def _by_slabs(
         )
     weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
     weights *= np.cos(geometry.tilt)[:, None]  # the part of Fourier space between two views shrinks by it
-    zeros = columns_beside(geometry, zeros, way[1])
     looked_at = spread(np.arange(geometry.n_views), _LOOKED_AT)
     mean = sum(projections[view] / np.float32(looked_at.size) for view in looked_at)
-    beyond, weights = continuation(mean, geometry, weights, zeros, *way)
+    beyond, weights = continuation(mean, geometry, weights, zeros, filter)
     z, y, x = grid.coordinates()
     there = voxel_device(device)
     volume = there.zeros((y.size, x.size, z.size))
@@ -234,7 +231,6 @@ def posed_direct(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     device: str = "cpu",
-    radius: float | None = None,
 ) -> F32:
     """Reconstruct views in any pose [view, row, col]; see `fbp` and `fdk` for arguments, result and errors.
 
@@ -271,7 +267,7 @@ def posed_direct(
         return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
 
     kernel = _along_rays if gpu is None else gpu.back_project
-    return _by_slabs(projections, geometry, grid, (filter, radius), prepare, kernel, on_block, device)
+    return _by_slabs(projections, geometry, grid, filter, prepare, kernel, on_block, device)
 
 
 Response = tuple[int, tuple[int, int], F32]
@@ -349,7 +345,6 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
     device: str = "cpu",
-    radius: float | None = None,
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
     and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Wide views have no
@@ -357,10 +352,10 @@ def direct(
     if not (own := geometry.ordinary).all():
         projections, geometry = projections[own], geometry.select(np.flatnonzero(own))
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
-        return posed_direct(projections, geometry, grid, filter, on_block, device, radius)
+        return posed_direct(projections, geometry, grid, filter, on_block, device)
     if geometry.is_cone:
-        return fdk(projections, geometry, grid, filter, on_block, radius)
-    return fbp(projections, geometry, grid, filter, on_block, out, radius)
+        return fdk(projections, geometry, grid, filter, on_block)
+    return fbp(projections, geometry, grid, filter, on_block, out)
 
 
 def direct_work(geometry: Geometry, grid: Grid) -> Work:

@@ -77,17 +77,18 @@ def _known(filter: str) -> None:
 
 
 def continuation(
-    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter, radius: float | None
+    mean: F32, geometry: Geometry, weights: NDArray[Any], zeros: tuple[int, int], filter: Filter
 ) -> tuple[F32 | None, NDArray[Any]]:
-    """What filtering brings inside [row, side, col], zeros counted, if rows go on beyond an edge from 1 as an ellipse.
+    """What filtering adds inside where rows go on beyond an edge as an ellipse does, for a level of 1 at the edge.
 
     A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
     (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells. The ellipse ends at
-    the radius of the sample (mm), or at the `sample_reach` of the mean of the views [row, col].
+    the `sample_reach` of the mean of the views [row, col].
 
     Returns:
-        0 for rows that end in air, None if all do; and the weights [view, 1 + col + 1] of `ray_weights`. If a row goes
-        on, and one edge lies a few columns farther out, too few for shares to change over, all are those at the axis.
+        float32 [row, side, col], zeros counted, 0 for rows that end in air; None if all do. And the weights
+        [view, 1 + col + 1] of `ray_weights`. If a row goes on, and one edge lies a few columns farther out, too few for
+        shares to change over, all are those at the axis.
     """
     cols, axes, given = mean.shape[1], geometry.axis_col + geometry.offsets[:, 0], weights
     edges = np.array([(axis := float(axes.mean())) + 0.5, cols - 0.5 - axis])
@@ -98,7 +99,7 @@ def continuation(
     if not there.size:
         return None, given
     filtered = np.zeros((len(mean), 2, cols + sum(zeros)), np.float32)
-    ends = sample_reach(mean, axis) if radius is None else np.full(len(mean), _columns_to(radius, geometry))
+    ends = sample_reach(mean, axis)
     for row in there:
         reach = min(max(ends[row], *np.abs(edges * cut[row])), FARTHEST * edges.max())
         length = max(*zeros, math.ceil(reach - edges.min()))
@@ -112,22 +113,10 @@ def continuation(
 
 
 def continued(beyond: F32, views: F32, weights: NDArray[np.floating]) -> F32:
-    """To add to filtered views: `continuation` times the edges of the views [..., row, col] and their weights."""
+    """What is added to filtered views, [..., row, col] with zeros: `continuation` times the edges of the views and
+    their weights."""
     levels = (edge_levels(views) * weights[..., None, (0, -1)]).astype(np.float32)
     return levels[..., :1] * beyond[:, 0] + levels[..., 1:] * beyond[:, 1]
-
-
-def _columns_to(radius: float, geometry: Geometry) -> float:
-    return radius / geometry.sample_pitch / math.sqrt(max(1 - (radius / geometry.sod) ** 2, 0.01))
-
-
-def columns_beside(geometry: Geometry, zeros: tuple[int, int], radius: float | None) -> tuple[int, int]:
-    """Columns of zeros beside the views, as many as show a sample of this radius (mm)."""
-    if radius is None:
-        return zeros
-    axis, reach = geometry.axis_col + geometry.offsets[:, 0], _columns_to(radius, geometry) + 1
-    beside = reach - axis.min(), reach + axis.max() - geometry.detector_shape[1]
-    return max(zeros[0], math.ceil(beside[0])), max(zeros[1], math.ceil(beside[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +126,6 @@ class FbpPlan:
     Attributes:
         geometry, grid, filter: as given.
         share: float32 [view, 1, 1 + col + 1], quadrature weight of each ray, see `ray_weights`.
-        radius: as of `fbp`.
         column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
             holds for all slices.
         zeros: columns of zeros to add before and after these.
@@ -149,7 +137,6 @@ class FbpPlan:
     grid: Grid
     filter: Filter
     share: F32
-    radius: float | None
     column_shares: F64 | None
     zeros: tuple[int, int]
     rows: F64
@@ -168,7 +155,7 @@ class FbpPlan:
         return int(low), int(np.clip(math.floor(rows.max() + shifts.max()) + 1, low, last)) + 1
 
 
-def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius: float | None = None) -> FbpPlan:
+def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
     """The part of `fbp` that does not depend on the data; with a skew all rows are at the angle of the middle one.
 
     Raises:
@@ -182,7 +169,6 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius:
     geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
-    zeros = columns_beside(geometry, zeros, radius)
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
     cols = geometry.detector_shape[1] + sum(zeros)
     back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
@@ -192,7 +178,7 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak", radius:
     share, rows = weights.astype(np.float32)[:, None], z + geometry.axis_row
     differ = geometry.shifts[:, 1].any() and not seen_by(geometry, rows).all()
     shares = column_shares(geometry)[0] if differ else None
-    return FbpPlan(geometry, grid, filter, share, radius, shares, zeros, rows, back_project)
+    return FbpPlan(geometry, grid, filter, share, shares, zeros, rows, back_project)
 
 
 def fbp_memory(views: int, cols: int) -> int:
@@ -227,7 +213,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     low, end = plan.rows_of(part)
     own = slice(low - first, end - first)
     mean = projections[:, own].mean(axis=0)
-    beyond, weights = continuation(mean, geometry, plan.share[:, 0], plan.zeros, plan.filter, plan.radius)
+    beyond, weights = continuation(mean, geometry, plan.share[:, 0], plan.zeros, plan.filter)
     share = weights[:, None] if plan.column_shares is None else _shares_of(plan, rows, plan.column_shares)
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
@@ -283,7 +269,6 @@ def fbp(
     filter: Filter = "ram-lak",
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
-    radius: float | None = None,
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
@@ -299,7 +284,6 @@ def fbp(
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
-        radius: of a sample wider than the field, mm: its rows end there, and voxels of a wider grid have values so far.
 
     Returns:
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
@@ -313,7 +297,7 @@ def fbp(
     if out is None:
         out = np.empty(grid.shape, np.float32)
     for band, views in bands_of(geometry, grid):
-        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter, radius)
+        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter)
         for part in plan.blocks:
             fbp_block(plan, projections, 0, part, out[band][part])
             on_block(band.start + part.stop, len(out))

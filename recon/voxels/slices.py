@@ -87,7 +87,7 @@ def _along(data: F32, geometry: Geometry, points: F64) -> F32:
     """
     weights, zeros = ray_weights(geometry)
     out = np.zeros((points.shape[1], data.shape[1]), np.float32)
-    beyond, weights = continuation(data.mean(axis=0), geometry, weights, zeros, "hann", None)
+    beyond, weights = continuation(data.mean(axis=0), geometry, weights, zeros, "hann")
     shares, pitch = weights.astype(np.float32)[:, None, 1:-1], geometry.pixel_pitch
     for first in range(0, geometry.n_views, _AT_ONCE):
         part = slice(first, first + _AT_ONCE)

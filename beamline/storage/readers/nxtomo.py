@@ -179,7 +179,7 @@ class NXtomoSource(ScanSource):
         if self._ours and n > self.n:
             rows = altered_rows(self._file, self.n, n)
             self._altered |= {self.n + row for row in rows.tolist()}
-        known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
+        known = np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW)  # which is never written
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
         if self._ours and (moved := datasets.dataset(places.entry, "sample/x_translation")) is not None:
             hdf5.look_again(moved)
