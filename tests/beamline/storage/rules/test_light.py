@@ -138,7 +138,7 @@ def test_one_view_of_another_light_where_the_sample_fills_the_field(view: int, f
     darks, flats, views = (each[:, rows] for each in counts(60.0))
     assert "as a whole" not in told(darks, flats, views)
     views[view] = (views[view] - 100) * factor + 100
-    assert f"Frame {10 + view} differs as a whole by 0.3" in told(darks, flats, views)
+    assert f"Frame {10 + view} differs as a whole from those beside it, by 0.3" in told(darks, flats, views)
 
 
 def test_a_wide_sample_of_even_edges_that_looks_like_a_weak_beam_is_told_how_to_say_so() -> None:
