@@ -83,8 +83,8 @@ def sample_radius(
 
     FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
     and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
-    leaves more unknown than the views tell. The search errs to the short side, so the next radius up is taken: where
-    it is right, densities change by 2 %.
+    leaves more unknown than the views tell. Of radii that predict alike the least is taken, or rather the next step up:
+    the search errs to the short side, and where it is right, densities change by 2 %.
 
     Args:
         projections: line integrals [view, row, col]; only some rows of some views are read.
@@ -125,14 +125,12 @@ def sample_radius(
         least = best(_FINE ** (k / 2) for k in range(8))
     if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
         return None
-    alike = [
-        ratio
-        for ratio, (left, _) in tried.items()
-        if abs(math.log(ratio / least, _FINE)) < 1.5 or not beyond_chance(left - tried[least][0], _ERRORS)
-    ]
+    alike = [ratio for ratio, (left, _) in tried.items() if not beyond_chance(left - tried[least][0], _ERRORS)]
+    radius = min(alike) * _FINE
+    alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]
     densities = [tried[ratio][1] for ratio in alike]
     uncertain = (max(densities) - min(densities)) / 2 / tried[least][1] if tried[least][1] > 0 else 1.0
-    return SampleRadius(least * _FINE * reach, min(alike) * reach, max(alike) * reach, uncertain)
+    return SampleRadius(radius * reach, min(alike) * reach, max(alike) * reach, uncertain)
 
 
 def _factor(geometry: Geometry, columns: int) -> int:
