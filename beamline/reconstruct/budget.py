@@ -98,6 +98,8 @@ def within(
     unbinned = default_count(geometry, geometry.sample_pitch)  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
+    if prepared.is_wide:  # the few sweeps after a fit leave the offset of the middle open: 4 dB behind FBP
+        taking = {name: method for name, method in taking.items() if not method.traits.any_grid} or taking
     plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
     choices = plan.choices()
     choice, because = choices[0], ""

@@ -202,9 +202,7 @@ def sample_radius_note(settings: Mapping[str, Any], prepared: PreparedProjection
         known = "assumed: there are too few views to measure it"
     elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
-        sure = (
-            f" Densities near the axis are uncertain by about {density:.1%}; wide views (scan.wide_views) reduce that."
-        )
+        sure = f" Densities near the axis are uncertain by {density:.1%} or more; scan.wide_views reduce that."
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
         f"field ({known}). The whole sample was reconstructed; only the part within the field is written.{sure}"

@@ -22,7 +22,7 @@ from recon.base.masks import RayWeights, masked
 from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of, wider_than_field
+from recon.voxels.field_edges import busiest_rows, middle_of_cone, sample_reach, slab_of, wider_than_field
 from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines
@@ -79,7 +79,7 @@ def sample_radius(
     weights: F32 | RayWeights | None = None,
     given: float | SampleRadius | None = None,
 ) -> SampleRadius | None:
-    """How far the sample reaches; None: not beyond the field. Of fewer than 16 views 1.2 times the field, unmeasured.
+    """How far the sample reaches; None: not beyond the field. Of fewer than 16 views the end that FBP takes.
 
     FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
     and each box is judged by the views held out. A box too small puts matter where no view agrees on it, one too wide
@@ -95,6 +95,8 @@ def sample_radius(
     if isinstance(given, SampleRadius):
         return given
     if given is not None:
+        if not 0 <= given < math.inf:
+            raise ValueError(f"sample_radius must be a finite length, 0 for a sample within the field, got {given}")
         return SampleRadius(given, given, given, 0.0) if given > reach else None
     own = geometry.ordinary
     used = np.flatnonzero(own)
@@ -107,7 +109,8 @@ def sample_radius(
     if not wider_than_field(views[used], geometry.select(used)):
         return None
     if used.size < LEAST_VIEWS:
-        return SampleRadius(_STEP * reach, reach, _WIDEST * reach, 1.0)
+        ends = sample_reach(views[used].mean(axis=0), geometry.axis_col) * geometry.sample_pitch
+        return SampleRadius(float(np.clip(np.median(ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
     trial = _Trial.of(views, geometry, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
 

@@ -113,10 +113,17 @@ def test_a_small_grid_holds_what_the_field_holds_there(
     assert np.abs(part - made.volume.data[:, 20:40, 10:34]).max() < 0.1 * made.volume.data.max()
 
 
-def test_few_views_take_a_box_that_is_a_fifth_wider_and_say_that_nothing_is_known() -> None:
+def test_few_views_take_the_end_that_fbp_takes_and_say_that_nothing_is_known() -> None:
     some = GEOMETRY.select(np.arange(0, VIEWS, 4))
     found = sample_radius(views_of(can(1.6 * COLS / 2), some), some)
-    assert found == SampleRadius(1.2 * COLS / 2, COLS / 2, 4.5 * COLS / 2, 1.0)
+    assert found is not None and (found.low, found.high, found.density) == (COLS / 2, 4.5 * COLS / 2, 1.0)
+    assert found.radius == pytest.approx(1.6 * COLS / 2, rel=0.15)
+
+
+@pytest.mark.parametrize("given", [-1.0, np.inf])
+def test_a_radius_that_is_no_length_is_refused(wide: tuple[np.ndarray, np.ndarray], given: float) -> None:
+    with pytest.raises(ValueError, match="sample_radius must be a finite length"):
+        recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=given))
 
 
 def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(wide: tuple[np.ndarray, np.ndarray]) -> None:
