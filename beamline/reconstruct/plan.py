@@ -236,7 +236,7 @@ def prepare_within(
     prepared = prepare_projections(source, selection, warn, buffer, check, phases)
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
-    if not (options.method.traits.direct or options.method.traits.several):
+    if not (options.method.traits.direct or options.method.traits.several or prepared.emission):
         views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
         prepared = replace(prepared, sample_radius=sample_radius(*views) or 0.0)  # it is not searched again
     return prepared, of_views(source, options, plan, prepared)

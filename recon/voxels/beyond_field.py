@@ -36,14 +36,14 @@ _ERRORS = 1.0  # standard errors by which radii predict alike
 def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
 
-    A sample within the field, a direct method, which continues the views, and methods that make several volumes, run as
-    they are.
+    A sample within the field, a direct method, which continues the views, methods that make several volumes, and those
+    of an emission run as they are.
 
     Raises:
         ValueError: as `Method.run`.
     """
     traits, decide = method.traits, control.decide or Decisions(problem.seed)
-    if traits.direct or traits.several:
+    if traits.direct or traits.several or problem.use.emission is not None:
         return method.run(problem, control)
     measured = decide(SAMPLE, lambda: _values(_of_problem(problem)))
     if not measured:
