@@ -334,7 +334,9 @@ def wide_places(config: Config) -> tuple[float, ...]:
     off_middle = 0.0 if axis is None else abs((axis + 0.5) / cols - 0.5)
     n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
     if n < 1:
-        raise ValueError(f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set it to 0")
+        raise ValueError(
+            f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set scan.wide_views to 0"
+        )
     places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
     if isinstance(mover, StageMover):
         mover.refuse_unreachable({f"the place for {mm:.4g} mm aside,": mover.in_deg + mm / per_unit for mm in places})

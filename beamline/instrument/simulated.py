@@ -122,7 +122,7 @@ def _is_at_level(controller: Controller, output: int, high: bool) -> bool:
 
 
 def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | None:
-    """mm by which the sample stands aside; None: out of the beam, or nobody says how far aside."""
+    """How far the sample is from its place, in mm across the beam; None: out of the beam."""
     place, mm = math.degrees(axis.angle_at(clock.now())), mover.mm_per_deg
     is_out = abs(place - mover.out_deg) < IN_PLACE if mm else abs(place - mover.in_deg) >= IN_PLACE
     return None if is_out else (mm or 0.0) * (place - mover.in_deg)

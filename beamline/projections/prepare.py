@@ -330,7 +330,7 @@ def assemble(
 
 
 def _stated_radius(source: ScanSource, selection: Selection) -> float | None:
-    """Half the width of the sample, as asked for or as the file says."""
+    """Half the width of the sample in mm (px where the pixel size is unknown), as asked for or as the file says."""
     stated = source.attributes.get("sample_diameter_mm") if pixel_size(source, selection) is not None else None
     width = stated if selection.sample_width is None else selection.sample_width
     return None if width is None else float(width) / 2
@@ -346,10 +346,10 @@ def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepa
             light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
         warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
+        if unlevelled and (change := uncorrected_current(source, selection)):
+            warn(change)
     elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))
-    if sides and unlevelled and (change := uncorrected_current(source, selection)):
-        warn(change)
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

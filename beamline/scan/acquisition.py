@@ -189,7 +189,7 @@ class Acquisition:
     def _standing(self, block: Block) -> Iterator[Frame]:
         """Views on the way back, or wide ones, at angles of the first views. Nothing replaces anything."""
         views = self._timeline.views
-        beyond = float(middle_of_exposure(views)[0])  # every pass goes the same way
+        beyond = float(max(middle_of_exposure(views), key=abs))  # every pass goes the same way; one pulse has none
         done = RecordedBlock(block, BlockTally(), again=block.kind is FrameKind.ALIGNMENT)
         first = 0 if done.again else block.first_trigger - views.first_trigger  # in files wide views are views, too
         for frame in self._block(done):

@@ -2,7 +2,7 @@
 
 Each view also sums the matter beside the field. A box of the field alone would push that matter into its rim, and make
 the middle too dense. So the views are explained by voxels, or Gaussians, as far as the sample reaches, and the field's
-part is given back. How far it reaches is the radius whose volume predicts views held out best (docs/numerics.md).
+part is given back. How far it reaches is the radius whose volume predicts views held out best (docs/reconstruction.md).
 """
 
 from __future__ import annotations
@@ -45,10 +45,15 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
     traits, decide = method.traits, control.decide or Decisions(problem.seed)
     if traits.direct or traits.several or problem.use.emission is not None:
         return method.run(problem, control)
-    measured = decide(SAMPLE, lambda: _values(_of_problem(problem)))
-    if not measured:
+
+    def measured() -> list[float]:
+        use = problem.use
+        sample = sample_radius(problem.projections, problem.geometry, use.weights, use.sample_radius)
+        return [] if sample is None else list(asdict(sample).values())
+
+    if not (values := decide(SAMPLE, measured)):
         return method.run(problem, control)
-    sample, grid = SampleRadius(*measured), problem.grid
+    sample, grid = SampleRadius(*values), problem.grid
     wide = grid.reaching(sample.radius, problem.geometry)
     result = method.run(replace(problem, grid=wide, wide=True), control)
     before = np.rint(np.subtract(grid.first[1:], wide.first[1:]) / grid.voxel_size).astype(int)
@@ -62,15 +67,6 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
 
     volume = Volume(np.ascontiguousarray(whole[:, y, x]), grid)
     return replace(result, volume=volume, settings={**result.settings, **sample.settings}, outside=outside)
-
-
-def _values(sample: SampleRadius | None) -> list[float]:
-    return [] if sample is None else list(asdict(sample).values())
-
-
-def _of_problem(problem: ReconProblem) -> SampleRadius | None:
-    use = problem.use
-    return sample_radius(problem.projections, problem.geometry, use.weights, use.sample_radius)
 
 
 def sample_radius(
