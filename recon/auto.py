@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, Self
@@ -11,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F64, bin_views
-from recon.base.choices import AUTO
+from recon.base.choices import AUTO, Quality
 from recon.base.decisions import Decisions
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import NonNegative, check_settings
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import (
@@ -28,13 +27,20 @@ from recon.base.method import (
 )
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod, Costs, Work
-from recon.splatting.finish import Candidates, beyond_voxels
+from recon.splatting.finish import FIRST_SHARE, Candidates, beyond_voxels, level_of
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
 from recon.voxels.direct import Fbp
 from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of
-from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, split_views, unseen_residuals
+from recon.voxels.held_out import (
+    LEAST_GAIN,
+    LEAST_VIEWS,
+    TRIAL_ROWS,
+    first_as_good,
+    split_views,
+    unseen_residuals,
+)
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines
@@ -64,11 +70,9 @@ def predicts_best(
     methods: Sequence[Method],
     control: RunControl,
     order: Sequence[int] | None = None,
+    least_gain: float = LEAST_GAIN,
 ) -> TrialsVerdict:
-    """Which method has the least residual in held-out views (one of eight); of equal ones the first.
-
-    A simpler one within one standard error is not preferred, as it is among priors: on a shell of 50 views that costs
-    1.7 dB, and the user would get a volume that predicts worse than another one that was tried.
+    """Which method predicts held-out views (one of eight) as well as the best, and is the first to do so.
 
     A prior that one trial chooses by views held out is that of the next ones. A method that `control` cuts short is not
     judged.
@@ -76,6 +80,7 @@ def predicts_best(
     Args:
         methods: the simplest and cheapest first.
         order: in which they are tried; None: the same.
+        least_gain: as of `first_as_good`.
 
     Raises:
         ValueError: no method takes these views or data.
@@ -112,7 +117,7 @@ def predicts_best(
         listed += "; the others not tried in time"
     if not tried:
         raise ValueError("; ".join(refused))
-    return TrialsVerdict(min(tried, key=lambda at: float(residuals[at].mean())), listed)
+    return TrialsVerdict(first_as_good([residuals.get(at) for at in range(len(methods))], least_gain), listed)
 
 
 def _candidate(method: Method) -> Method:
@@ -190,12 +195,12 @@ def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
 
 
 def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F64:
-    """`unseen_residuals` of a result, negative values at zero; a fit also shows what no voxel can."""
+    """`unseen_residuals` of a result, negative values at zero; of a fit less the level of what is beyond them."""
     grid = made.volume.grid
     projector, views = Projector(problem.geometry, grid), problem.projections
     if made.gaussians is not None and isinstance(method, FitMethod):
         beyond = beyond_voxels(made.gaussians, problem.geometry, grid, method.fit)
-        views = views if beyond is None else views - beyond
+        views = views if beyond is None else views - level_of(beyond)
     model, weights = projector.forward(np.maximum(made.volume.data, 0)), problem.use.weights
     model, views = (projection_lines(each) for each in (model, views))
     rays = None if weights is None else projection_lines(weights)
@@ -213,15 +218,17 @@ class Auto:
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
+        least_gain: share of the residual that a costlier method must leave less of views held out.
     """
 
     name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
     traits: ClassVar[Traits] = Traits(
-        device=True, budget=True, needs_matter=True, halo=max(R2.traits.halo, FistaTv.traits.halo)
+        device=True, budget=True, presets=True, needs_matter=True, halo=max(R2.traits.halo, FistaTv.traits.halo)
     )
 
     candidates: tuple[Method, ...] = field(default_factory=lambda: (Fbp(), FistaTv(), PnpDct(), R2()))
+    least_gain: NonNegative = LEAST_GAIN
 
     def __post_init__(self) -> None:
         check_settings(self)
@@ -256,18 +263,19 @@ class Auto:
         fit = self._fit
         if fit is not None:
             listen = control.on_progress if control.decide is None else None  # in a slab only slices are counted
-            tried = trials_of(fit, problem, replace(control, on_progress=listen))
-            residuals = [_residual(method, tried) for method in self.candidates]
-            if min(residuals) < math.inf:
+            tried = trials_of(fit, problem, replace(control, on_progress=listen), self.least_gain)
+            residuals = [_residuals_in(tried, method) for method in self.candidates]
+            at = first_as_good(residuals, self.least_gain)
+            if at is not None:
                 decide.preset(tried.prior)
                 named = zip(self.candidates, residuals, strict=True)
-                listed = "; ".join(f"{method.name} {each:.4g}" for method, each in named if each < math.inf)
+                listed = "; ".join(f"{method.name} {each.mean():.4g}" for method, each in named if each is not None)
                 rows = min(TRIAL_ROWS, problem.geometry.detector_shape[0])
-                return int(np.argmin(residuals)), f"trials on {rows} rows, {LEFT}: {listed}", True
+                return at, f"trials on {rows} rows, {LEFT}: {listed}{_untried(fit, tried.untried)}", True
         part, where = part_of(problem)
         if part is None:
             return last, where, False
-        at, because = predicts_best(part, self.candidates, control)
+        at, because = predicts_best(part, self.candidates, control, least_gain=self.least_gain)
         if at is None:
             return last, because, False
         return at, f"trials on {where}, {LEFT}: {because}", True
@@ -278,6 +286,12 @@ class Auto:
         *others, last = self.candidates
         fits = last if isinstance(last, FitMethod) and last.by_content else None
         return fits if all(_judged_beside(method) for method in others) else None
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """A preview without the costly candidates; for the best the least lead counts, and all trials are made."""
+        if quality == "preview":
+            return replace(self, candidates=self.candidates[:2])
+        return replace(self, least_gain=0.0) if quality == "best" else self
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
@@ -310,8 +324,13 @@ def _judged_beside(method: Method) -> bool:
     return isinstance(method, Fbp)
 
 
-def _residual(method: Method, tried: Candidates) -> float:
-    """Mean of what the method leaves of views held out; infinite where it was not tried."""
+def _residuals_in(tried: Candidates, method: Method) -> F64 | None:
+    """What the method leaves of views held out; None: it was not tried."""
     of_voxels = {Fbp: tried.direct, FistaTv: tried.smooth, PnpDct: tried.patches}
-    residuals = of_voxels.get(type(method), tried.fit)
-    return math.inf if residuals is None else float(residuals.mean())
+    return of_voxels.get(type(method), tried.fit)
+
+
+def _untried(fit: FitMethod, seconds: float) -> str:
+    """Of a fit that is judged after some of its steps, what the others would cost."""
+    after = f" after {FIRST_SHARE:.0%} of its steps, too far behind to try the others (about {seconds:.2g} s)"
+    return f", {fit.name}{after}; --quality best tries them" if seconds else ""

@@ -169,7 +169,7 @@ def _chosen(
     trial = RunControl(control.stop, now=control.now).by(control.now() + _TRIAL_SLACK * seconds)
     liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
     order = [liked.index(c) for c in tried]
-    at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
+    at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order, least_gain=0.0)
     if at is None:
         return plan.preferred(plan.choices()), f"{expected}too little time"
     return plan.choices(name=liked[at].method)[0], f"trials on {where}, {LEFT}: {residuals}"

@@ -48,6 +48,7 @@ class ReconMemory:
         largest_step: name of the one that takes the most alone.
         bars: error bars are made, too.
         radius: mm from the rotation axis to the end of a sample wider than the field; None: it ends within.
+        taller: the sample goes on above or below the field of a cone.
     """
 
     method: Method
@@ -58,6 +59,7 @@ class ReconMemory:
     largest_step: str = ""
     bars: bool = False
     radius: float | None = None
+    taller: bool = False
 
     @property
     def rows(self) -> int:
@@ -138,7 +140,8 @@ class ReconMemory:
 
     def _grid(self, rows: int) -> Grid:
         grid = Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
-        return grid if self.radius is None else grid.reaching(self.radius, self.geometry)
+        grid = grid if self.radius is None else grid.reaching(self.radius, self.geometry)
+        return grid.as_tall_as_rays(self.geometry) if self.taller else grid
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:

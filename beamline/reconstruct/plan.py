@@ -56,6 +56,7 @@ from recon.base.views import parse_views
 from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import sample_radius
+from recon.voxels.field_edges import taller_than_field
 
 _BATCH = 0.25  # of the memory: views during correction
 
@@ -128,6 +129,7 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
+        taller=taller_than_field(prepared.projections.data, geometry) and not options.method.traits.direct,
     )  # fmt: skip
     if plan.slabs or (needs.radius is not None and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)

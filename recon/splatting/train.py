@@ -44,7 +44,7 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.held_out import unseen_residuals
+from recon.voxels.held_out import LEAST_GAIN, first_as_good, unseen_residuals
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines
@@ -245,22 +245,24 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
     return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last), started_from=n_start)
 
 
-def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
+def trials_of(
+    method: FitMethod, problem: ReconProblem, control: RunControl, least_gain: float = LEAST_GAIN
+) -> Candidates:
     """Residuals of held-out views for a fit and for methods on voxels."""
 
     def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
         share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]
         return run_fit(method.for_trial(share, of_steps), part, watched)
 
-    return judged(problem, method.fit, control, short)
+    return judged(problem, method.fit, control, short, least_gain)
 
 
 def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: Decisions) -> int:
     """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
     tried = trials_of(method, views.fitted, control)
     decide.preset(tried.prior)
-    residuals = [math.inf if each is None else float(each.mean()) for each in (tried.smooth, tried.patches, tried.fit)]
-    return int(np.argmin(residuals)) if min(residuals) < math.inf else len(_ON_VOXELS)
+    at = first_as_good((tried.smooth, tried.patches, tried.fit))
+    return len(_ON_VOXELS) if at is None else at
 
 
 def _started(

@@ -22,7 +22,14 @@ from recon.base.masks import RayWeights, masked
 from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.field_edges import busiest_rows, middle_of_cone, sample_reach, slab_of, wider_than_field
+from recon.voxels.field_edges import (
+    busiest_rows,
+    middle_of_cone,
+    sample_reach,
+    slab_of,
+    taller_than_field,
+    wider_than_field,
+)
 from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines
@@ -36,6 +43,9 @@ _ERRORS = 1.0  # standard errors by which radii predict alike
 def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
 
+    The box is as wide as the sample. Where a sample goes on above or below the field of a cone, it is as tall as the
+    rays: voxels of a thorax of 48 rows, cut from 128, have 38.7 dB in place of 14.4.
+
     A sample within the field, a direct method, which continues the views, methods that make several volumes, and those
     of an emission run as they are.
 
@@ -46,27 +56,29 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
     if traits.direct or traits.several or problem.use.emission is not None:
         return method.run(problem, control)
 
+    data, views, grid = problem.projections, problem.geometry, problem.grid
+
     def measured() -> list[float]:
-        use = problem.use
-        sample = sample_radius(problem.projections, problem.geometry, use.weights, use.sample_radius)
+        sample = sample_radius(data, views, problem.use.weights, problem.use.sample_radius)
         return [] if sample is None else list(asdict(sample).values())
 
-    if not (values := decide(SAMPLE, measured)):
+    sample = SampleRadius(*values) if (values := decide(SAMPLE, measured)) else None
+    box = grid if sample is None else grid.reaching(sample.radius, views)
+    box = box.as_tall_as_rays(views) if decide("taller", lambda: taller_than_field(data, views)) else box
+    if box == grid:
         return method.run(problem, control)
-    sample, grid = SampleRadius(*values), problem.grid
-    wide = grid.reaching(sample.radius, problem.geometry)
-    result = method.run(replace(problem, grid=wide, wide=True), control)
-    before = np.rint(np.subtract(grid.first[1:], wide.first[1:]) / grid.voxel_size).astype(int)
-    y, x = (slice(first, first + n) for first, n in zip(before, grid.shape[1:], strict=True))
+    result = method.run(replace(problem, grid=box, wide=sample is not None), control)
+    before = np.rint(np.subtract(grid.first, box.first) / grid.spacing).astype(int)
+    field = tuple(slice(first, first + n) for first, n in zip(before, grid.shape, strict=True))
     whole = result.volume.data
 
     def outside(views: Geometry) -> F32:
         matter = np.maximum(whole, 0)
-        matter[:, y, x] = 0
-        return Projector(views, wide).forward(matter)
+        matter[field] = 0
+        return Projector(views, box).forward(matter)
 
-    volume = Volume(np.ascontiguousarray(whole[:, y, x]), grid)
-    return replace(result, volume=volume, settings={**result.settings, **sample.settings}, outside=outside)
+    volume, radius = Volume(np.ascontiguousarray(whole[field]), grid), {} if sample is None else sample.settings
+    return replace(result, volume=volume, settings={**result.settings, **radius}, outside=outside)
 
 
 def sample_radius(

@@ -148,6 +148,18 @@ def wider_than_field(projections: F32, geometry: Geometry) -> bool:
     return bool(FieldEdges.of(projections, geometry).beyond(0.0))
 
 
+def taller_than_field(projections: F32, geometry: Geometry) -> bool:
+    """Whether matter goes on above or below the field of a cone, whose rays then meet it beyond the slices of its rows.
+
+    Args:
+        projections: line integrals [view, row, col]; values that are not finite do not count.
+    """
+    if not geometry.is_cone or not len(projections):
+        return False
+    rows = np.nan_to_num(projections[spread(np.arange(len(projections)), _VIEWS)], posinf=0, neginf=0).mean(axis=(0, 2))
+    return bool(ends_in_matter(rows[None]).any())
+
+
 AIR = 0.03
 """Of the largest line integral: trials leave out columns below it. Without: a tooth takes 129 CPU s instead of 55."""
 

@@ -20,6 +20,7 @@ from recon.voxels.held_out import (
     CHOICE_SWEEPS,
     TRIAL_SWEEPS,
     TRIALS,
+    BestStrength,
     HeldOutTrial,
     choose_weight,
     preferred_strength,
@@ -282,9 +283,10 @@ def choose_patches(
         found = preferred_strength(partial(residuals_of_patches, judge, smooth, steps), first)
         if found is None:
             return [first, 0]
-        judge.remember("patches", found)
         fewer = math.sqrt(1 - 1 / ONE_IN)  # noise of a volume falls with the root of the views: the trial had fewer
-        return [fewer * found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
+        best = BestStrength(fewer * found.strength, found.residuals)  # by the name that the volume will ask for
+        judge.remember("patches", best)
+        return [best.strength, best.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
