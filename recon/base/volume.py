@@ -119,11 +119,11 @@ class Grid:
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
 
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
-        """The box with whole slices added until it holds the rays of a cone, which climb up to its far corners."""
+        """The box with whole slices added until it holds the rays of a cone, which climb or sink to its corners."""
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
-        climb = 1 + min(corner / geometry.source_distance, 1.0)
+        share = min(corner / geometry.source_distance, 1.0)
         (low, high), (bottom, top) = geometry.heights, self.edges[:, 2]
-        wanted = bottom - min(low, climb * low), max(high, climb * high) - top
+        wanted = bottom - low + share * abs(low), high + share * abs(high) - top
         below, above = (max(0, math.ceil(each / edge - 1e-6)) for each in wanted)
         centre = (self.centre[0] + (above - below) / 2 * edge, *self.centre[1:])
         return replace(self, shape=(below + self.shape[0] + above, *self.shape[1:]), centre=centre)

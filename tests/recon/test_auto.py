@@ -15,6 +15,7 @@ from recon.auto import Auto
 from recon.base.decisions import Decisions
 from recon.base.method import ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Volume
+from recon.splatting.finish import Candidates
 from recon.voxels import held_out
 from recon.voxels.direct import Fbp
 from recon.voxels.iterative import prior_decisions
@@ -132,6 +133,23 @@ def test_a_cone_is_tried_in_its_middle_or_at_half_the_resolution(axis_row: float
     found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
     assert found.settings["factor"] == 1.0
     assert where in found.settings["chosen_because"]
+
+
+def test_a_gain_of_a_percent_is_not_worth_another_method_unless_the_best_is_asked_for(data: F32) -> None:
+    auto, left = Auto((Scaled(factor=0.8), Scaled(factor=0.805))), []
+    for method in (auto, auto.with_quality("best", 1)):
+        made = recon.reconstruct(data, VIEWS, method)
+        left.append(made.settings["factor"])
+    assert left == [0.8, 0.805]
+    assert [type(each) for each in Auto().with_quality("preview", 1).candidates] == [Fbp, FistaTv]
+    assert auto.with_quality("standard", 1) is auto
+
+
+def test_it_says_what_was_not_tried_and_what_that_would_cost(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried = Candidates(*(np.full(3, residual) for residual in (2.0, 1.0, 1.1, 1.3)), untried=4.2)
+    monkeypatch.setattr("recon.auto.trials_of", lambda *_: tried)
+    because = recon.reconstruct(data, VIEWS, Auto()).settings["chosen_because"]
+    assert "r2 1.3, r2 after 25% of its steps, too far behind" in because and "about 4.2 s" in because
 
 
 def test_a_stop_ends_the_trials(data: F32) -> None:

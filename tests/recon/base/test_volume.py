@@ -16,6 +16,7 @@ from recon.splatting.initialise import first_volume, place
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
+from recon.voxels.projector import Projector
 
 TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 
@@ -103,6 +104,25 @@ def test_a_fit_of_a_wider_sample_gets_a_wider_box() -> None:
     near = Geometry.cone(TURN, (10, 30), 1.0, 23.0, 23.0)
     field, box = Grid.for_fit(near, grid), Grid.for_fit(near, grid.reaching(18, near), wider=True)
     assert field.shape[1] < box.shape[1] < 36 and np.hypot(*box.edges[1][:2]) < near.sod
+
+
+@pytest.mark.parametrize("axis_row", [5.5, -4.0, 20.0])
+def test_the_rays_of_a_cone_meet_all_slices_of_its_tall_box_and_no_others(axis_row: float) -> None:
+    views = Geometry.cone(TURN, (12, 40), 1.0, 90.0, 90.0, axis_row=axis_row)
+    grid = Grid.matching(views)
+    tall = grid.as_tall_as_rays(views)
+    added = np.rint(np.subtract(grid.first, tall.first)[0]).astype(int)
+    assert tall.shape[1:] == grid.shape[1:] and tall.shape[0] >= added + grid.shape[0] >= grid.shape[0]
+    more = Grid((tall.shape[0] + 8, *tall.shape[1:]), 1.0, tall.centre)
+    slices = np.zeros(more.shape, np.float32)
+    for k in (3, more.shape[0] - 4):
+        slices[k] = 1
+    assert not Projector(views, more).forward(slices).any()
+    slices[:] = 0
+    slices[5 if axis_row > 0 else -6] = 1
+    assert Projector(views, more).forward(slices).any()
+    straight = Geometry.parallel(TURN, (12, 40))
+    assert Grid.matching(straight).as_tall_as_rays(straight) == Grid.matching(straight)
 
 
 def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:

@@ -158,3 +158,27 @@ def test_a_box_ends_before_the_source_of_a_cone() -> None:
     cone = recon.Geometry.cone(ANGLES, (8, 32), 1.0, 60.0, 90.0)
     wider = recon.Grid.matching(cone).reaching(500.0, cone)
     assert np.hypot(*wider.edges[1, :2]) + wider.voxel_size / 2 < cone.source_distance
+
+
+def test_matter_above_and_below_the_field_of_a_cone_stays_out_of_its_slices() -> None:
+    """A rod with discs across goes on for twice the height that rows see; the same rod within is not touched."""
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    cone = recon.Geometry.cone(turn, (16, 48), 1.0, 80.0, 80.0)
+    grid, tall = recon.Grid.matching(cone), recon.Grid((48, 48, 48), 1.0)
+    z, y, x = np.meshgrid(*tall.coordinates(), indexing="ij")
+    rod = np.where(np.hypot(x, y) < 14, 0.01 + 0.01 * (np.sin(z) > 0), 0).astype(np.float32)
+    inner = slice(16, 32)
+    views = Projector(cone, tall).forward(rod)
+    problem = ReconProblem(views, cone, grid, DataUse(), 0, "cpu")
+    made, alone = recon.reconstruct(views, cone, METHOD), METHOD.run(problem, RunControl())
+    assert made.volume.grid == grid and made.outside is not None
+
+    def off(volume: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((volume - rod[inner]) ** 2)))
+
+    assert off(made.volume.data) < 0.5 * off(alone.volume.data)
+    left = views - made.outside(cone) - Projector(cone, grid).forward(made.volume.data)
+    assert np.abs(left).mean() < 0.02 * views.mean()
+    rod[: inner.start + 3], rod[inner.stop - 3 :] = 0, 0
+    views = Projector(cone, tall).forward(rod)
+    assert recon.reconstruct(views, cone, METHOD).outside is None

@@ -26,6 +26,7 @@ from recon.voxels.held_out import (
     LEAST_VIEWS,
     HeldOutTrial,
     beyond_chance,
+    first_as_good,
     preferred_strength,
     split_views,
     unseen_residuals,
@@ -130,6 +131,29 @@ def test_beyond_chance_is_more_than_a_standard_error_in_any_unit(gains: NDArray[
     error = float(gains.std(ddof=1)) / math.sqrt(6)
     assume(abs(gains.mean() - error) > 1e-6)
     assert beyond_chance(unit * gains, 1.0) == (gains.mean() > error)
+
+
+@pytest.mark.parametrize(
+    ("means", "least_gain", "taken"),
+    [
+        ((1.5, 1.2, 1.0), 0.02, 2),
+        ((1.5, 1.015, 1.0), 0.02, 1),  # ahead by less than that
+        ((1.5, 1.015, 1.0), 0.0, 2),
+        ((1.5, 1.015, None), 0.02, 1),
+        ((None, None, 1.0), 0.02, 2),
+        ((1.0, 1.2, 0.5), 0.6, 0),
+        ((None, None), 0.02, None),
+    ],
+)
+def test_the_cheapest_candidate_that_the_best_does_not_lead_is_taken(
+    means: tuple[float | None, ...], least_gain: float, taken: int | None
+) -> None:
+    residuals = [None if mean is None else mean + SCATTER for mean in means]
+    assert first_as_good(residuals, least_gain) == taken
+
+
+def test_a_lead_by_chance_is_none() -> None:
+    assert first_as_good([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
 
 
 @pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])
