@@ -92,7 +92,7 @@ def judged(case: Case, volume: F32) -> float:
     return psnr(case.truth[:, seen], volume[:, seen], case.peak)
 
 
-def _peak_memory() -> float:
+def peak_memory() -> float:
     """Of this process, MB."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
@@ -115,7 +115,7 @@ def play(name: str, case: Case) -> list[Score]:
         except NotImplementedError:
             continue
         seconds = (time.process_time() - begin) * share
-        scores.append(Score(setting, judged(case, volume), seconds, _peak_memory()))
+        scores.append(Score(setting, judged(case, volume), seconds, peak_memory()))
     return scores
 
 

@@ -6,10 +6,13 @@ a geometry on the CPU raises NotImplementedError.
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +24,10 @@ from recon.warm_up import warm_up
 from tests.bench.quality_cases import Case
 
 F32 = NDArray[np.float32]
+Value = Any  # of a method's main setting, a number or a name; None: the default
+DEFAULT = "default"
 WEIGHTS = 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2
+THRESHOLDS = 0.01, 0.02, 0.04, 0.08
 
 
 @dataclass(frozen=True)
@@ -102,12 +108,28 @@ def _iradon_sart(sweeps: int) -> Callable[[Case], F32]:
     return _by_slices(volume)
 
 
-def _astra(algorithm: str, iterations: int = 1) -> Callable[[Case], F32]:
+def _within(volume: F32, side: int) -> F32:
+    """The middle of slices [z, y, x] that are wider."""
+    first = (volume.shape[2] - side) // 2
+    return volume[:, first : first + side, first : first + side]
+
+
+def _wider(side: int, by: float) -> int:
+    """An even number more."""
+    return side + 2 * round((by - 1) * side / 2)
+
+
+def _astra(algorithm: str, iterations: int = 1, widen: float = 1) -> Callable[[Case], F32]:
+    """`widen`: the slices that it makes are so many times as wide as the field."""
+
     def volume(views: F32, geometry: Geometry) -> F32:
         import astra
 
-        side = views.shape[1]
-        plane, beam = astra.create_vol_geom(side, side), astra.create_proj_geom("parallel", 1.0, side, geometry.angles)
+        side, whole = views.shape[1], _wider(views.shape[1], widen)
+        plane, beam = (
+            astra.create_vol_geom(whole, whole),
+            astra.create_proj_geom("parallel", 1.0, side, geometry.angles),
+        )
         if off_middle(geometry):
             beam = astra.geom_postalignment(beam, -off_middle(geometry))
         projector = astra.create_projector("linear", beam, plane)
@@ -118,23 +140,27 @@ def _astra(algorithm: str, iterations: int = 1) -> Callable[[Case], F32]:
         astra.algorithm.run(run, iterations)
         found = astra.data2d.get(image)
         astra.clear()
-        return np.asarray(found, np.float32)
+        return _within(np.asarray(found, np.float32)[None], side)[0]
 
     return _by_slices(volume, axis_off=algorithm != "FBP")
 
 
-def _svmbir(**settings: float) -> Callable[[Case], F32]:
+def _svmbir(widen: float = 1, **settings: float) -> Callable[[Case], F32]:
+    """`widen`: the slices that it makes are so many times as wide as the field, its own way to a wider sample."""
+
     def volume(case: Case) -> F32:
         import svmbir
 
         if case.geometry.is_cone:
             raise NotImplementedError
+        side = case.geometry.detector_shape[1]
+        whole, threads = _wider(side, widen), int(os.environ.get("OMP_NUM_THREADS", 2))
         with tempfile.TemporaryDirectory() as folder:  # system matrices of earlier scans
             found = svmbir.recon(
                 case.projections, case.geometry.angles, weights=case.weights, center_offset=off_middle(case.geometry),
-                num_threads=2, verbose=0, svmbir_lib_path=folder, **settings,
+                num_rows=whole, num_cols=whole, num_threads=threads, verbose=0, svmbir_lib_path=folder, **settings,
             )  # fmt: skip
-        return np.asarray(found, np.float32).swapaxes(1, 2)[:, ::-1]
+        return _within(np.asarray(found, np.float32).swapaxes(1, 2)[:, ::-1], side)
 
     return volume
 
@@ -163,6 +189,23 @@ def _mbirjax(**settings: float) -> Callable[[Case], F32]:
     return volume
 
 
+def _mbir_parallel(module: str, widen: float = 1, **settings: float) -> Callable[[Case], F32]:
+    """mbirjax or mbirtorch, of the authors of svmbir, by a parallel beam; `widen` as there."""
+
+    def volume(case: Case) -> F32:
+        if case.geometry.is_cone or case.grid.shape[1] != case.geometry.detector_shape[1]:
+            raise NotImplementedError
+        (rows, side), whole = case.geometry.detector_shape, _wider(case.geometry.detector_shape[1], widen)
+        np.random.seed(0)  # noqa: NPY002 - the order of its updates
+        model = import_module(module).ParallelBeamModel(case.projections.shape, case.geometry.angles)
+        offset = off_middle(case.geometry)
+        model.set_params(no_warning=True, recon_shape=(whole, whole, rows), det_channel_offset=offset, **settings)
+        found, _ = model.recon(case.projections, weights=case.weights, print_logs=False, logfile_path=None)
+        return _within(np.moveaxis(np.asarray(found, np.float32), 2, 0)[:, ::-1], side)
+
+    return volume
+
+
 def _corrct(weight: float | None, iterations: int) -> Callable[[Case], F32]:
     """By scikit-image's projector where there is no CUDA."""
 
@@ -181,6 +224,10 @@ LEAGUE: dict[str, Competitor] = {
     "splatline fbp": _ours(("ram-lak", recon.Fbp(filter="ram-lak")), ("hann", recon.Fbp(filter="hann"))),
     "splatline fista-tv": _ours(
         ("default", recon.FistaTv()), *((f"weight {weight:g}", recon.FistaTv(tv_weight=weight)) for weight in WEIGHTS)
+    ),
+    "splatline pnp-dct": _ours(
+        ("default", recon.PnpDct()),
+        *((f"threshold {value:g}", recon.PnpDct(patch_threshold=value)) for value in THRESHOLDS),
     ),
     "splatline r2": _ours(("default", recon.R2())),
     "splatline auto": _ours(("default", recon.Auto())),
@@ -209,3 +256,70 @@ LEAGUE: dict[str, Competitor] = {
         slice_by_slice=True,
     ),
 }
+
+
+class Entrant(NamedTuple):
+    """A method, volume by volume.
+
+    Attributes:
+        of: by a value of its main setting, for a sample so many times as wide as the field.
+        setting: its name.
+        at: value k of a sweep, in order; None: there is none.
+        wide_alone: takes part only where the sample is wider than the field.
+    """
+
+    of: Callable[[Value, float], Competitor]
+    setting: str = ""
+    at: Callable[[int], Value] = lambda k: DEFAULT if k == 0 else None
+    wide_alone: bool = False
+
+
+def _own(method: Callable[[Value], Method]) -> Callable[[Value, float], Competitor]:
+    return lambda value, over: _ours((DEFAULT, method(value)))
+
+
+def _of_peer(
+    module: str, make: Callable[..., Callable[[Case], F32]], wide: bool, compiles: bool = False
+) -> Callable[[Value, float], Competitor]:
+    def of(value: Value, over: float) -> Competitor:
+        settings = {} if value is None else {"sharpness": value}
+        return Competitor({DEFAULT: make(widen=over if wide else 1.0, **settings)}, module, compiles=compiles)
+
+    return of
+
+
+def _sirt(wide: bool) -> Callable[[Value, float], Competitor]:
+    def of(value: Value, over: float) -> Competitor:
+        iterations = 100 if value is None else round(float(value))
+        return Competitor({DEFAULT: _astra("SIRT", iterations, over if wide else 1.0)}, "astra", slice_by_slice=True)
+
+    return of
+
+
+def _fbp(value: Value) -> Method:
+    return recon.Fbp() if value is None else recon.Fbp(filter=value)
+
+
+def _mbir(module: str) -> Callable[..., Callable[[Case], F32]]:
+    return lambda **settings: _mbir_parallel(module, **settings)
+
+
+def _peers() -> Iterator[tuple[str, Entrant]]:
+    for wide in (False, True):
+        end = " wide" if wide else ""
+        yield f"svmbir{end}", Entrant(_of_peer("svmbir", _svmbir, wide), "sharpness", lambda k: k or DEFAULT, wide)
+        for module in ("mbirtorch", "mbirjax"):
+            of = _of_peer(module, _mbir(module), wide, compiles=True)
+            yield f"{module}{end}", Entrant(of, "sharpness", lambda k: 1.0 + k if k else DEFAULT, wide)
+        yield f"sirt{end}", Entrant(_sirt(wide), "iterations", lambda k: round(100 * 2**k) if k else DEFAULT, wide)
+
+
+ENTRANTS: dict[str, Entrant] = {
+    "fbp": Entrant(_own(_fbp), "filter", {0: DEFAULT, 1: "shepp-logan", 2: "ram-lak"}.get),
+    "fista-tv": Entrant(_own(lambda value: recon.FistaTv(tv_weight=value)), "weight", lambda k: 4e-3 * 2**k),
+    "pnp-dct": Entrant(_own(lambda value: recon.PnpDct(patch_threshold=value)), "threshold", lambda k: 0.04 * 2**k),
+    "r2": Entrant(_own(lambda value: recon.R2())),
+    "auto": Entrant(_own(lambda value: recon.Auto())),
+    **dict(_peers()),
+}
+"""Of tests.bench.first_users, in the order of its tables."""

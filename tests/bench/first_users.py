@@ -1,0 +1,353 @@
+"""The first users' league: packed samples of many columns from few views, in the field and wider, by ours and peers.
+
+python -m tests.bench.first_users SCORES.json --columns 512 --views 90 --best > tables.md
+adds what SCORES.json lacks, a volume at a time, and prints the tables of all cells asked for. Several calls may add to
+one file at once. Peers take part where they are installed, see tests.bench.league.
+
+Scenes: see tests.bench.first_users_scenes. 16 rows, 8 from 2048 columns on. The noise is that of so many photons a
+pixel in the open beam; seeds are of the noise alone. "wide" is a peer's own way to a sample wider than the field:
+slices as wide as the sample, of whose width it is told.
+
+dB: PSNR within 0.95 of the field's circle, over the largest density, values clipped at 0. Fraction: of voxels over half
+way between matrix and grains, inside the can's wall, over the true one's. Cracks: share found where 2 % of planes
+without a crack are taken for one, see `cracks_found`. CPU seconds are of the volume alone, on one thread by default;
+what compiles did so before. Memory: peak of the process, which makes this volume alone, with all that it imports.
+
+The best setting is best by dB, which no user knows: from its first value the sweep climbs until it has seen lower
+quality on both sides, for the first seed; further seeds take that setting. Slices that do not know each other (ASTRA)
+are two of all rows, whose seconds count for all; of `cracks` all are made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import json
+import math
+import multiprocessing
+import os
+import resource
+import signal
+import statistics
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from itertools import product
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from recon.base.volume import Grid
+from tests.bench.first_users_scenes import SCENES, Planes, Scene, scene_of
+from tests.bench.league import SLICES, peak_memory
+from tests.bench.league_peers import DEFAULT, ENTRANTS, Value
+from tests.bench.quality_cases import Case, rows_of
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+VERSION = 1
+"""Of scenes and figures: scores of another one do not belong into the same table."""
+FALSE, BESIDE, ACROSS, POINTS, FEWEST = 0.02, 2.5, 0.6, 60, 15
+"""Share of controls taken for cracks; planes beside a plane, voxels away; disc over the plane's; points, and fewest."""
+
+
+class Cell(NamedTuple):
+    """One noisy scan; `over`: width of the sample over the field."""
+
+    scene: str
+    columns: int
+    views: int
+    over: float
+    photons: float
+    seed: int
+
+    @property
+    def rows(self) -> int:
+        return 8 if self.columns >= 2048 else 16
+
+    def __str__(self) -> str:
+        return f"{self.scene}|{self.columns}|{self.views}|{self.over:g}|{self.photons:g}|{self.seed}"
+
+
+class Score(NamedTuple):
+    """Figures of a volume, see above; without a quality it was ended after so many seconds."""
+
+    quality: float | None
+    fraction: float | None
+    cracks: float | None
+    seconds: float
+    memory: float
+
+
+def cracks_found(volume: F32, planes: Planes) -> float:
+    """Share of the cracks darker than 98 % of the controls.
+
+    The darkness of a plane is the mean of a disc in it below that of two discs 2.5 voxels beside it, all within the
+    same ball. Discs of which fewer than 15 of 60 points lie in the rows and within 0.95 of the field do not count.
+    """
+    turn, out = np.arange(POINTS) * np.pi * (3 - math.sqrt(5)), np.sqrt((np.arange(POINTS) + 0.5) / POINTS)
+    least = np.eye(3)[np.argmin(np.abs(planes.normal), axis=1)]
+    one = np.cross(planes.normal, least)
+    one /= np.linalg.norm(one, axis=1, keepdims=True)
+    other = np.cross(planes.normal, one)
+    flat = out * np.cos(turn) * one[..., None] + out * np.sin(turn) * other[..., None]
+    disc = planes.centre[..., None] + ACROSS * planes.radius[:, None, None] * flat  # [plane, xyz, point]
+    middle = (np.array(volume.shape[::-1]) - 1) / 2
+
+    def seen(beside: float) -> tuple[F64, NDArray[np.bool_]]:
+        at = disc + beside * planes.normal[..., None]
+        there = (np.abs(at[:, 2]) <= middle[2]) & (np.hypot(at[:, 0], at[:, 1]) < 0.95 * volume.shape[2] / 2)
+        points = (at + middle[:, None])[:, ::-1].transpose(1, 0, 2)
+        return map_coordinates(volume, points, order=1, mode="nearest", output=np.float64), there
+
+    (low, a), (own, b), (high, c) = seen(-BESIDE), seen(0), seen(BESIDE)
+    counts = a & b & c
+    some = counts.sum(1) >= FEWEST
+    if not (some & (planes.width > 0)).any() or not (some & (planes.width == 0)).any():
+        return math.nan
+    dark = (((low + high) / 2 - own) * counts).sum(1)[some] / counts.sum(1)[some]
+    crack = planes.width[some] > 0
+    return float(np.mean(dark[crack] > np.quantile(dark[~crack], 1 - FALSE)))
+
+
+def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, float | None]:
+    """dB, fraction of grains over the true one, and share of cracks found (all rows of such a scene only)."""
+    volume, truth = np.maximum(volume, 0), scene.truth[list(rows)]
+    x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
+    away, field = np.hypot(x[:, None], x), 0.95 * truth.shape[2] / 2
+    error = np.mean(np.square(volume - truth, dtype=np.float64)[:, away < field])
+    inside, half_way = away < min(field, scene.inner - 2), sum(scene.levels) / 2
+    fraction = np.mean(volume[:, inside] > half_way) / np.mean(truth[:, inside] > half_way)
+    whole = scene.planes is not None and len(rows) == len(scene.truth)
+    found = cracks_found(volume, scene.planes) if whole and scene.planes else math.nan
+    quality = 10 * math.log10(float(scene.truth.max()) ** 2 / error)
+    return quality, float(fraction), None if math.isnan(found) else found
+
+
+def noisy(cell: Cell, scene: Scene) -> F32:
+    """Line integrals [view, row, col] as so many photons see them."""
+    rng = np.random.default_rng([cell.seed, cell.columns, cell.views])
+    counts = rng.poisson(cell.photons * np.exp(-scene.clean.astype(np.float64)))
+    return -np.log(np.maximum(counts, 1) / cell.photons).astype(np.float32)
+
+
+def _child(name: str, value: Value, over: float, case: Case, limit: float, into: Path, answer: Connection) -> None:
+    warnings.simplefilter("ignore")
+    os.dup2(2, 1)  # what peers print does not belong in the table
+    competitor = ENTRANTS[name].of(value, over)
+    make = competitor.settings[DEFAULT]
+    competitor.prepare(case)
+    if competitor.compiles:
+        make(case)
+    begin = time.process_time()
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(begin + limit), resource.RLIM_INFINITY))
+    volume = make(case)
+    seconds = time.process_time() - begin
+    np.save(into, volume)
+    answer.send((seconds, peak_memory()))
+
+
+def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
+    """One volume in a process of its own; None: it failed, as stderr says."""
+    scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views)
+    rows, views = list(range(cell.rows)), noisy(cell, scene)
+    case = Case(cell.scene, views, scene.geometry, Grid.matching(scene.geometry), np.empty((cell.rows, 0, 0), "f4"), 1)
+    if ENTRANTS[name].of(value, cell.over).slice_by_slice and scene.planes is None:
+        rows = [cell.rows * (2 * k + 1) // (2 * SLICES) for k in range(SLICES)]
+        case = rows_of(case, rows)
+    share, spawn = cell.rows / len(rows), multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as folder:
+        into, (ours, theirs) = Path(folder) / "volume.npy", spawn.Pipe(duplex=False)
+        process = spawn.Process(target=_child, args=(name, value, cell.over, case, limit / share, into, theirs))
+        process.start()
+        theirs.close()
+        process.join()
+        if process.exitcode == -signal.SIGXCPU:
+            return Score(None, None, None, limit, 0.0)
+        if process.exitcode:
+            print(f"{cell} {name}: ended with status {process.exitcode}", file=sys.stderr, flush=True)
+            return None
+        seconds, memory = ours.recv()
+        return Score(*judged(np.load(into), scene, rows), seconds * share, memory)
+
+
+class Kept:
+    """Scores in a file, which several processes may add to."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.scores = self._read()
+
+    def _read(self) -> dict[str, Score]:
+        """Raises ValueError: the file was not written by this version of the bench, or is damaged."""
+        if not self.path.exists():
+            return {}
+        advice = "give another file, or delete it"
+        try:
+            document = json.loads(self.path.read_text(encoding="utf-8"))
+            version, rows = document["version"], dict(document["first_users"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.path} does not hold scores of first_users ({error!r}); {advice}") from error
+        if version != VERSION:
+            raise ValueError(f"{self.path} has scores of version {version}, and these are {VERSION}; {advice}")
+        for key, row in rows.items():
+            parts = key.split("|")
+            numbers = isinstance(row, list) and all(isinstance(x, int | float) for x in row if x is not None)
+            good = len(parts) == 8 and parts[0] in SCENES and parts[6] in ENTRANTS and numbers and len(row) == 5
+            if not good or None in row[3:] or not all(math.isfinite(x) for x in row if x is not None):
+                raise ValueError(f"{self.path}: the score {key!r}: {row!r} is damaged; delete it, or {advice}")
+        return {key: Score(*row) for key, row in rows.items()}
+
+    def change(self, change: Callable[[dict[str, Score]], dict[str, Score]]) -> None:
+        """Change what is in the file now, which others may have added to."""
+        with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            self.scores = change(self._read())
+            part = self.path.with_suffix(".part")
+            part.write_text(json.dumps({"version": VERSION, "first_users": self.scores}, indent=0), encoding="utf-8")
+            part.replace(self.path)
+
+    def score(self, cell: Cell, name: str, setting: Value, limit: float) -> Score | None:
+        """Of the file, or made now; one that was ended is made again if the limit is higher by now."""
+        key = f"{cell}|{name}|{setting}"
+        kept = self.scores.get(key)
+        if kept is None or (kept.quality is None and kept.seconds < limit):
+            kept = play(cell, name, None if setting == DEFAULT else setting, limit)
+            if kept is not None:
+                print(key, *kept, file=sys.stderr, flush=True)
+                new = {key: kept}
+                self.change(lambda scores: scores | new)
+        return kept
+
+    def of(self, cell: Cell, name: str) -> dict[str, Score]:
+        """Scores of a method by setting."""
+        start = f"{cell}|{name}|"
+        return {key.removeprefix(start): score for key, score in self.scores.items() if key.startswith(start)}
+
+
+def climb(quality: Callable[[Value], float], at: Callable[[int], Value]) -> Value:
+    """The best setting: from number 0 up or down until quality is lower on both sides, or there is none further."""
+
+    def of(k: int) -> float:
+        value = at(k)
+        return -math.inf if value is None else quality(value)
+
+    best, top = 0, of(0)
+    for step in (1, -1):
+        while (higher := of(best + step)) > top:
+            best, top = best + step, higher
+        if best > 0:
+            break  # what lies below was passed on the way
+    return at(best)
+
+
+def play_all(kept: Kept, cells: Sequence[Cell], names: Sequence[str], best: bool, limit: float) -> None:
+    """Each method's default for each cell, and its best setting."""
+    for cell, name in product(cells, names):
+        entrant = ENTRANTS[name]
+        if (entrant.wide_alone and cell.over <= 1) or not entrant.of(None, 1.0).is_installed:
+            continue
+        kept.score(cell, name, DEFAULT, limit)
+        if not best or entrant.at(1) is None:
+            continue
+
+        def quality(value: Value, cell: Cell = cell, name: str = name) -> float:
+            made = kept.score(cell, name, value, limit)
+            return -math.inf if made is None or made.quality is None else made.quality
+
+        first = cell._replace(seed=next(other.seed for other in cells if other[:5] == cell[:5]))
+        if first.seed == cell.seed:
+            climb(quality, entrant.at)
+        else:
+            settled = best_of(kept.of(first, name))
+            quality(next((v for v in map(entrant.at, range(-20, 20)) if str(v) == settled), DEFAULT))
+
+
+def best_of(scores: dict[str, Score]) -> str:
+    """The setting of the best quality."""
+    return max(scores, key=lambda setting: scores[setting].quality or -math.inf)
+
+
+def _shown(scores: Sequence[Score]) -> str:
+    """Median and range of dB, and medians of the rest."""
+    if not (made := [score for score in scores if score.quality is not None]):
+        return f"ended at {max(score.seconds for score in scores):.0f} s" if scores else ""
+    quality = [score.quality for score in made if score.quality is not None]
+    text = f"{statistics.median(quality):.2f}"
+    text += f" ({min(quality):.2f} to {max(quality):.2f})" if len(quality) > 1 else ""
+    text += f", {statistics.median(score.fraction or 0 for score in made):.2f}"
+    if found := [score.cracks for score in made if score.cracks is not None]:
+        text += f", {100 * statistics.median(found):.0f} %"
+    seconds = statistics.median(score.seconds for score in made)
+    return text + (f", {seconds:.0f} s" if seconds >= 10 else f", {seconds:.2g} s")
+
+
+def tables(kept: Kept, cells: Sequence[Cell]) -> str:
+    """Markdown: a table for each scene, size, width and number of photons; a column for each number of views."""
+    lines: list[str] = []
+    for scene, columns, over, photons in dict.fromkeys((c.scene, c.columns, c.over, c.photons) for c in cells):
+        here = [c for c in cells if (c.scene, c.columns, c.over, c.photons) == (scene, columns, over, photons)]
+        views = list(dict.fromkeys(c.views for c in here))
+        where = f"{over:g} times as wide as the field" if over > 1 else "in the field"
+        rows: list[str] = []
+        for name, best in product(ENTRANTS, (False, True)):
+            texts, memory = [], 0.0
+            for n in views:
+                by_seed = [kept.of(cell, name) for cell in here if cell.views == n]
+                # A best setting is that of all seeds which have it.
+                setting = best_of(by_seed[0]) if best and len(by_seed[0]) > 1 else None if best else DEFAULT
+                scores = [one[setting] for one in by_seed if setting in one] if setting else []
+                memory = max([memory, *(score.memory for score in scores)])
+                named = f" ({ENTRANTS[name].setting} {setting})" if best and scores else ""
+                texts.append(_shown(scores) + named)
+            if any(texts):
+                label = f"{name}, best" if best else name
+                rows.append(f"| {label} | " + " | ".join(texts) + f" | {memory:.0f} |")
+        if rows:
+            lines += [f"{scene}, {columns} x {here[0].rows}, {where}, {photons:g} photons:", ""]
+            lines += ["| | " + " | ".join(f"{n} views" for n in views) + " | MB |", "|---" * (len(views) + 2) + "|"]
+            lines += [*rows, ""]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scores", type=Path)
+    lists = {"scenes": "cathode,packed,cracks,fringes", "columns": "512,1024,2048", "views": "45,90,180"}
+    lists |= {"over": "1,1.5", "photons": "1e4,1e5", "seeds": "1,2,3", "of": ",".join(ENTRANTS), "forget": ""}
+    for name, default in lists.items():
+        parser.add_argument(f"--{name}", default=default, help="parted by commas")
+    parser.add_argument("--best", action="store_true", help="the best setting of each, too")
+    parser.add_argument("--limit", type=float, default=1800.0, help="CPU seconds of a volume")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--table", action="store_true", help="only print what there is")
+    asked = parser.parse_args(arguments)
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = str(asked.threads)  # of the competitors' processes
+    some = {name: [x for x in getattr(asked, name).split(",") if x] for name in lists}
+    for name in [*some["of"], *some["forget"]]:
+        if name not in ENTRANTS:
+            parser.error(f"there is no {name!r}; these take part: {', '.join(ENTRANTS)}")
+    kinds = {"columns": int, "views": int, "over": float, "photons": float, "seeds": int}
+    numbers = [[kind(x) for x in some[name]] for name, kind in kinds.items()]
+    cells = [Cell(scene, *values) for scene, *values in product(some["scenes"], *numbers)]
+    try:
+        kept = Kept(asked.scores)
+        if some["forget"]:
+            gone = set(some["forget"])
+            kept.change(lambda scores: {key: one for key, one in scores.items() if key.split("|")[6] not in gone})
+        if not asked.table:
+            play_all(kept, cells, some["of"], asked.best, asked.limit)
+    except ValueError as error:
+        sys.exit(str(error))
+    print(tables(kept, cells))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
