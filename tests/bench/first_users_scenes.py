@@ -52,7 +52,7 @@ class Bodies(NamedTuple):
         centre: [body, 3], x, y, z.
         radius: [body].
         density: [body], over the matrix.
-        plate: [body, 4], unit normal and half thickness (infinite: a ball).
+        plate: [body, 5], unit normal, 0, half thickness (infinite: a ball).
         crack: [body, 5], unit normal, distance from the centre, half width (0: none).
     """
 
@@ -102,7 +102,7 @@ def _place(
     can: float,
     half: float,
     wanted: float,
-) -> F64:  # pragma: no cover - compiled
+) -> F64:
     """Places [body, 3] of bodies that do not meet, by trial, until their volumes are `wanted` (NaN: no room).
 
     `spheres` [sphere, 4] cover them: body b at the origin is within spheres first[b] to first[b + 1]. The space comes
@@ -145,17 +145,17 @@ def _place(
 
 
 @njit(cache=True)
-def _layer(z: float, half: float, tall: int) -> int:  # pragma: no cover - compiled
+def _layer(z: float, half: float, tall: int) -> int:
     return math.floor((z + half) / (2 * half) * tall) % tall
 
 
 @njit(cache=True)
-def _add_view(bodies: Bodies, angle: float, u: F64, v: F64, out: F64) -> None:  # pragma: no cover - compiled
+def _add_view(bodies: Bodies, angle: float, u: F64, v: F64, out: F64) -> None:
     """Add the line integrals [v, u] of the bodies, rays at equally spaced u and v."""
     c, s, step = np.cos(angle), np.sin(angle), u[1] - u[0]
     for b in range(len(bodies.radius)):
         x, y, z = bodies.centre[b]
-        r, at, normal, crack = bodies.radius[b], x * c + y * s, bodies.plate[b], bodies.crack[b]
+        r, at, plate, crack = bodies.radius[b], x * c + y * s, bodies.plate[b], bodies.crack[b]
         for k in range(max(0, math.ceil((z - r - v[0]) / step)), min(len(v), math.floor((z + r - v[0]) / step) + 1)):
             dv = v[k] - z
             reach = np.sqrt(max(r * r - dv * dv, 0.0))
@@ -164,30 +164,28 @@ def _add_view(bodies: Bodies, angle: float, u: F64, v: F64, out: F64) -> None:  
                 du = u[i] - at
                 high = np.sqrt(max(r * r - dv * dv - du * du, 0.0))
                 low = -high
-                if normal[3] < r:
-                    low, high = _between(du, dv, c, s, normal[:3], 0.0, normal[3], low, high)
+                if plate[4] < r:
+                    low, high = _between(du, dv, c, s, plate, low, high)
                 length = high - low
                 if crack[4] > 0:
-                    low, high = _between(du, dv, c, s, crack[:3], crack[3], crack[4], low, high)
+                    low, high = _between(du, dv, c, s, crack, low, high)
                     length -= high - low
                 out[k, i] += bodies.density[b] * length
 
 
 @njit(cache=True)
-def _between(
-    du: float, dv: float, c: float, s: float, n: F64, off: float, half: float, low: float, high: float
-) -> tuple[float, float]:  # pragma: no cover - compiled
-    """The part of low to high, along a ray at (du, dv) from the body's centre, within `half` of a plane."""
-    at, slope = du * (n[0] * c + n[1] * s) + dv * n[2] - off, n[1] * c - n[0] * s
+def _between(du: float, dv: float, c: float, s: float, n: F64, low: float, high: float) -> tuple[float, float]:
+    """The part of low to high, along a ray at (du, dv) from the body's centre, between two planes as of `Bodies`."""
+    at, slope = du * (n[0] * c + n[1] * s) + dv * n[2] - n[3], n[1] * c - n[0] * s
     if abs(slope) < 1e-9:
-        return (low, high) if abs(at) <= half else (low, low)
-    one, other = (-half - at) / slope, (half - at) / slope
+        return (low, high) if abs(at) <= n[4] else (low, low)
+    one, other = (-n[4] - at) / slope, (n[4] - at) / slope
     low, high = max(low, min(one, other)), min(high, max(one, other))
     return low, max(low, high)
 
 
 @njit(cache=True)
-def _fill(bodies: Bodies, x: F64, z: F64, sub: int, out: F32) -> None:  # pragma: no cover - compiled
+def _fill(bodies: Bodies, x: F64, z: F64, sub: int, out: F32) -> None:
     """Add the bodies' densities to voxels [z, y, x], means of sub³ points of each that a surface may cross."""
     for b in range(len(bodies.radius)):
         middle, r, plate, crack = bodies.centre[b], bodies.radius[b], bodies.plate[b], bodies.crack[b]
@@ -198,7 +196,7 @@ def _fill(bodies: Bodies, x: F64, z: F64, sub: int, out: F32) -> None:  # pragma
                     away = math.sqrt((x[i] - middle[0]) ** 2 + (x[j] - middle[1]) ** 2 + (z[k] - middle[2]) ** 2)
                     if away > r + 0.87:
                         continue
-                    points = 1 if away < r - 0.87 and plate[3] >= r and crack[4] == 0 else sub
+                    points = 1 if away < r - 0.87 and plate[4] >= r and crack[4] == 0 else sub
                     inside = 0
                     for p in range(points**3):
                         dx = x[i] - middle[0] + (p % points + 0.5) / points - 0.5
@@ -206,7 +204,7 @@ def _fill(bodies: Bodies, x: F64, z: F64, sub: int, out: F32) -> None:  # pragma
                         dz = z[k] - middle[2] + (p // points**2 + 0.5) / points - 0.5
                         across = abs(dx * plate[0] + dy * plate[1] + dz * plate[2])
                         from_crack = abs(dx * crack[0] + dy * crack[1] + dz * crack[2] - crack[3])
-                        if dx * dx + dy * dy + dz * dz <= r * r and across <= plate[3] and from_crack >= crack[4]:
+                        if dx * dx + dy * dy + dz * dz <= r * r and across <= plate[4] and from_crack >= crack[4]:
                             inside += 1
                     out[k, j, i] += bodies.density[b] * inside / points**3
 
@@ -227,8 +225,8 @@ def packed_bodies(rng: np.random.Generator, can: float, half: float) -> Bodies:
         drawn = rng.uniform(low, high, int(FILLED * volume / low**3) + 1)
         radii.append(-np.sort(-drawn[np.cumsum(_volume(drawn, flat)) <= share * FILLED * volume]))
     plates, radius = radii[0].size, np.concatenate(radii)
-    plate = np.column_stack((_directions(rng, radius.size), np.full(radius.size, np.inf)))
-    plate[:plates, 3] = FLAT * radius[:plates]
+    plate = np.column_stack((_directions(rng, radius.size), np.zeros(radius.size), np.full(radius.size, np.inf)))
+    plate[:plates, 4] = FLAT * radius[:plates]
     covers = [_cover(r, one) for r, one in zip(radius, plate, strict=True)]
     first = np.concatenate(([0], np.cumsum([len(cover) for cover in covers])))
     volumes = _volume(radius, np.where(np.arange(radius.size) < plates, FLAT, 1.0))
@@ -245,7 +243,7 @@ def _volume(radius: F64, flat: float | F64) -> F64:
 
 def _cover(radius: float, plate: F64) -> F64:
     """Spheres [sphere, 4] that hold a ball or plate at the origin."""
-    half = float(plate[3])
+    half = float(plate[4])
     if half >= radius:
         return np.array([[0, 0, 0, radius]])
     step = 1.2 * half
@@ -260,7 +258,7 @@ def _cover(radius: float, plate: F64) -> F64:
 
 def _cracked(rng: np.random.Generator, bodies: Bodies, controls: int = 5) -> tuple[Bodies, Planes]:
     """Cracks through every second large ball, and `controls` planes drawn likewise through each of the others."""
-    large = np.flatnonzero((bodies.radius > CRACKED) & (bodies.plate[:, 3] >= bodies.radius))
+    large = np.flatnonzero((bodies.radius > CRACKED) & (bodies.plate[:, 4] >= bodies.radius))
     with_crack, without = large[::2], np.repeat(large[1::2], controls)
     ball = np.concatenate((with_crack, without))
     normal, off = _directions(rng, ball.size), rng.uniform(-OFF, OFF, ball.size) * bodies.radius[ball]

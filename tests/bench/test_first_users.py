@@ -26,7 +26,7 @@ def cracked() -> Scene:
 def test_bodies_do_not_meet_and_fill_two_fifths() -> None:
     can, half = 40.0, 20.0
     bodies = packed_bodies(np.random.default_rng(3), can, half)
-    is_ball = np.isinf(bodies.plate[:, 3])
+    is_ball = np.isinf(bodies.plate[:, 4])
     own = np.where(is_ball, 4 / 3, 2 * (0.25 - 0.25**3 / 3)) * np.pi * bodies.radius**3
     assert own.sum() / (np.pi * can**2 * 2 * half) == pytest.approx(0.4, abs=0.04) and not is_ball.all()
     assert (np.hypot(*bodies.centre[is_ball, :2].T) + bodies.radius[is_ball] < can).all()
@@ -40,7 +40,7 @@ def test_bodies_do_not_meet_and_fill_two_fifths() -> None:
 def test_a_view_is_the_sum_of_finely_divided_matter(half: float, off: float, width: float) -> None:
     """Of a ball, a plate and a ball with a crack."""
     normal = np.array([0.6, 0.48, 0.64])
-    plate, crack = np.array([[*normal, half]]), np.array([[*normal, off, width / 2]])
+    plate, crack = np.array([[*normal, 0.0, half]]), np.array([[*normal, off, width / 2]])
     body = Bodies(np.array([[1.3, -2.1, 0.4]]), np.array([9.0]), np.array([0.7]), plate, crack)
     u = (np.arange(30 * 8) + 0.5) / 8 - 15
     lines = np.zeros((u.size, u.size))
