@@ -331,9 +331,9 @@ def main(arguments: Sequence[str]) -> None:
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = str(asked.threads)  # of the competitors' processes
     some = {name: [x for x in getattr(asked, name).split(",") if x] for name in lists}
-    for name in [*some["of"], *some["forget"]]:
-        if name not in ENTRANTS:
-            parser.error(f"there is no {name!r}; these take part: {', '.join(ENTRANTS)}")
+    for names, known in ((some["of"] + some["forget"], ENTRANTS), (some["scenes"], SCENES)):
+        if wrong := [name for name in names if name not in known]:
+            parser.error(f"there is no {', '.join(wrong)}; there are {', '.join(known)}")
     kinds = {"columns": int, "views": int, "over": float, "photons": float, "seeds": int}
     numbers = [[kind(x) for x in some[name]] for name, kind in kinds.items()]
     cells = [Cell(scene, *values) for scene, *values in product(some["scenes"], *numbers)]
