@@ -111,18 +111,18 @@ def test_a_second_call_goes_on_and_a_best_setting_is_swept_by_the_first_noise(
 
     def play(cell: Cell, name: str, value: float | None, limit: float) -> Score:
         made.append((cell.seed, value))
-        return Score(20.0 - abs(math.log2((value or 0.1) / 0.008)), 1.0, None, 3.0, 100.0)
+        return Score(20.0 - abs(math.log2((value or 0.025) / 0.002)), 1.0, None, 3.0, 100.0)
 
     monkeypatch.setattr(first_users, "play", play)
     cells, path = [CELL, CELL._replace(seed=2)], tmp_path / "scores.json"
     play_all(Kept(path), cells, ["fista-tv"], True, 10.0)
-    assert made == [(1, None), (1, 4e-3), (1, 8e-3), (1, 16e-3), (2, None), (2, 8e-3)]
+    assert made == [(1, None), (1, 1e-3), (1, 2e-3), (1, 4e-3), (2, None), (2, 2e-3)]
     kept = Kept(path)
     play_all(kept, cells, ["fista-tv"], True, 10.0)
     assert len(made) == 6
     assert tables(kept, cells).splitlines()[4:] == [
         "| fista-tv | 16.36 (16.36 to 16.36), 1.00, 3 s | 100 |",
-        "| fista-tv, best | 20.00 (20.00 to 20.00), 1.00, 3 s (weight 0.008) | 100 |",
+        "| fista-tv, best | 20.00 (20.00 to 20.00), 1.00, 3 s (weight 0.002) | 100 |",
     ]
 
 
