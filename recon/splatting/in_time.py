@@ -256,7 +256,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     if (part := trial_part(geometry, grid)) is not None:
         share = part[0].detector_shape[0] / geometry.detector_shape[0]
         own = method.for_trial(share, FIRST_SHARE)
-        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, PnpDct.iterations)
+        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS)
         trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
     return Costs(volumes, weight + patches + trial)
 
