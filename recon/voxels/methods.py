@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Count, Natural, NonNegative
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
@@ -20,7 +20,6 @@ from recon.voxels.held_out import (
     CHOICE_SWEEPS,
     TRIAL_SWEEPS,
     TRIALS,
-    BestStrength,
     HeldOutTrial,
     choose_weight,
     preferred_strength,
@@ -283,10 +282,8 @@ def choose_patches(
         found = preferred_strength(partial(residuals_of_patches, judge, smooth, steps), first)
         if found is None:
             return [first, 0]
-        fewer = math.sqrt(1 - 1 / ONE_IN)  # noise of a volume falls with the root of the views: the trial had fewer
-        best = BestStrength(fewer * found.strength, found.residuals)  # by the name that the volume will ask for
-        judge.remember("patches", best)
-        return [best.strength, best.residuals.mean() < judge.of_weight(weight).mean()]
+        judge.remember("patches", found)
+        return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))

@@ -126,7 +126,7 @@ class Subsets:
     Attributes:
         views: indices, of each subset.
         projectors: of these views.
-        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most.
+        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most, with all columns.
         plain_norm: the same eigenvalue, of the projector that is not sharpened.
     """
 
@@ -147,7 +147,8 @@ class Subsets:
             heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
         norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
         gain = max(part.gain(some) for part, some in zip(projectors, rays, strict=True))
-        return cls(views, projectors, 1 / (norm * gain), norm)
+        step = Subsets.of(problem.wide(), most, fewest).step if problem.wide else 1 / (norm * gain)
+        return cls(views, projectors, step, norm)
 
 
 def ordered_fista(

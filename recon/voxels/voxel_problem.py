@@ -127,6 +127,7 @@ class VoxelProblem:
         decide: keeps decisions that follow from sums over the whole volume or all rays.
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
         measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
+        wide: makes the problem with all columns, where these are some; steps are as long as of that one.
     """
 
     projector: Projector
@@ -138,15 +139,17 @@ class VoxelProblem:
     decide: Decisions = field(default_factory=Decisions)
     trial_goes_on: Callable[[], bool] = lambda: True
     measured: F32 | None = None
+    wide: Callable[[], VoxelProblem] | None = None
     _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
 
     @property
     def norm(self) -> float:
-        """`largest_eigenvalue` of AᵀWA, computed once for all copies of the problem with this projector and weight."""
+        """`largest_eigenvalue` of AᵀWA with all columns, computed once for copies with this projector and weight."""
         for projector, weight, norm in self._norms:
             if projector is self.projector and weight is self.weight:
                 return norm
-        self._norms.append((self.projector, self.weight, largest_eigenvalue(self.projector, self.weight)))
+        norm = self.wide().norm if self.wide else largest_eigenvalue(self.projector, self.weight)
+        self._norms.append((self.projector, self.weight, norm))
         return self._norms[-1][-1]
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from recon.base.empirical import ONE_IN
+from recon.base.empirical import FEWEST_SUBSETS, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import Work
@@ -103,8 +103,9 @@ def weight_choice(geometry: Geometry, grid: Grid) -> Work:
     part = trial_part(geometry, grid)
     if part is None:
         return first
-    trials = fista_sweeps(*part, CHOICE_SWEEPS, SUBSETS, TV_STEPS)
-    return first + direct_work(*part) + power_rounds(*part, subsets_of(part[0], SUBSETS)) + trials
+    count = subsets_of(geometry, SUBSETS, FEWEST_SUBSETS)
+    trials = fista_sweeps(*part, CHOICE_SWEEPS, count, TV_STEPS, count)
+    return first + direct_work(*part) + power_rounds(*part, count) + trials
 
 
 def patch_choice(geometry: Geometry, grid: Grid, steps: int) -> Work:
@@ -113,5 +114,5 @@ def patch_choice(geometry: Geometry, grid: Grid, steps: int) -> Work:
     part = trial_part(geometry, grid)
     if part is None:
         return noise
-    smooth = fista_sweeps(*part, TRIAL_SWEEPS, SUBSETS, TV_STEPS)
+    smooth = fista_sweeps(*part, TRIAL_SWEEPS, SUBSETS, TV_STEPS, FEWEST_SUBSETS)
     return noise + smooth + TRIALS * patch_steps(*part, steps)
