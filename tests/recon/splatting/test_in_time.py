@@ -32,15 +32,15 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     grid = Grid.matching(views)
     # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6,
-    # and four trials of 16 over seven of eight views where time is left for these.
+    # and four trials of 20 over seven of eight views where time is left for these.
     found = [
-        finish_within(s, 0.0, views, grid, SteppedClock(tick=1.0)) for s in (0.0, 39.0, 40.0, 69.0, 349.0, 350.0, 1e3)
+        finish_within(s, 0.0, views, grid, SteppedClock(tick=1.0)) for s in (0.0, 39.0, 40.0, 69.0, 419.0, 420.0, 1e3)
     ]
-    none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
+    none, trials = [(0, 0.0, True)] * 2, [(8, 420.0, True)] * 2
     assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
     # With patches, where time is left for their 35 steps, for the trials of total variation and for those of patches.
-    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (1207.0, 1208.0)]
-    assert found == [(8, 350.0, True), (None, 1207.5, True)]
+    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (1294.0, 1295.0)]
+    assert found == [(8, 420.0, True), (None, 1295.0, True)]
 
 
 def test_sweeps_that_are_given_keep_their_whole_share_of_the_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,9 +87,9 @@ def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
     """Seconds do not suffice for the same finish in every slab; another one would show as a seam."""
     decided = Decisions().made
     for found in (3, 0):
-        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
+        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.3))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=(decide := Decisions(followed=decided)))
-        done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
+        done = recon.reconstruct(*parallel, R2(seconds=0.4, gaussians=50), control=control)
         assert done.settings["finish"] == 3
         decided = decide.made
 
@@ -98,8 +98,8 @@ def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
     parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for trials in (True, False):
-        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, t=trials: FinishPlan(2, 0.2, t))
+        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, t=trials: FinishPlan(2, 0.3, t))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=Decisions(), stop_trials=lambda: True)
-        done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
+        done = recon.reconstruct(*parallel, R2(seconds=0.4, gaussians=50), control=control)
         assert done.settings["finish"] == 2 and control.decide is not None
         assert len(control.decide.made["weight"][0]) == (1 if trials else 2)  # the weight, and the noise to follow
