@@ -22,7 +22,7 @@ from beamline.projections.corrections.poses import ScanPoses, poses_of, require_
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import ScanStep
+from beamline.projections.protocols import LearningStep, ScanStep
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
@@ -124,9 +124,16 @@ def prepare_projections(
     phases.enter("correction")
     used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(source, correction, used, buffer, phases)
+    geometry = view_geometry.of(projections.view_ids)
+    steps = [step for step in in_order(selection) if isinstance(step, LearningStep)]
+    learnt = [step.learnt(source, selection, projections, geometry) for step in steps]
+    if any(one is not other for one, other in zip(steps, learnt, strict=True)):
+        selection = selection.with_steps(*learnt)
+        correction = ScanCorrection(source, selection, lambda _: None)  # what it warns of was said
+        projections = _corrected(source, correction, used, buffer, phases)
     light = compare_with_flats(source, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
-    geometry, place = view_geometry.of(projections.view_ids), (view_geometry.axis_col, axis)
+    place = view_geometry.axis_col, axis
     prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}

@@ -86,6 +86,14 @@ class ViewStep(PrepStep, Protocol):
 
 
 @runtime_checkable
+class LearningStep(Protocol):
+    """A step on each view that may follow from all views of a finished scan."""
+
+    def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> NamedStep:
+        """The step as these views, corrected without it, tell it to be; itself where they do not."""
+
+
+@runtime_checkable
 class BlurringStep(Protocol):
     """A step that blurs the views: what looks for fine detail leaves it out."""
 
