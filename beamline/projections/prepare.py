@@ -125,9 +125,11 @@ def prepare_projections(
     used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(source, correction, used, buffer, phases)
     geometry = view_geometry.of(projections.view_ids)
-    steps = [step for step in in_order(selection) if isinstance(step, LearningStep)]
-    learnt = [step.learnt(source, selection, projections, geometry) for step in steps]
-    if any(one is not other for one, other in zip(steps, learnt, strict=True)):
+    if learnt := [
+        new
+        for step in in_order(selection)
+        if isinstance(step, LearningStep) and (new := step.learnt(source, selection, projections, geometry)) is not None
+    ]:
         selection = selection.with_steps(*learnt)
         correction = ScanCorrection(source, selection, lambda _: None)  # what it warns of was said
         projections = _corrected(source, correction, used, buffer, phases)

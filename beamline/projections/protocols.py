@@ -89,8 +89,10 @@ class ViewStep(PrepStep, Protocol):
 class LearningStep(Protocol):
     """A step on each view that may follow from all views of a finished scan."""
 
-    def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> NamedStep:
-        """The step as these views, corrected without it, tell it to be; itself where they do not."""
+    def learnt(
+        self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry
+    ) -> NamedStep | None:
+        """The step as these views, corrected without it, tell it to be; None where they do not."""
 
 
 @runtime_checkable

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,23 +13,17 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.units import HC
+from recon.base.views import spread
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance, predicted_views, preferred_strength
+from recon.voxels.field_edges import columns_of_matter
+from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, predicted_views, preferred_strength
 from recon.voxels.methods import FistaTv
 
 _REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
-LONGEST = 8.0
-"""Length in pixels up to which it is sought by views."""
-TRIAL_ROWS, FEWEST_VIEWS = 8, 16
-"""Rows that the search looks at, and views that it needs."""
-_FIRST, _ONE_IN, _SWEEPS, _TV_WEIGHT = (
-    0.5,
-    8,
-    12,
-    5e-4,
-)  # square of the first length; views held out; iterations of a trial
-_RAYS, _VOLUMES = 6, 8  # float32 copies of the views and of the volume
-_ERRORS = 4.0  # standard errors by which a filter must predict better than none
+TRIAL_ROWS, TRIAL_VOLUMES = 8, 10
+"""Rows that a search for the length sees, and the float32 volumes of these that it holds."""
+_FIRST, _LONGEST, _ERRORS = 1.0, 64.0, 3.0  # squares of lengths; by which a filter must predict better than none
+_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial; the weight as in `FistaTv`
 
 
 @dataclass(frozen=True)
@@ -66,8 +61,9 @@ class Paganin:
         if self.unsharp is not None:
             sigma, weight = self.unsharp
             gain *= 1 + weight * (1 - np.exp(-2 * (math.pi * sigma) ** 2 * f2))
+        gain = gain.astype(np.float32)
         for view in views:
-            light = _filtered_light(view, gain.astype(np.float32))
+            light = _filtered_light(view, gain)
             np.negative(np.log(np.maximum(light, floor, out=light), out=light), out=view)
 
 
@@ -77,7 +73,7 @@ def _squared_frequencies(views: F32) -> F64:
     return along[0][:, None] + along[1]
 
 
-def _filtered_light(view: F32, gain: F32) -> F32:
+def _filtered_light(view: F32, gain: NDArray[np.floating]) -> F32:
     """The transmission of line integrals [row, col], its cosine transform times `gain`."""
     from numba import config
 
@@ -104,7 +100,8 @@ class FringesSeen:
 
     Attributes:
         length: in pixels.
-        factor: by which its square may be larger or smaller, by how views held out disagree; one standard error.
+        factor: by which its square may be larger or smaller, one standard error of the vertex of the parabola that
+            gave it, by how views held out disagree.
         gain: share of the residual of these views that the filter takes, beside none.
     """
 
@@ -113,13 +110,7 @@ class FringesSeen:
     gain: float
 
 
-def search_memory(geometry: Geometry) -> int:
-    """Bytes that `fringes_seen` takes at most, with some rows of such views."""
-    rows, cols = min(TRIAL_ROWS, geometry.detector_shape[0]), geometry.detector_shape[1]
-    return 4 * rows * cols * (_RAYS * geometry.n_views + _VOLUMES * cols)
-
-
-def fringes_seen(views: F32, geometry: Geometry, floor: float, known: NDArray[np.bool_] | None) -> FringesSeen | None:
+def fringes_seen(views: F32, geometry: Geometry, floor: float, known: NDArray[np.bool_]) -> FringesSeen | None:
     """The length of Paganin's filter by views held out; None where no filter predicts them as well, or too few views.
 
     A volume of the other views, filtered, is projected, and its transmission T gets the fringes back, as
@@ -129,37 +120,29 @@ def fringes_seen(views: F32, geometry: Geometry, floor: float, known: NDArray[np
     Args:
         views: line integrals [view, row, col]; some rows are enough, and take less time.
         floor: least light.
-        known: [row, col] pixels that were measured; None: all.
+        known: [row, col] pixels that were measured.
     """
-    if geometry.n_views < FEWEST_VIEWS:
+    if geometry.n_views < LEAST_VIEWS:
         return None
-    residuals: dict[float, F64] = {}
+    views, geometry = views[(some := spread(np.arange(geometry.n_views), _VIEWS))], geometry.select(some)
+    if matter := columns_of_matter(geometry, Grid.matching(geometry), views):
+        views, known, geometry = views[:, :, matter[0]], known[:, matter[0]], matter[1]
+    method, grid = FistaTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
 
+    @cache
     def residuals_of(square: float) -> F64:
-        if square not in residuals:
-            filtered = views.copy()
-            Paganin(math.sqrt(square)).retrieve(filtered, floor)
-            unseen, images = predicted_views(
-                FistaTv(_SWEEPS, _TV_WEIGHT), filtered, geometry, Grid.matching(geometry), known, _ONE_IN
-            )
-            gain = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
-            left = [_filtered_light(image, gain) - np.exp(-views[n]) for n, image in zip(unseen, images, strict=True)]
-            rays = np.ones(views.shape[1:], np.bool_) if known is None else known
-            residuals[square] = np.array([np.sqrt(np.mean(np.square(each[rays], dtype=np.float64))) for each in left])
-        return residuals[square]
+        filtered = views.copy()
+        Paganin(math.sqrt(square)).retrieve(filtered, floor)
+        unseen, images = predicted_views(method, filtered, geometry, grid, None if known.all() else known, _ONE_IN)
+        fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
+        left = np.stack([_filtered_light(image, fringes) for image in images]) - np.exp(-views[unseen])
+        return np.sqrt(np.square(left[:, known]).mean(axis=1, dtype=np.float64))
 
     best = preferred_strength(residuals_of, _FIRST)
-    if best is None or best.strength > LONGEST**2:
+    if best is None or best.strength > _LONGEST or not beyond_chance(residuals_of(0.0) - best.residuals, _ERRORS):
         return None
-    none = residuals_of(0.0)
-    if not beyond_chance(none - best.residuals, _ERRORS):
-        return None
-    at = next(square for square, each in residuals.items() if each is best.residuals)
-    beside = (residuals_of(at * factor) - best.residuals for factor in (0.5, 2.0))
-    return FringesSeen(math.sqrt(best.strength), _factor(*beside), 1 - float(best.residuals.mean() / none.mean()))
-
-
-def _factor(weaker: F64, stronger: F64) -> float:
-    """2 to the standard error of the vertex of a parabola through residuals [view] an octave apart, less the least."""
-    slope, bend = (weaker - stronger) / 2, float((weaker + stronger).mean())
-    return 2.0 ** (float(slope.std(ddof=1)) / (math.sqrt(slope.size) * bend)) if bend > 0 else math.inf
+    at = _FIRST * 2.0 ** round(math.log2(best.strength / _FIRST))
+    weaker, stronger = (residuals_of(at * factor) - residuals_of(at) for factor in (0.5, 2.0))
+    octaves = float((weaker - stronger).std(ddof=1) / (2 * math.sqrt(weaker.size) * (weaker + stronger).mean()))
+    gain = 1 - float(best.residuals.mean() / residuals_of(0.0).mean())
+    return FringesSeen(math.sqrt(best.strength), 2.0**octaves, gain)

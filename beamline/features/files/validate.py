@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from beamline.core.errors import DataError, damaged, user_message
+from beamline.core.errors import ConfigError, DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.features.files.nexus import nexus_findings
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.selection import Selection
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -33,6 +36,7 @@ from beamline.storage.writers.partial_volume import completion_cut_short
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
+from recon.prep.overshoot import Overshoot
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
@@ -224,7 +228,8 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     until = clock() + LOOK
-    findings = source_findings(BriefSource(source, lambda: clock() > until))
+    brief = BriefSource(source, lambda: clock() > until)
+    findings = source_findings(brief)
     attributes = dict(source.attributes)
     if not source.finished and not held(source.path):
         attributes["status"] = "died"
@@ -255,8 +260,19 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
-        + ([altered_sentence(source)] if source.altered else []),
+        + ([altered_sentence(source)] if source.altered else [])
+        + _rims(brief),
     }
+
+
+def _rims(source: ScanSource) -> list[str]:
+    """A sentence on fringes, where outer edges in the middle rows of some views show them."""
+    views, middle = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS), source.shape[0] // 2
+    band = Selection(rows=(max(0, middle - 16), min(source.shape[0], middle + 16)))
+    with suppress(ConfigError, DataError, TakesTooLongError):
+        seen = Overshoot.of(ScanCorrection(source, band, lambda sentence: None).at_once(views).data)
+        return [f"{seen.in_words()} recon undoes them (--phase auto)."] if seen.certain else []
+    return []
 
 
 def _angles(source: ScanSource) -> dict[str, float | None]:

@@ -4,6 +4,8 @@ The figure is the contrast of second differences over two pixels against that of
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
 product of a difference and the same difference a line beside it. Noise is independent from line to line and adds
 nothing on average, however few the photons; edges go on. The light's level and a smooth beam cancel.
+
+Edges that are sharper than any blur leaves them, with rims brighter than the open beam, are looked for once.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
+from recon.prep.overshoot import SHARE, Overshoot
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
 STRIP = 6  # neighbouring rows that are used together
@@ -30,6 +33,7 @@ SIGMAS = 8.0
 LEAST = 0.9  # highest useful limit; above it there are too few photons or edges
 GONE = 0.5  # share of the limit below which sharpness is back
 PATIENCE = 40  # views after which it is the new normal
+FIRST = 32  # views whose outer edges are looked at
 DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
 
 
@@ -47,6 +51,7 @@ class BlurState:
     first: tuple[FrameScatter, FrameScatter] | None = None  # the same of the first views, which stay
     blurred: int = 0  # views in a row that are flagged
     reported: bool = False  # the slow loss was reported
+    views: tuple[CellValues, ...] | None = ()  # the first ones, line integrals; None: they were looked at
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,8 @@ class BlurCheck(Logged):
     """Score: fraction of its fine contrast that a view has lost relative to the views before.
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
-    is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well.
+    is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well. Fringes
+    are a fact, too; their score is the share of an outer edge by which line integrals lie below the air beside it.
     """
 
     name: ClassVar[str] = "blur"
@@ -69,6 +75,23 @@ class BlurCheck(Logged):
     start = BlurState
 
     def look(self, state: BlurState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BlurState]:
+        looked = self._loss_of(state, frame, context)
+        after = looked.state
+        if context.view is None or looked.flag is not None or after.flat is None or after.views is None:
+            return looked
+        low = np.zeros_like(after.flat) if after.dark is None else after.dark
+        light = (_lines(frame) - low) / np.maximum(after.flat - low, 1)
+        views = (*after.views, -np.log(np.maximum(light, 1e-6)).astype(np.float32))
+        if len(views) < FIRST:
+            return Look(replace(after, views=views))
+        rims, after = Overshoot.of(np.stack(views)), replace(after, views=None)
+        advice = f"{rims.in_words()} `recon` looks for the filter that undoes them (--phase auto)."
+        return Look(
+            after, Flag(self.name, Level.INFO, frame.index, rims.share, SHARE, advice) if rims.certain else None
+        )
+
+    def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> Look[BlurState]:
+        """What the frame has lost beside the views before."""
         if frame.kind is not FrameKind.PROJECTION:
             return Look(_with_reference(state, frame))
         if context.view is None:

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from recon.base.geometry import Geometry
-    from recon.features.phase import FringesSeen, Paganin
+    from recon.features.phase import Paganin
     from recon.prep.correct import Projections
-    from recon.prep.overshoot import Overshoot
 
 _AUTO = "auto"
+_NO_FILTER = "No filter predicts views held out better; give --phase paganin:RATIO if the ratio delta/beta is known."
 
 
 def _material(text: str) -> str | None:
@@ -53,7 +53,8 @@ class Phase:
         distance_mm: from the sample to the detector; None takes the file's.
         energy_kev: None takes the file's.
         unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
-        overshoot, fringes: what the views showed; None: nothing certain, or not looked at.
+        length: of the filter, in pixels as they are used, that the views show; None: none, or they were not looked at.
+        seen: what they show; empty: nothing certain.
     """
 
     name: ClassVar[str] = "phase"
@@ -87,8 +88,8 @@ class Phase:
         metavar="SIGMA:WEIGHT",
     )
 
-    overshoot: Overshoot | None = field(default=None, compare=False)
-    fringes: FringesSeen | None = field(default=None, compare=False)
+    length: float | None = field(default=None, compare=False)
+    seen: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         others = self.distance_mm, self.energy_kev, self.unsharp
@@ -114,44 +115,41 @@ class Phase:
         return delta_beta(str(self.material), energy_kev)
 
     def memory(self, part: ScanPart) -> StepMemory:
+        from recon.features.phase import TRIAL_ROWS, TRIAL_VOLUMES, Paganin
+
         if self.material is None:
             return StepMemory()
-        if self.material != _AUTO:
-            reach, alone = self.filter_of(part.source, part.selection)[0].reach, 0
-        else:
-            from recon.features.phase import Paganin, search_memory
+        looks, cols = self.material == _AUTO, part.geometry.detector_shape[1]
+        paganin = Paganin(1.0) if looks else self.filter_of(part.source, part.selection)[0]
+        search = 4 * TRIAL_ROWS * cols * TRIAL_VOLUMES * (part.geometry.n_views + cols) if looks else 0
+        return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
-            reach, alone = Paganin(1.0, self.unsharp).reach, search_memory(part.geometry)
-        return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(reach), alone)
-
-    def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> Phase:
-        """This step with the filter that these views show; itself where it was said, or where none is certain."""
+    def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> Phase | None:
+        """This step with what these views show; None where it was said, or where nothing is certain."""
         from recon.features.phase import TRIAL_ROWS, fringes_seen
         from recon.prep.overshoot import Overshoot
         from recon.voxels.field_edges import busiest_rows
 
-        square = source.row_pitch_mm is None and geometry.rows_show_slices
-        if self.material != _AUTO or views.weights is not None or not square:
-            return self
-        overshoot, data = Overshoot.of(views.data), views.data
-        if not overshoot.certain:
-            return self
-        rows, height = slice(0, data.shape[1]), min(TRIAL_ROWS, data.shape[1])
-        if geometry.is_cone:
-            first = round(min(max(geometry.axis_row - height / 2, 0), rows.stop - height))
-            rows = slice(first, first + height)
-        elif height < rows.stop:
-            rows = busiest_rows(data, height)
-        known = ~views.masked[rows] if views.masked[rows].any() else None
-        part, floor = np.ascontiguousarray(data[:, rows]), selection.step(Preparation).floor
-        fringes = fringes_seen(part, geometry.rows(rows.start, rows.stop), floor, known)
-        return replace(self, overshoot=overshoot, fringes=fringes)
+        still = geometry.is_straight and not geometry.shifts.any() and source.row_pitch_mm is None
+        looks = self.material == _AUTO and self.length is None and views.weights is None and still
+        if not looks or not (overshoot := Overshoot.of(views.data)).certain:
+            return None
+        height = min(TRIAL_ROWS, views.data.shape[1])
+        middle = round(min(max(geometry.axis_row - height / 2, 0), views.data.shape[1] - height))
+        rows = slice(middle, middle + height) if geometry.is_cone else busiest_rows(views.data, height)
+        some, floor = np.ascontiguousarray(views.data[:, rows]), selection.step(Preparation).floor
+        shown = fringes_seen(some, geometry.rows(rows.start, rows.stop), floor, ~views.masked[rows])
+        if shown is None:
+            return replace(self, seen=f"{overshoot.in_words()} {_NO_FILTER}")
+        seen = (
+            f"{overshoot.in_words()} Views held out choose the square of its length within {shown.factor - 1:.0%}, and "
+            f"are predicted {shown.gain:.0%} better. --phase none leaves it out."
+        )
+        return replace(self, length=shown.length, seen=seen)
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
-        if self.material is None or (self.material == _AUTO and self.fringes is None):
-            return None, StepDone(
-                "" if self.overshoot is None else _unexplained(self.overshoot), {"phase": "not retrieved"}
-            )
+        if self.material is None or (self.material == _AUTO and self.length is None):
+            return None, StepDone(self.seen and f"Phase: not retrieved. {self.seen}", {"phase": "not retrieved"})
         paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
@@ -177,24 +175,21 @@ class Phase:
         if distance is None:
             distance = _stated(source) if cone is None else cone[1] - cone[0]
         values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
-        if (missing := [option for option, value in values.items() if value is None]) and self.fringes is None:
+        missing = [option for option, value in values.items() if value is None]
+        if missing and self.length is None:
             raise ConfigError(f"--phase needs {' and '.join(missing)}, which {source.path} does not say.")
-        per_ratio = math.nan  # pixels, of a ratio of 1
-        if distance is not None and energy is not None and pitch is not None:
+        length, sentence = self.length or 0.0, "by views held out"
+        if not missing:
+            assert distance is not None and energy is not None and pitch is not None
             near, scale = (1.0, 1.0) if cone is None else (cone[0] / (cone[0] + distance), cone[0] / cone[1])
-            per_ratio = length_of(1.0, distance * near, energy, pitch * scale * selection.binning)
-        where = f"at {energy:g} keV, {distance:g} mm behind the sample" if per_ratio > 0 else ""
-        if self.fringes is not None and self.overshoot is not None:
-            paganin = Paganin(self.fringes.length, self.unsharp)
-            ratio = f"; delta/beta {(paganin.length / per_ratio) ** 2:.3g} {where}" if where else ""
-            sentence = _seen(self.overshoot, self.fringes) + ratio
-        else:
+            unit = length_of(1.0, distance * near, energy, pitch * scale * selection.binning)
             try:
-                ratio_said = self.delta_beta(energy or 0.0)
+                ratio = self.delta_beta(energy) if self.length is None else (self.length / unit) ** 2
             except ValueError as error:
                 raise ConfigError(f"--phase paganin:{self.material}: {error}") from error
-            paganin = Paganin(math.sqrt(ratio_said) * per_ratio, self.unsharp)
-            sentence = f"delta/beta {ratio_said:.4g} {where}"
+            sentence = f"delta/beta {ratio:.4g} at {energy:g} keV, {distance:g} mm behind the sample"
+            length = math.sqrt(ratio) * unit
+        paganin = Paganin(length, self.unsharp)
         if paganin.length > max(source.shape) / selection.binning:
             raise ConfigError(
                 f"--phase: {sentence}, is a filter over {paganin.length:.4g} pixels; {source.path} has "
@@ -202,24 +197,7 @@ class Phase:
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
         sentence = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
-        return paganin, sentence
-
-
-def _seen(overshoot: Overshoot, fringes: FringesSeen) -> str:
-    """Why the filter was chosen, and how sure its length is."""
-    return (
-        f"fringes, or sharpened views: beside outer edges line integrals are {overshoot.share:.1%} of the edge below "
-        f"the air; views held out choose the filter's square within {fringes.factor - 1:.0%} and are predicted "
-        f"{fringes.gain:.0%} better; --phase none leaves it out"
-    )
-
-
-def _unexplained(overshoot: Overshoot) -> str:
-    return (
-        f"Phase: beside outer edges line integrals are {overshoot.share:.1%} of the edge below the air, as by fringes "
-        "or sharpened views, but no filter predicts views held out better: none was used. Give --phase paganin:RATIO "
-        "if the ratio delta/beta is known."
-    )
+        return paganin, f"{sentence} {self.seen}".rstrip()
 
 
 def _stated(source: ScanSource) -> float | None:

@@ -18,6 +18,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange, write_flagged
+from tests.recon.prep.rims import views_of_can
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
 
@@ -95,6 +96,19 @@ def test_info_takes_what_the_caller_says(folder: Path) -> None:
     assert "quantity" in beamline("info", "exchange.h5").stdout
     result = beamline("info", "exchange.h5", "--quantity", "line-integrals")
     assert "line_integrals" in result.stdout
+
+
+@pytest.mark.parametrize("square", [0.0, 0.8])
+def test_info_tells_of_fringes(folder: Path, square: float) -> None:
+    views, geometry = views_of_can(square, noise=1e-3)
+    frames = {"data_dark": np.full((2, 8, 80), 100.0), "data_white": np.full((2, 8, 80), 40_100.0)}
+    frames["data"] = 100 + 40_000 * np.exp(-views)
+    with h5py.File("can.h5", "w") as file:
+        file["implements"] = "exchange"
+        file["exchange/theta"] = np.degrees(geometry.angles)
+        for name, counts in frames.items():
+            file[f"exchange/{name}"] = counts.round().astype(np.uint16)
+    assert ("phase fringes" in beamline("info", "can.h5").stdout) == bool(square)
 
 
 def test_validate_passes_what_we_write(folder: Path) -> None:

@@ -6,7 +6,7 @@ from math import erf, pi
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, laplace
 from scipy.special import erf as erf_of
 
 from beamline.monitor import watch
@@ -105,3 +105,13 @@ def test_flats_darker_than_the_darks_divide_by_nothing() -> None:
     flat = (100 - (np.indices((8, 40))[1] % 2) * 3).astype(np.float32)
     with np.errstate(all="raise"):
         assert np.isnan(sharpness(lines, lines.astype(np.float32), flat)).all()
+
+
+def fringed(view: int, light: NDArray[np.float64]) -> NDArray[np.float64]:
+    return light - laplace(light, mode="nearest")
+
+
+def test_fringes_are_said_once_as_a_fact() -> None:
+    flags = scan(fringed, 80)
+    assert [flag.level for flag in flags] == [Level.INFO]
+    assert flags[0].frame == 37 and "fringes" in flags[0].advice and flags[0].score > 0.01

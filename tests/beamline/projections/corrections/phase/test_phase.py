@@ -12,10 +12,16 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
-from recon.prep.correct import merge_and_empty
+from beamline.projections.step import NamedStep
+from recon.prep.correct import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK
+from tests.recon.prep.rims import views_of_can
 
 PHASE = Phase("20", distance_mm=50.0, energy_kev=20.0)
 SELECTION = Selection(pixel_size_mm=1e-3, steps=(Air("none"), PHASE))
@@ -74,3 +80,62 @@ def test_a_cone_is_scaled_to_the_sample() -> None:
     near = replace(SELECTION, pixel_size_mm=0.25e-3)
     plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near)  # type: ignore[arg-type]
     assert "30 mm behind" in said and found.length == pytest.approx(plane.length)
+
+
+def _rimmed(fringes: float) -> ArraySource:
+    views, geometry = views_of_can(fringes)
+    source = counted(DARK + BEAM * np.exp(-views), geometry.angles)
+    source.axis_col = geometry.axis_col
+    return source
+
+
+def _prepared(source: ArraySource, *steps: NamedStep) -> PreparedProjections:
+    return prepare_projections(source, Selection(axis_col=source.axis_col, steps=steps), lambda _: None)  # type: ignore[arg-type]
+
+
+def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known() -> None:
+    source = _rimmed(0.8)
+    found = _prepared(source)
+    sentence = found.done["phase"].sentence
+    assert (
+        "(by views held out)" in sentence and "below the air" in sentence and "--phase none leaves it out" in sentence
+    )
+    length = float(sentence.split("over ")[1].split(" pixels")[0])
+    by_hand = replace(Phase(), length=length)
+    np.testing.assert_allclose(found.projections.data, _prepared(source, by_hand).projections.data, atol=2e-3)
+    still = _prepared(source, Phase(None))
+    assert found.projections.data.min() > 0.5 * still.projections.data.min()  # less light beyond the open beam
+    source.energy_kev, source.pixel_size_mm = 25.0, 4.6e-3
+    ratio = _prepared(source, Phase(distance_mm=30.0)).done["phase"].sentence.split("delta/beta ")[1]
+    assert float(ratio.split(" at 25 keV, 30 mm")[0]) == pytest.approx((length / 0.0748) ** 2, rel=0.03)
+
+
+def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
+    found, still = (_prepared(_rimmed(0.0), *steps) for steps in ((), (Phase(None),)))
+    np.testing.assert_array_equal(found.projections.data, still.projections.data)
+    assert found.done["phase"].sentence == "" and dict(found.done["phase"].parameters or {}) == {
+        "phase": "not retrieved"
+    }
+
+
+def test_views_of_counted_photons_are_left_alone() -> None:
+    found = _prepared(_rimmed(0.8), Preparation(noise="counts", gain=1.0))
+    assert found.projections.weights is not None and found.done["phase"].sentence == ""
+
+
+def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.features.phase.fringes_seen", lambda *_: None)
+    found = _prepared(_rimmed(0.8))
+    assert "No filter predicts" in found.done["phase"].sentence
+    np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
+
+
+@pytest.mark.slow
+def test_the_search_takes_no_more_memory_than_it_states() -> None:
+    source = _rimmed(0.8)
+    views, geometry = views_of_can(0.8)
+    part = ScanPart(source, Selection(), geometry)  # type: ignore[arg-type]
+    masked = np.zeros(views.shape[1:], np.bool_)
+    given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
+    taken = peak(lambda: Phase().learnt(source, Selection(), given, geometry))  # type: ignore[arg-type]
+    assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
