@@ -139,10 +139,17 @@ def fringes_seen(views: F32, geometry: Geometry, floor: float, known: NDArray[np
         return np.sqrt(np.square(left[:, known]).mean(axis=1, dtype=np.float64))
 
     best = preferred_strength(residuals_of, _FIRST)
-    if best is None or best.strength > _LONGEST or not beyond_chance(residuals_of(0.0) - best.residuals, _ERRORS):
+    if best is None or best.strength > _LONGEST:
         return None
-    at = _FIRST * 2.0 ** round(math.log2(best.strength / _FIRST))
-    weaker, stronger = (residuals_of(at * factor) - residuals_of(at) for factor in (0.5, 2.0))
-    octaves = float((weaker - stronger).std(ddof=1) / (2 * math.sqrt(weaker.size) * (weaker + stronger).mean()))
-    gain = 1 - float(best.residuals.mean() / residuals_of(0.0).mean())
-    return FringesSeen(math.sqrt(best.strength), 2.0**octaves, gain)
+    near = (_FIRST * 2.0 ** (round(math.log2(best.strength / _FIRST)) + half) for half in (-0.5, 0.0, 0.5))
+    at = min(near, key=lambda square: float(residuals_of(square).mean()))
+    least, none = residuals_of(at), residuals_of(0.0)
+    if not beyond_chance(none - least, _ERRORS):
+        return None
+    weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))
+    halves = (weaker - stronger) / (
+        2 * float((weaker + stronger).mean())
+    )  # of octaves, to the vertex; that of whole ones costs 1 dB
+    factor = 2.0 ** float(halves.std(ddof=1) / (2 * math.sqrt(halves.size)))
+    square, gain = at * 2.0 ** float(halves.mean() / 2), 1 - float(least.mean() / none.mean())
+    return FringesSeen(math.sqrt(square), factor, gain)

@@ -268,8 +268,8 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
 def _rims(source: ScanSource) -> list[str]:
     """A sentence on fringes, where outer edges in the middle rows of some views show them."""
     views, middle = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS), source.shape[0] // 2
-    band = Selection(rows=(max(0, middle - 16), min(source.shape[0], middle + 16)))
     with suppress(ConfigError, DataError, TakesTooLongError):
+        band = Selection(rows=(max(0, middle - 16), min(source.shape[0], middle + 16)))
         seen = Overshoot.of(ScanCorrection(source, band, lambda sentence: None).at_once(views).data)
         return [f"{seen.in_words()} recon undoes them (--phase auto)."] if seen.certain else []
     return []

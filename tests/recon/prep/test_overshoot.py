@@ -11,7 +11,9 @@ from recon.prep.overshoot import Overshoot
 from tests.recon.prep.rims import views_of_can
 
 
-@pytest.mark.parametrize("change", [{}, {"gains": 0.01}, {"noise": 0.03}, {"blur": 0.3}, {"shape": (48, 4, 80)}, {"shape": (1, 8, 80)}])
+@pytest.mark.parametrize(
+    "change", [{}, {"gains": 0.01}, {"noise": 0.03}, {"blur": 0.3}, {"shape": (48, 4, 80)}, {"shape": (1, 8, 80)}]
+)
 @pytest.mark.parametrize("square", [0.4, 2.0])
 def test_fringes_are_seen(square: float, change: dict[str, Any]) -> None:
     seen = Overshoot.of(views_of_can(square, **change)[0])
