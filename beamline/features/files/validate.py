@@ -261,7 +261,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
         + ([altered_sentence(source)] if source.altered else [])
-        + _rims(brief),
+        + (_rims(brief) if facts["reconstructable"] else []),
     }
 
 

@@ -55,8 +55,10 @@ def flags(path: Path, share: Share | None = None) -> list[Flag]:
         return [flag for judged in replay(seen) for flag in judged.flags]  # type: ignore[arg-type]
 
 
-def test_a_clean_scan_has_no_flags(shared_data: Path) -> None:
-    assert flags(shared_data / TOOTH) == []
+def test_a_clean_scan_has_no_flags_but_the_fact_that_it_has_fringes(shared_data: Path) -> None:
+    (fact,) = flags(shared_data / TOOTH)
+    assert (fact.check, fact.level) == ("blur", Level.INFO) and "fringes" in fact.advice
+    assert 0.03 < fact.score < 0.12  # of the edge's step
 
 
 def test_diamond_has_facts_and_the_crumb_that_crosses_it(shared_data: Path) -> None:
