@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from beamline.core.errors import ConfigError, DataError, damaged, user_message
+from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.features.files.nexus import nexus_findings
-from beamline.projections.correction import ScanCorrection
-from beamline.projections.selection import Selection
 from beamline.storage import hdf5
-from beamline.storage.readers.base import ScanSource, TakesTooLongError, rows_replaced
+from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import BriefSource
 from beamline.storage.recon_record import ReconRecord
@@ -35,6 +33,7 @@ from beamline.storage.writer_lock import held
 from beamline.storage.writers.partial_volume import completion_cut_short
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
+from recon.base.arrays import F32
 from recon.base.views import spread
 from recon.prep.overshoot import Overshoot
 
@@ -267,10 +266,19 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
 
 def _rims(source: ScanSource) -> list[str]:
     """A sentence on fringes, where outer edges in the middle rows of some views show them."""
-    views, middle = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS), source.shape[0] // 2
-    with suppress(ConfigError, DataError, TakesTooLongError):
-        band = Selection(rows=(max(0, middle - 16), min(source.shape[0], middle + 16)))
-        seen = Overshoot.of(ScanCorrection(source, band, lambda sentence: None).at_once(views).data)
+    rows = slice(*np.clip(source.shape[0] // 2 + np.array([-16, 16]), 0, source.shape[0]).tolist())
+
+    def read(kind: FrameKind) -> F32:
+        return read_known(source, spread(np.flatnonzero(source.image_key == kind), VIEWS), rows).astype(np.float32)
+
+    with suppress(DataError, TakesTooLongError):
+        views, counts = read(FrameKind.PROJECTION), source.quantity == "counts"
+        if source.quantity != "line_integrals":
+            dark, flat = (
+                read(kind).mean(axis=0) if counts else n for n, kind in enumerate((FrameKind.DARK, FrameKind.FLAT))
+            )
+            views = -np.log(np.maximum((views - dark) / np.maximum(flat - dark, 1e-6), 1e-6))
+        seen = Overshoot.of(views)
         return [f"{seen.in_words()} recon undoes them (--phase auto)."] if seen.certain else []
     return []
 

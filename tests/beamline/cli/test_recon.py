@@ -210,8 +210,8 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     assert said in result.stderr and said.startswith("Phase: Paganin's filter over 5.4") and "delta/beta 295.8" in said
     for options, code, error in (
         (way, 2, "--phase needs --distance-mm, which scan.h5 does not say"),
-        (("--distance-mm", "20"), 2, "--phase"),
-        (("--phase", "born:3"), 2, "expected none, paganin:RATIO"),
+        (("--distance-mm", "20", "--phase", "none"), 2, "need --phase"),
+        (("--phase", "born:3"), 2, "expected auto, none, paganin:RATIO"),
         ((*way, "--distance-mm", "20", "--phase", "paganin:bone"), 2, "'bone' is neither a material"),
         ((*way, "--distance-mm", "20", "--unsharp", "3"), 2, "is not SIGMA:WEIGHT"),
     ):
