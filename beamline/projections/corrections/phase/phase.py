@@ -142,8 +142,8 @@ class Phase:
         if shown is None:
             return replace(self, seen=f"{overshoot.in_words()} {_NO_FILTER}")
         seen = (
-            f"{overshoot.in_words()} Views held out choose the square of the filter's length within {shown.factor - 1:.0%}, and "
-            f"are predicted {shown.gain:.0%} better. --phase none leaves it out."
+            f"{overshoot.in_words()} Views held out choose the square of the filter's length within "
+            f"{shown.factor - 1:.0%}, and are predicted {shown.gain:.0%} better. --phase none leaves it out."
         )
         return replace(self, length=shown.length, seen=seen)
 
