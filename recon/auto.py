@@ -209,16 +209,16 @@ def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F
 
 @dataclass(frozen=True, eq=False)
 class Auto:
-    """Tries methods on a part of the scan, and reconstructs the volume with the one that predicts held-out views best.
+    """Tries methods on a part of the scan, and takes the cheapest that predicts views held out as well as the best.
 
-    The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
-    and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
-    settings of their own, each is run on 32 rows, or on all of them at half the resolution. Trials need at
-    least 16 views; with fewer the last candidate is used. docs/choosing.md has reasons.
+    The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out.
+    Where the middle of a cone holds little matter, or methods have settings of their own, each is run on 32 rows, or on
+    all of them at half the resolution. Trials need at least 16 views; with fewer the last candidate is used.
+    docs/choosing.md has reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
-        least_gain: share of the residual that a costlier method must leave less of views held out.
+        least_gain: share by which a costlier method must lower the residual of views held out.
     """
 
     name: ClassVar[str] = AUTO
@@ -288,7 +288,7 @@ class Auto:
         return fits if all(_judged_beside(method) for method in others) else None
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """A preview without the costly candidates; for the best the least lead counts, and all trials are made."""
+        """A preview has no costly candidates; the best needs no minimum gain, and ends no fit that is behind."""
         if quality == "preview":
             return replace(self, candidates=self.candidates[:2])
         return replace(self, least_gain=0.0) if quality == "best" else self
@@ -331,6 +331,6 @@ def _residuals_in(tried: Candidates, method: Method) -> F64 | None:
 
 
 def _untried(fit: FitMethod, seconds: float) -> str:
-    """Of a fit that is judged after some of its steps, what the others would cost."""
-    after = f" after {FIRST_SHARE:.0%} of its steps, too far behind to try the others (about {seconds:.2g} s)"
-    return f", {fit.name}{after}; --quality best tries them" if seconds else ""
+    """What a trial would cost whose fit ended early."""
+    after = f"; {fit.name} stopped after {FIRST_SHARE:.0%} of its steps, too far behind"
+    return f"{after} (a full trial: about {seconds:.2g} s; --quality best runs it)" if seconds else ""

@@ -125,13 +125,15 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     geometry = prepared.geometry
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
     weighted = differ and not options.method.traits.direct
-    sample = prepared.sample_radius
+    sample, traits = prepared.sample_radius, options.method.traits
+    shows_beyond = not (traits.direct or traits.several or prepared.emission)
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
-        taller=taller_than_field(prepared.projections.data, geometry) and not options.method.traits.direct,
+        taller=shows_beyond and taller_than_field(prepared.projections.data, geometry),
     )  # fmt: skip
-    if plan.slabs or (needs.radius is not None and needs.at_once > plan.allowed):
+    larger = needs.radius is not None or needs.taller
+    if plan.slabs or (larger and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(

@@ -1,7 +1,8 @@
 """Views held out: how strengths, priors and methods are chosen, and the trials that judge them.
 
 One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
-view held out is measured. The candidate of the least mean residual is taken. Two candidates are compared view by view
+view held out is measured. Of strengths the one of the least mean residual is taken, of methods the cheapest
+that the best does not lead. Two candidates are compared view by view
 where a search, or a trial fit, may end before all has been tried: views differ more than candidates do.
 """
 
@@ -35,7 +36,8 @@ less far prefers a heavier weight, and one that gets further a lighter one."""
 LEAST_VIEWS = 2 * ONE_IN
 
 LEAST_GAIN = 0.02
-"""Of a residual: what a costlier candidate must leave less. A first user's tooth has 1.3 % for four times the time."""
+"""By which share a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four
+times the time."""
 
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 TRIAL_ROWS = 16

@@ -149,7 +149,7 @@ def test_it_says_what_was_not_tried_and_what_that_would_cost(data: F32, monkeypa
     tried = Candidates(*(np.full(3, residual) for residual in (2.0, 1.0, 1.1, 1.3)), untried=4.2)
     monkeypatch.setattr("recon.auto.trials_of", lambda *_: tried)
     because = recon.reconstruct(data, VIEWS, Auto()).settings["chosen_because"]
-    assert "r2 1.3, r2 after 25% of its steps, too far behind" in because and "about 4.2 s" in because
+    assert "r2 1.3; r2 stopped after 25% of its steps" in because and "about 4.2 s" in because
 
 
 def test_a_stop_ends_the_trials(data: F32) -> None:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from recon.prep.correct import Projections
 
 _AUTO = "auto"
-_NO_FILTER = "No filter predicts views held out better; give --phase paganin:RATIO if the ratio delta/beta is known."
+_NO_FILTER = "No filter predicts views held out (of 16 or more) better; give --phase paganin:RATIO for delta/beta."
 
 
 def _material(text: str) -> str | None:
