@@ -279,7 +279,9 @@ def _rims(source: ScanSource) -> list[str]:
             )
             views = -np.log(np.maximum((views - dark) / np.maximum(flat - dark, 1e-6), 1e-6))
         seen = Overshoot.of(views)
-        return [f"{seen.in_words()} recon undoes them (--phase auto)."] if seen.certain else []
+        return (
+            [f"{seen.in_words()} `recon --phase auto` searches for a filter that removes them."] if seen.certain else []
+        )
     return []
 
 

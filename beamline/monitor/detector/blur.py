@@ -85,7 +85,7 @@ class BlurCheck(Logged):
         if len(views) < FIRST:
             return Look(replace(after, views=views))
         rims, after = Overshoot.of(np.stack(views)), replace(after, views=None)
-        advice = f"{rims.in_words()} `recon` looks for the filter that undoes them (--phase auto)."
+        advice = f"{rims.in_words()} `recon --phase auto` searches for a filter that removes them."
         return Look(
             after, Flag(self.name, Level.INFO, frame.index, rims.share, SHARE, advice) if rims.certain else None
         )

@@ -126,7 +126,7 @@ class Phase:
 
     def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> Phase | None:
         """This step with what these views show; None where it was said, or where nothing is certain."""
-        from recon.features.phase import TRIAL_ROWS, fringes_seen
+        from recon.features.phase import LEAST_GAIN, TRIAL_ROWS, fringes_seen
         from recon.prep.overshoot import Overshoot
         from recon.voxels.field_edges import busiest_rows
 
@@ -141,6 +141,12 @@ class Phase:
         shown = fringes_seen(some, geometry.rows(rows.start, rows.stop), floor, ~views.masked[rows])
         if shown is None:
             return replace(self, seen=f"{overshoot.in_words()} {_NO_FILTER}")
+        if shown.gain < LEAST_GAIN:
+            little = (
+                f"A filter over {shown.length:.3g} pixels predicts views held out {shown.gain:.0%} better, which is"
+            )
+            seen = f"{overshoot.in_words()} {little} too little for the cracks that it blurs."
+            return replace(self, seen=f"{seen} Give --phase paganin:RATIO (delta/beta) to take one.")
         seen = (
             f"{overshoot.in_words()} Views held out choose the square of the filter's length within "
             f"{shown.factor - 1:.0%}, and are predicted {shown.gain:.0%} better. --phase none leaves it out."
