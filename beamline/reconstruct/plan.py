@@ -132,8 +132,13 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
         taller=shows_beyond and taller_than_field(prepared.projections.data, geometry),
     )  # fmt: skip
-    larger = needs.radius is not None or needs.taller
-    if plan.slabs or (larger and needs.at_once > plan.allowed):
+    if geometry.is_cone and (needs.radius is not None or needs.taller) and needs.at_once > plan.allowed:
+        raise DataError(
+            f"{source.path}: the sample goes on beyond the field, and the box that holds it takes "
+            f"{size(needs.at_once)} of memory by {needs.method.name}, {size(plan.allowed)} may be used. A cone is not "
+            "made in slabs. Give more --memory, or --bin 2, or fewer --rows. Nothing was written."
+        )
+    if plan.slabs or (needs.radius is not None and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(

@@ -123,7 +123,10 @@ class Grid:
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
         share = min(corner / geometry.source_distance, 1.0)
         (low, high), (bottom, top) = geometry.heights, self.edges[:, 2]
-        wanted = bottom - low + share * abs(low), high + share * abs(high) - top
+        axis = geometry.axis_row + geometry.shifts[:, 1]  # rays climb from their source, which moves with `centres`
+        sinks, climbs = (0.5 + axis.max()), (geometry.detector_shape[0] - 0.5 - axis.min())
+        share *= geometry.sample_pitch
+        wanted = bottom - low + share * abs(sinks), high + share * abs(climbs) - top
         below, above = (max(0, math.ceil(each / edge - 1e-6)) for each in wanted)
         centre = (self.centre[0] + (above - below) / 2 * edge, *self.centre[1:])
         return replace(self, shape=(below + self.shape[0] + above, *self.shape[1:]), centre=centre)

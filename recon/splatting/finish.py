@@ -141,8 +141,8 @@ class _Planning:
         tried.smooth = judge.of_weight(weight)
         if patches.better:
             tried.patches = residuals_of_patches(judge, judge.start, PnpDct.iterations, patches.strength)
-        voxels = tried.by_voxels
-        assert voxels is not None
+        if (voxels := tried.by_voxels) is None:  # the trials were ended
+            return x
         strength = patches.strength if patches.better else 0.0
         begin = self.control.now()
         tried.fit = self.of_fit(judge, weight, strength, FIRST_SHARE)

@@ -156,6 +156,10 @@ def taller_than_field(projections: F32, geometry: Geometry) -> bool:
     """
     if not geometry.is_cone or not len(projections):
         return False
+    if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows of most views
+        at = geometry.offsets[:, 1]
+        lowest, highest = np.nan_to_num(projections[[at.argmax(), at.argmin()]], posinf=0, neginf=0).mean(axis=2)
+        return bool(ends_in_matter(lowest[None])[0, 0] or ends_in_matter(highest[None])[0, 1])
     rows = np.nan_to_num(projections[spread(np.arange(len(projections)), _VIEWS)], posinf=0, neginf=0).mean(axis=(0, 2))
     return bool(ends_in_matter(rows[None]).any())
 

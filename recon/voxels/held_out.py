@@ -73,8 +73,11 @@ def leads(residuals: F64, other: F64, least_gain: float) -> bool:
 
 
 def first_as_good(residuals: Sequence[F64 | None], least_gain: float = LEAST_GAIN) -> int | None:
-    """Number of the first candidate, and so the cheapest, that the best one does not lead; None: none was tried."""
-    tried = {at: each for at, each in enumerate(residuals) if each is not None}
+    """Number of the first candidate, and so the cheapest, that the best one does not lead; None: none was tried.
+
+    One with a residual that is not finite was ended, or diverged, and counts as not tried.
+    """
+    tried = {at: each for at, each in enumerate(residuals) if each is not None and np.isfinite(each).all()}
     if not tried:
         return None
     best = min(tried.values(), key=lambda each: float(each.mean()))

@@ -125,6 +125,15 @@ def test_the_rays_of_a_cone_meet_all_slices_of_its_tall_box_and_no_others(axis_r
     assert Grid.matching(straight).as_tall_as_rays(straight) == Grid.matching(straight)
 
 
+def test_the_tall_box_of_a_helix_holds_rays_that_climb_from_a_source_which_climbs_too() -> None:
+    still = Geometry.cone(TURN, (12, 40), 1.0, 90.0, 90.0)
+    centres = np.zeros((TURN.size, 3))
+    centres[:, 2] = np.linspace(-60, 60, TURN.size)
+    helix = still.about(centres)
+    of_one, of_all = (Grid.matching(views).as_tall_as_rays(views).shape[0] for views in (still, helix))
+    assert of_all == Grid.matching(helix).shape[0] + of_one - Grid.matching(still).shape[0]
+
+
 def test_a_volume_of_no_stated_size_shows_all_heights_that_jumping_views_see() -> None:
     views = Geometry.parallel(TURN, (10, 32), shifts=np.resize([[0.0, 10.0], [0.0, -10.0]], (48, 2)))
     result = reconstruct(project(_sample(9.0, 12.0), views).numpy(), views, "fbp")

@@ -8,6 +8,7 @@ import pytest
 import recon
 from recon.base.method import DataUse, ReconProblem, RunControl, SampleRadius
 from recon.voxels.beyond_field import sample_radius
+from recon.voxels.field_edges import taller_than_field
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -182,3 +183,14 @@ def test_matter_above_and_below_the_field_of_a_cone_stays_out_of_its_slices() ->
     rod[: inner.start + 3], rod[inner.stop - 3 :] = 0, 0
     views = Projector(cone, tall).forward(rod)
     assert recon.reconstruct(views, cone, METHOD).outside is None
+
+
+def test_a_sample_that_ends_within_the_heights_of_a_helix_is_not_taken_for_a_taller_one() -> None:
+    turn = np.linspace(0, 4 * np.pi, 40, endpoint=False)
+    shifts = np.stack((np.zeros(40), np.linspace(-20, 20, 40)), 1)
+    helix, tall = recon.Geometry.cone(turn, (16, 48), 1.0, 80.0, 80.0, shifts=shifts), recon.Grid((64, 48, 48), 1.0)
+    z, y, x = np.meshgrid(*tall.coordinates(), indexing="ij")
+    rod = np.where(np.hypot(x, y) < 14, 0.01, 0).astype(np.float32)
+    for low, high, goes_on in ((-16, 16, False), (-32, 16, True), (-16, 32, True)):
+        views = Projector(helix, tall).forward(np.where((z > low) & (z < high), rod, 0).astype(np.float32))
+        assert taller_than_field(views, helix) == goes_on

@@ -162,6 +162,14 @@ def test_a_lead_by_chance_is_none() -> None:
     assert first_as_good([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
 
 
+@pytest.mark.parametrize("ended", [np.full(5, np.inf), np.full(1, np.inf), np.full(5, np.nan)])
+def test_a_trial_that_was_ended_or_diverged_is_not_taken(ended: NDArray[np.float64]) -> None:
+    """As FBP where the time of trials ends in the search for the strength of patches."""
+    assert first_as_good([ended, 2 + SCATTER, ended, 1 + SCATTER, ended]) == 3
+    assert first_as_good([ended, 1 + SCATTER]) == 1
+    assert first_as_good([ended]) is None
+
+
 @pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])
 def test_the_strength_of_the_least_residual_is_found(best: float) -> None:
     """A residual that is a parabola of the octave has its vertex where a parabola through three points has it."""

@@ -179,7 +179,7 @@ class Phase:
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm
         if distance is None:
-            distance = _stated(source) if cone is None else cone[1] - cone[0]
+            distance = _stated(source) if cone is None else cone[1] - cone[0] or None
         values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
         missing = [option for option, value in values.items() if value is None]
         if missing and self.length is None:

@@ -149,3 +149,11 @@ def test_the_search_takes_no_more_memory_than_it_states() -> None:
     given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
     taken = peak(lambda: Phase().learnt(source, Selection(), given, geometry))  # type: ignore[arg-type]
     assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
+
+
+def test_a_length_by_the_views_of_a_cone_without_a_distance_has_no_ratio() -> None:
+    """Source to axis and source to detector are alike in scans whose pixels are given at the sample."""
+    source = _source()
+    source.cone, source.energy_kev = (40.0, 40.0), 25.0
+    paganin, sentence = replace(Phase(), length=2.0).filter_of(source, replace(SELECTION, steps=()))  # type: ignore[arg-type]
+    assert paganin.length == 2.0 and "by views held out" in sentence
