@@ -137,7 +137,7 @@ class _Planning:
         if isinstance(weight, NoiseBalance):
             return x
         patches, tried = choose_patches(problem, weight, lambda: judge, PnpDct.iterations), self.tried
-        tried.direct = judge.residuals(judge.start) if judge.direct else None
+        tried.direct = judge.residuals(judge.start) if judge.direct and not judge.ended else None
         tried.smooth = judge.of_weight(weight)
         if patches.better:
             tried.patches = residuals_of_patches(judge, judge.start, PnpDct.iterations, patches.strength)
