@@ -155,7 +155,8 @@ class Phase:
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
-            return None, StepDone(self.seen and f"Phase: not retrieved. {self.seen}", {"phase": "not retrieved"})
+            seen = self.seen or (self.unsharp and "Without a filter --unsharp is not used; give --phase paganin:RATIO.")
+            return None, StepDone(f"Phase: not retrieved. {seen}" if seen else "", {"phase": "not retrieved"})
         paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:

@@ -157,3 +157,8 @@ def test_a_length_by_the_views_of_a_cone_without_a_distance_has_no_ratio() -> No
     source.cone, source.energy_kev = (40.0, 40.0), 25.0
     paganin, sentence = replace(Phase(), length=2.0).filter_of(source, replace(SELECTION, steps=()))  # type: ignore[arg-type]
     assert paganin.length == 2.0 and "by views held out" in sentence
+
+
+def test_an_unsharp_mask_that_no_filter_precedes_is_not_dropped_without_a_word() -> None:
+    sentence = _prepared(_rimmed(0.0), Phase(unsharp=(1.5, 2.0))).done["phase"].sentence
+    assert "not retrieved" in sentence and "--unsharp is not used" in sentence
