@@ -37,7 +37,7 @@ from recon.voxels.held_out import (
     LEAST_GAIN,
     LEAST_VIEWS,
     TRIAL_ROWS,
-    first_as_good,
+    cheapest_not_led,
     split_views,
     unseen_residuals,
 )
@@ -80,7 +80,7 @@ def predicts_best(
     Args:
         methods: the simplest and cheapest first.
         order: in which they are tried; None: the same.
-        least_gain: as of `first_as_good`.
+        least_gain: as of `cheapest_not_led`.
 
     Raises:
         ValueError: no method takes these views or data.
@@ -117,7 +117,7 @@ def predicts_best(
         listed += "; the others not tried in time"
     if not tried:
         raise ValueError("; ".join(refused))
-    return TrialsVerdict(first_as_good([residuals.get(at) for at in range(len(methods))], least_gain), listed)
+    return TrialsVerdict(cheapest_not_led([residuals.get(at) for at in range(len(methods))], least_gain), listed)
 
 
 def _candidate(method: Method) -> Method:
@@ -265,13 +265,13 @@ class Auto:
             listen = control.on_progress if control.decide is None else None  # in a slab only slices are counted
             tried = trials_of(fit, problem, replace(control, on_progress=listen), self.least_gain)
             residuals = [_residuals_in(tried, method) for method in self.candidates]
-            at = first_as_good(residuals, self.least_gain)
+            at = cheapest_not_led(residuals, self.least_gain)
             if at is not None:
                 decide.preset(tried.prior)
                 named = zip(self.candidates, residuals, strict=True)
                 listed = "; ".join(f"{method.name} {each.mean():.4g}" for method, each in named if each is not None)
                 rows = min(TRIAL_ROWS, problem.geometry.detector_shape[0])
-                return at, f"trials on {rows} rows, {LEFT}: {listed}{_untried(fit, tried.untried)}", True
+                return at, f"trials on {rows} rows, {LEFT}: {listed}{_ended_early(fit, tried.full_trial_seconds)}", True
         part, where = part_of(problem)
         if part is None:
             return last, where, False
@@ -330,7 +330,7 @@ def _residuals_in(tried: Candidates, method: Method) -> F64 | None:
     return of_voxels.get(type(method), tried.fit)
 
 
-def _untried(fit: FitMethod, seconds: float) -> str:
+def _ended_early(fit: FitMethod, seconds: float) -> str:
     """What a trial would cost whose fit ended early."""
     after = f"; {fit.name} stopped after {FIRST_SHARE:.0%} of its steps, too far behind"
     return f"{after} (a full trial: about {seconds:.2g} s; --quality best runs it)" if seconds else ""

@@ -22,7 +22,7 @@ from recon.base.volume import Grid
 from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, Emission, line_integrals, weighted_lines
-from recon.voxels.beyond_field import run_as_wide_as_sample
+from recon.voxels.beyond_field import run_in_box_of_sample
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -85,7 +85,7 @@ def reconstruct(
     grid = grid or Grid.matching(geometry)
     _warn_of_unseen_cone(chosen, geometry, grid)
     begin = control.now()
-    result = run_as_wide_as_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
+    result = run_in_box_of_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
     return replace(
         result, settings=MappingProxyType(dict(result.settings)), method=result.method or chosen.name,
         seconds=result.seconds or control.now() - begin,

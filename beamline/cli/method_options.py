@@ -217,7 +217,7 @@ method_options = together(
     run_option(
         "--quality",
         type=NameChoice(list(PRESETS)),
-        help="Preset of steps and Gaussians.",
+        help="Preset of steps and Gaussians; of auto, of what is tried.",
     ),
     _GAUSSIANS,
     run_option(

@@ -176,7 +176,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     stated = method is not None
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
-        of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
+        of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
         method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
     if why := of_other_methods(rules, asked, method, stated=stated):

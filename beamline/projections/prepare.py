@@ -22,7 +22,7 @@ from beamline.projections.corrections.poses import ScanPoses, poses_of, require_
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import LearningStep, ScanStep
+from beamline.projections.protocols import EstimatedStep, ScanStep
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
@@ -125,14 +125,16 @@ def prepare_projections(
     used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(source, correction, used, buffer, phases)
     geometry = view_geometry.of(projections.view_ids)
-    if learnt := [
+    if estimated := [
         new
         for step in in_order(selection)
-        if isinstance(step, LearningStep) and (new := step.learnt(source, selection, projections, geometry)) is not None
+        if isinstance(step, EstimatedStep)
+        and (new := step.estimated(source, selection, projections, geometry)) is not None
     ]:
-        selection = selection.with_steps(*learnt)
-        correction = ScanCorrection(source, selection, lambda _: None)  # what it warns of was said
-        projections = _corrected(source, correction, used, buffer, phases)
+        selection = selection.with_steps(*estimated)
+        correction = ScanCorrection(source, selection, lambda _: None)  # its warnings were given
+        if any(step.on(source, selection)[0] is not None for step in estimated):
+            projections = _corrected(source, correction, used, buffer, phases)
     light = compare_with_flats(source, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     place = view_geometry.axis_col, axis

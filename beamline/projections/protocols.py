@@ -86,13 +86,13 @@ class ViewStep(PrepStep, Protocol):
 
 
 @runtime_checkable
-class LearningStep(Protocol):
-    """A step on each view that may follow from all views of a finished scan."""
+class EstimatedStep(Protocol):
+    """A step whose settings may be estimated from the corrected views of a finished scan."""
 
-    def learnt(
+    def estimated(
         self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry
-    ) -> NamedStep | None:
-        """The step as these views, corrected without it, tell it to be; None where they do not."""
+    ) -> ViewStep | None:
+        """The step with the settings that these views, corrected without it, determine; None if they determine none."""
 
 
 @runtime_checkable
@@ -165,7 +165,7 @@ class JumpStep(Protocol):
 
 
 class GeometryLearnt(Protocol):
-    """What was learnt of the geometry of some views.
+    """What was estimated of the geometry of some views.
 
     Attributes:
         axis: displacement of the rotation axis in the detector's middle row, in columns.
@@ -179,7 +179,7 @@ class GeometryLearnt(Protocol):
     def done(self) -> StepDone: ...
 
     def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of these rows of the file, which may be binned, as it was learnt."""
+        """The geometry of these rows of the file, which may be binned, as it was estimated."""
 
 
 @runtime_checkable
@@ -188,7 +188,7 @@ class GeometryStep(PrepStep, Protocol):
 
     Attributes:
         asked_by: the option that asks for it.
-        geometry: names of the terms that are to be learnt; "roll", "tilt" and "shifts" let rows show other slices.
+        geometry: names of the terms that are to be estimated; "roll", "tilt" and "shifts" let rows show other slices.
         may_lean: views may come out rolled or tilted.
     """
 

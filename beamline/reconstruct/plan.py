@@ -55,7 +55,7 @@ from recon.base.method import SampleRadius
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
-from recon.voxels.beyond_field import sample_radius
+from recon.voxels.beyond_field import knows_outside, sample_radius
 from recon.voxels.field_edges import taller_than_field
 
 _BATCH = 0.25  # of the memory: views during correction
@@ -125,12 +125,11 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     geometry = prepared.geometry
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
     weighted = differ and not options.method.traits.direct
-    sample, traits = prepared.sample_radius, options.method.traits
-    shows_beyond = not (traits.direct or traits.several or prepared.emission)
+    sample, whole = prepared.sample_radius, knows_outside(options.method.traits, prepared.emission)
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
-        taller=shows_beyond and taller_than_field(prepared.projections.data, geometry),
+        taller=whole and taller_than_field(prepared.projections.data, geometry),
     )  # fmt: skip
     if geometry.is_cone and (needs.radius is not None or needs.taller) and needs.at_once > plan.allowed:
         raise DataError(
@@ -245,7 +244,7 @@ def prepare_within(
     prepared = prepare_projections(source, selection, warn, buffer, check, phases)
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
-    if not (options.method.traits.direct or options.method.traits.several or prepared.emission):
+    if knows_outside(options.method.traits, prepared.emission):
         views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
         prepared = replace(prepared, sample_radius=sample_radius(*views) or 0.0)  # it is not searched again
     return prepared, of_views(source, options, plan, prepared)

@@ -121,12 +121,11 @@ class Grid:
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
         """The box with whole slices added until it holds the rays of a cone, which climb or sink to its corners."""
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
-        share = min(corner / geometry.source_distance, 1.0)
+        row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch  # what a row climbs on that way
         (low, high), (bottom, top) = geometry.heights, self.edges[:, 2]
         axis = geometry.axis_row + geometry.shifts[:, 1]  # rays climb from their source, which moves with `centres`
-        sinks, climbs = (0.5 + axis.max()), (geometry.detector_shape[0] - 0.5 - axis.min())
-        share *= geometry.sample_pitch
-        wanted = bottom - low + share * abs(sinks), high + share * abs(climbs) - top
+        first, last = abs(-0.5 - axis.max()), abs(geometry.detector_shape[0] - 0.5 - axis.min())
+        wanted = bottom - low + row * first, high + row * last - top
         below, above = (max(0, math.ceil(each / edge - 1e-6)) for each in wanted)
         centre = (self.centre[0] + (above - below) / 2 * edge, *self.centre[1:])
         return replace(self, shape=(below + self.shape[0] + above, *self.shape[1:]), centre=centre)

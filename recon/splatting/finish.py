@@ -26,7 +26,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
-from recon.voxels.held_out import LEAST_GAIN, MOST_TRIALS, HeldOutTrial, choose_weight, first_as_good, leads
+from recon.voxels.held_out import LEAST_GAIN, MOST_TRIALS, HeldOutTrial, cheapest_not_led, choose_weight, leads
 from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods import PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
@@ -93,7 +93,7 @@ class Candidates:
     Attributes:
         direct, smooth, patches, fit: FBP, total variation, sparse patches, and a fit that these refine.
         prior: decisions on the prior of the winner.
-        untried: seconds of a trial with all steps of the fit, which ended after a quarter; 0: it needed no more.
+        full_trial_seconds: of a trial with all steps of the fit, where it ended after a quarter; 0: it needed no more.
     """
 
     direct: F64 | None = None
@@ -101,7 +101,7 @@ class Candidates:
     patches: F64 | None = None
     fit: F64 | None = None
     prior: Mapping[str, Sequence[Any]] = field(default_factory=dict)
-    untried: float = 0.0
+    full_trial_seconds: float = 0.0
 
     @property
     def by_voxels(self) -> F64 | None:
@@ -116,7 +116,7 @@ class _Planning:
 
     Attributes:
         wide: as of `ReconProblem`.
-        least_gain: as of `first_as_good`.
+        least_gain: as of `cheapest_not_led`.
         apart: the fit takes matter beyond the box off the views.
     """
 
@@ -149,7 +149,7 @@ class _Planning:
         if tried.fit is None or leads(tried.fit, voxels, self.least_gain):
             return x
         if self.least_gain > 0 and leads(tried.smooth, tried.fit, FAR_BEHIND):
-            tried.untried = (self.control.now() - begin) / FIRST_SHARE
+            tried.full_trial_seconds = (self.control.now() - begin) / FIRST_SHARE
         else:
             tried.fit = self.of_fit(judge, weight, strength, 1.0)
         return x
@@ -260,7 +260,7 @@ def judged(
 
     Args:
         fit: makes the fit of a trial.
-        least_gain: as of `first_as_good`; 0: a fit that voxels lead takes all of its steps, too.
+        least_gain: as of `cheapest_not_led`; 0: a fit that voxels lead takes all of its steps, too.
 
     Nothing is told where nothing can be held out, or `control` ends the trials. No prior is told for a fit that takes
     matter beyond the box off the views: from all of them a region of interest gets one that costs 1.3 dB.
@@ -275,7 +275,7 @@ def judged(
     tried = method.tried
     if watch.ended or tried.smooth is None:
         return Candidates()
-    fits = first_as_good((tried.smooth, tried.patches, tried.fit), least_gain) == 2
+    fits = cheapest_not_led((tried.smooth, tried.patches, tried.fit), least_gain) == 2
     return replace(tried, prior={} if fits and method.apart else prior_decisions(decide.made))
 
 

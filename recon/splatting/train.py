@@ -44,7 +44,7 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.held_out import LEAST_GAIN, first_as_good, unseen_residuals
+from recon.voxels.held_out import LEAST_GAIN, cheapest_not_led, unseen_residuals
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines
@@ -261,7 +261,7 @@ def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: De
     """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
     tried = trials_of(method, views.fitted, control)
     decide.preset(tried.prior)
-    at = first_as_good((tried.smooth, tried.patches, tried.fit))
+    at = cheapest_not_led((tried.smooth, tried.patches, tried.fit))
     return len(_ON_VOXELS) if at is None else at
 
 

@@ -19,7 +19,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, masked
-from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
+from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.field_edges import (
@@ -40,7 +40,7 @@ _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the firs
 _ERRORS = 1.0  # standard errors by which radii predict alike
 
 
-def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
+def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
 
     The box is as wide as the sample. Where a sample goes on above or below the field of a cone, it is as tall as the
@@ -52,8 +52,8 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
     Raises:
         ValueError: as `Method.run`.
     """
-    traits, decide = method.traits, control.decide or Decisions(problem.seed)
-    if traits.direct or traits.several or problem.use.emission is not None:
+    decide = control.decide or Decisions(problem.seed)
+    if not knows_outside(method.traits, problem.use.emission):
         return method.run(problem, control)
 
     data, views, grid = problem.projections, problem.geometry, problem.grid
@@ -79,6 +79,11 @@ def run_as_wide_as_sample(method: Method, problem: ReconProblem, control: RunCon
 
     volume, radius = Volume(np.ascontiguousarray(whole[field]), grid), {} if sample is None else sample.settings
     return replace(result, volume=volume, settings={**result.settings, **radius}, outside=outside)
+
+
+def knows_outside(traits: Traits, emission: object | None) -> bool:
+    """Whether a method explains views by a box that holds all of the sample."""
+    return not (traits.direct or traits.several) and emission is None
 
 
 def sample_radius(

@@ -30,14 +30,14 @@ from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem, whitened
 
 TRIAL_SWEEPS = 20
-"""Sweeps of total variation, as of `FistaTv`. A trial takes the volume's own steps, in number and length: one that gets
-less far prefers a heavier weight, and one that gets further a lighter one."""
+"""Sweeps of total variation in a trial, and by default of `FistaTv`: a trial that gets less far than its volume prefers
+a heavier weight, one that gets further a lighter one."""
 
 LEAST_VIEWS = 2 * ONE_IN
 
 LEAST_GAIN = 0.02
-"""By which share a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four
-times the time."""
+"""Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
+time."""
 
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 TRIAL_ROWS = 16
@@ -72,7 +72,7 @@ def leads(residuals: F64, other: F64, least_gain: float) -> bool:
     return by_more and beyond_chance(other - residuals, _ERRORS)
 
 
-def first_as_good(residuals: Sequence[F64 | None], least_gain: float = LEAST_GAIN) -> int | None:
+def cheapest_not_led(residuals: Sequence[F64 | None], least_gain: float = LEAST_GAIN) -> int | None:
     """Number of the first candidate, and so the cheapest, that the best one does not lead; None: none was tried.
 
     One with a residual that is not finite was ended, or diverged, and counts as not tried.
@@ -302,7 +302,7 @@ class HeldOutTrial:
             first = np.zeros((height, width, depth), np.float32)
         others, judges = split_views(views)
         all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
-        part = replace(seen, wide=all_columns.seen if matter else None)
+        part = replace(seen, with_all_columns=all_columns.seen if matter else None)
         return cls(part, np.maximum(first, 0, out=first) if direct else first, unseen, all_columns, direct,
                    subsets_of(problem.projector.geometry, SUBSETS, FEWEST_SUBSETS))  # fmt: skip
 

@@ -64,7 +64,7 @@ class FistaTv(VoxelMethod):
     label: ClassVar[str] = "FISTA-TV"
     traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=12, error_bars=(2.2, 0.1))
 
-    iterations: Count = 20
+    iterations: Count = TRIAL_SWEEPS
     tv_weight: NonNegative | None = None
     subsets: Count = 9
     tv_steps: Count = 3

@@ -147,7 +147,8 @@ class Subsets:
             heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
         norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
         gain = max(part.gain(some) for part, some in zip(projectors, rays, strict=True))
-        step = Subsets.of(problem.wide(), most, fewest).step if problem.wide else 1 / (norm * gain)
+        whole = problem.with_all_columns
+        step = Subsets.of(whole(), most, fewest).step if whole else 1 / (norm * gain)
         return cls(views, projectors, step, norm)
 
 

@@ -127,7 +127,7 @@ class VoxelProblem:
         decide: keeps decisions that follow from sums over the whole volume or all rays.
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
         measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
-        wide: makes the problem with all columns, where these are some; steps are as long as of that one.
+        with_all_columns: makes the problem with all columns, where these are some; steps are as long as of that one.
     """
 
     projector: Projector
@@ -139,7 +139,7 @@ class VoxelProblem:
     decide: Decisions = field(default_factory=Decisions)
     trial_goes_on: Callable[[], bool] = lambda: True
     measured: F32 | None = None
-    wide: Callable[[], VoxelProblem] | None = None
+    with_all_columns: Callable[[], VoxelProblem] | None = None
     _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
 
     @property
@@ -148,7 +148,8 @@ class VoxelProblem:
         for projector, weight, norm in self._norms:
             if projector is self.projector and weight is self.weight:
                 return norm
-        norm = self.wide().norm if self.wide else largest_eigenvalue(self.projector, self.weight)
+        whole = self.with_all_columns
+        norm = whole().norm if whole else largest_eigenvalue(self.projector, self.weight)
         self._norms.append((self.projector, self.weight, norm))
         return self._norms[-1][-1]
 

@@ -21,9 +21,8 @@ from beamline.scenes.scene_file import geometry_of, open_scene, truth_of
 from drivers.base.frame import FrameKind
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.features.phase import TRIAL_ROWS, Paganin, fringes_seen, length_of
+from recon.features.phase import Paganin, length_by_held_out_views, length_of
 from recon.prep.overshoot import Overshoot
-from recon.voxels.field_edges import busiest_rows
 from simulators.scenes.expose import Scan, expose
 
 F32 = NDArray[np.float32]
@@ -86,9 +85,7 @@ def length_shown(views: F32, geometry: Geometry) -> float:
     """Of the filter that `--phase auto` applies, in pixels; 0 for none."""
     if not Overshoot.of(views).certain:
         return 0.0
-    rows = busiest_rows(views, TRIAL_ROWS)
-    known = np.ones((TRIAL_ROWS, views.shape[2]), np.bool_)
-    shown = fringes_seen(np.ascontiguousarray(views[:, rows]), geometry.rows(rows.start, rows.stop), FLOOR, known)
+    shown = length_by_held_out_views(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
     return 0.0 if shown is None else shown.length
 
 
@@ -118,14 +115,14 @@ def main() -> None:
             views, truth, geometry = scan_of(one)
             begin = time.process_time()
             shown = length_shown(views, geometry)
-            seconds, true = (
+            seconds, true_length = (
                 time.process_time() - begin,
                 length_of(one.delta_beta, one.distance_mm, ENERGY, PIXEL_UM * 1e-3),
             )
             none, by_ratio, auto = (
-                quality(views, geometry, truth, asked.method, length) for length in (0.0, true, shown)
+                quality(views, geometry, truth, asked.method, length) for length in (0.0, true_length, shown)
             )
-            squares = f"{shown**2:.3f} of {true**2:.3f}"
+            squares = f"{shown**2:.3f} of {true_length**2:.3f}"
             print(
                 f"| {one.delta_beta:g}, {one.distance_mm:g}, {one.photons:g}, {one.seed} | {none:.2f} | {by_ratio:.2f} "
                 f"| {auto:.2f} | {squares} | {seconds:.1f} |",

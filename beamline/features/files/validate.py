@@ -35,7 +35,7 @@ from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.base.views import spread
-from recon.prep.overshoot import Overshoot
+from recon.prep.overshoot import MOST_VIEWS, SEARCH, Overshoot
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
@@ -260,28 +260,28 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
         + ([altered_sentence(source)] if source.altered else [])
-        + (_rims(brief) if facts["reconstructable"] else []),
+        + (_fringes(brief) if facts["reconstructable"] else []),
     }
 
 
-def _rims(source: ScanSource) -> list[str]:
+def _fringes(source: ScanSource) -> list[str]:
     """A sentence on fringes, where outer edges in the middle rows of some views show them."""
     rows = slice(*np.clip(source.shape[0] // 2 + np.array([-16, 16]), 0, source.shape[0]).tolist())
 
     def read(kind: FrameKind) -> F32:
-        return read_known(source, spread(np.flatnonzero(source.image_key == kind), VIEWS), rows).astype(np.float32)
+        return read_known(source, spread(np.flatnonzero(source.image_key == kind), MOST_VIEWS), rows).astype(np.float32)
 
     with suppress(DataError, TakesTooLongError):
-        views, counts = read(FrameKind.PROJECTION), source.quantity == "counts"
-        if source.quantity != "line_integrals":
-            dark, flat = (
-                read(kind).mean(axis=0) if counts else n for n, kind in enumerate((FrameKind.DARK, FrameKind.FLAT))
+        views = read(FrameKind.PROJECTION)
+        if source.quantity == "line_integrals":
+            overshoot = Overshoot.of(views)
+        elif source.quantity == "counts":
+            overshoot = Overshoot.of_counts(
+                views, *(read(kind).mean(axis=0) for kind in (FrameKind.DARK, FrameKind.FLAT))
             )
-            views = -np.log(np.maximum((views - dark) / np.maximum(flat - dark, 1e-6), 1e-6))
-        seen = Overshoot.of(views)
-        return (
-            [f"{seen.in_words()} `recon --phase auto` searches for a filter that removes them."] if seen.certain else []
-        )
+        else:
+            overshoot = Overshoot.of_counts(views, 0.0, 1.0)
+        return [f"{overshoot.in_words()} {SEARCH}"] if overshoot.certain else []
     return []
 
 

@@ -23,7 +23,7 @@ from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
-from recon.prep.overshoot import SHARE, Overshoot
+from recon.prep.overshoot import LEAST_SHARE, SEARCH, Overshoot
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
 STRIP = 6  # neighbouring rows that are used together
@@ -33,7 +33,7 @@ SIGMAS = 8.0
 LEAST = 0.9  # highest useful limit; above it there are too few photons or edges
 GONE = 0.5  # share of the limit below which sharpness is back
 PATIENCE = 40  # views after which it is the new normal
-FIRST = 32  # views whose outer edges are looked at
+VIEWS_FOR_EDGES = 32  # whose outer edges are looked at
 DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
 
 
@@ -51,7 +51,7 @@ class BlurState:
     first: tuple[FrameScatter, FrameScatter] | None = None  # the same of the first views, which stay
     blurred: int = 0  # views in a row that are flagged
     reported: bool = False  # the slow loss was reported
-    views: tuple[CellValues, ...] | None = ()  # the first ones, line integrals; None: they were looked at
+    views: tuple[CellValues, ...] | None = ()  # the first ones, as counts; None: their edges were looked at
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ class BlurCheck(Logged):
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
     is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well. Fringes
-    are a fact, too; their score is the share of an outer edge by which line integrals lie below the air beside it.
+    are a fact, too. Their score is the share of an outer edge's step by which line integrals beside it lie below the
+    air.
     """
 
     name: ClassVar[str] = "blur"
@@ -79,16 +80,15 @@ class BlurCheck(Logged):
         after = looked.state
         if context.view is None or looked.flag is not None or after.flat is None or after.views is None:
             return looked
-        low = np.zeros_like(after.flat) if after.dark is None else after.dark
-        light = (_lines(frame) - low) / np.maximum(after.flat - low, 1)
-        views = (*after.views, -np.log(np.maximum(light, 1e-6)).astype(np.float32))
-        if len(views) < FIRST:
+        dark = 0.0 if after.dark is None else after.dark
+        views = (*after.views, _lines(frame).astype(np.float32))
+        if len(views) < VIEWS_FOR_EDGES:
             return Look(replace(after, views=views))
-        rims, after = Overshoot.of(np.stack(views)), replace(after, views=None)
-        advice = f"{rims.in_words()} `recon --phase auto` searches for a filter that removes them."
-        return Look(
-            after, Flag(self.name, Level.INFO, frame.index, rims.share, SHARE, advice) if rims.certain else None
-        )
+        overshoot, after = Overshoot.of_counts(np.stack(views), dark, after.flat), replace(after, views=None)
+        if not overshoot.certain:
+            return Look(after)
+        advice = f"{overshoot.in_words()} {SEARCH}"
+        return Look(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
 
     def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> Look[BlurState]:
         """What the frame has lost beside the views before."""

@@ -40,6 +40,13 @@ def test_defaults_and_results(folder: Path) -> None:
     assert "fbp: 30 views" not in result.stdout
 
 
+@pytest.mark.parametrize(("more", "chosen"), [((), "fbp"), (("-m", "r2"), "preview: 125 steps")])
+def test_a_quality_takes_the_method_that_is_taken_without_it(folder: Path, more: tuple[str, ...], chosen: str) -> None:
+    """Auto, whose message names --quality best: that took a fit of 1500 steps."""
+    result = succeeds("recon", "scan.h5", "--quality", "preview", "--no-report", *more)
+    assert chosen in result.stdout and ("r2" in result.stdout) == bool(more), result.stdout
+
+
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """The volume of a file of ours."""

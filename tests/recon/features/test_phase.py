@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.base.units import HC
-from recon.features.phase import Paganin, fringes_seen, length_of
+from recon.features.phase import Paganin, length_by_held_out_views, length_of
 from simulators.effects.scattering.phase_fringes import PhaseFringes
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -76,7 +76,7 @@ def test_what_is_no_filter_is_refused(wrong: dict[str, object]) -> None:
 def test_views_held_out_tell_the_length_of_fringes(square: float) -> None:
     views, geometry = views_of_can(square)
     kept = views.copy()
-    shown = fringes_seen(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
+    shown = length_by_held_out_views(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
     assert shown is not None and 1 < shown.factor < 1.3 and shown.gain > 0.1
     assert 0.5 * square < shown.length**2 < 1.3 * square  # its finest cosines have smaller eigenvalues than length²
     np.testing.assert_array_equal(views, kept)
@@ -87,6 +87,6 @@ def test_without_fringes_or_with_few_views_no_length_is_told() -> None:
     known = np.ones(views.shape[1:], np.bool_)
     known[2, 40] = False
     views[:, 2, 40] = 3.0  # a pixel that was not measured
-    assert fringes_seen(views, geometry, FLOOR, known) is None
+    assert length_by_held_out_views(views, geometry, FLOOR, known) is None
     fringed, geometry = views_of_can(1.0, shape=(15, 8, 80))
-    assert fringes_seen(fringed, geometry, FLOOR, np.ones((8, 80), np.bool_)) is None
+    assert length_by_held_out_views(fringed, geometry, FLOOR, np.ones((8, 80), np.bool_)) is None

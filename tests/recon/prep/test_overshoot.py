@@ -48,4 +48,4 @@ def test_a_blur_as_wide_as_the_fringes_hides_them() -> None:
 def test_the_mirror_image_says_the_same() -> None:
     views, _ = views_of_can(0.5)
     one, other = Overshoot.of(views), Overshoot.of(np.ascontiguousarray(views[:, :, ::-1]))
-    assert one.share == pytest.approx(other.share, rel=1e-5) and one.sigmas == pytest.approx(other.sigmas, rel=1e-3)
+    assert one.share == pytest.approx(other.share, rel=1e-5) and one.errors == pytest.approx(other.errors, rel=1e-3)

@@ -234,7 +234,7 @@ def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(rng: np.random.
     assert fit.call_args[0][0].geometry.n_views == 26  # views held out are not fitted
     assert fit.call_count == 1 and fit.call_args[0][2] == 0.25  # voxels lead: the other steps are not tried
     fit.reset_mock()
-    assert judged(_problem(data), R2().fit, RunControl(), fit, least_gain=0.0).untried == 0
+    assert judged(_problem(data), R2().fit, RunControl(), fit, least_gain=0.0).full_trial_seconds == 0
     assert fit.call_count == 2 and fit.call_args[0][2] == 1.0
     fit.reset_mock()
     none = judged(replace(_problem(data[:12]), geometry=VIEWS.select(range(12))), R2().fit, RunControl(), fit)

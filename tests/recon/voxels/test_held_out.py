@@ -28,8 +28,8 @@ from recon.voxels.held_out import (
     BestStrength,
     HeldOutTrial,
     beyond_chance,
+    cheapest_not_led,
     choose_weight,
-    first_as_good,
     preferred_strength,
     split_views,
     unseen_residuals,
@@ -155,19 +155,19 @@ def test_the_cheapest_candidate_that_the_best_does_not_lead_is_taken(
     means: tuple[float | None, ...], least_gain: float, taken: int | None
 ) -> None:
     residuals = [None if mean is None else mean + SCATTER for mean in means]
-    assert first_as_good(residuals, least_gain) == taken
+    assert cheapest_not_led(residuals, least_gain) == taken
 
 
 def test_a_lead_by_chance_is_none() -> None:
-    assert first_as_good([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
+    assert cheapest_not_led([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
 
 
 @pytest.mark.parametrize("ended", [np.full(5, np.inf), np.full(1, np.inf), np.full(5, np.nan)])
 def test_a_trial_that_was_ended_or_diverged_is_not_taken(ended: NDArray[np.float64]) -> None:
     """As FBP where the time of trials ends in the search for the strength of patches."""
-    assert first_as_good([ended, 2 + SCATTER, ended, 1 + SCATTER, ended]) == 3
-    assert first_as_good([ended, 1 + SCATTER]) == 1
-    assert first_as_good([ended]) is None
+    assert cheapest_not_led([ended, 2 + SCATTER, ended, 1 + SCATTER, ended]) == 3
+    assert cheapest_not_led([ended, 1 + SCATTER]) == 1
+    assert cheapest_not_led([ended]) is None
 
 
 @pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-import numpy as np
-
 from beamline.core.errors import ConfigError
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, ViewFilter
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from recon.prep.correct import Projections
 
 _AUTO = "auto"
+_UNUSED = "Without a filter --unsharp is not used; give --phase paganin:RATIO."
 _NO_FILTER = "No filter predicts views held out (of 16 or more) better; give --phase paganin:RATIO for delta/beta."
 
 
@@ -54,7 +53,7 @@ class Phase:
         energy_kev: None takes the file's.
         unsharp: (sigma in pixels as they are used, weight), see `recon.features.phase.Paganin`; None: none.
         length: of the filter, in pixels as they are used, that the views show; None: none, or they were not looked at.
-        seen: what they show; empty: nothing certain.
+        explanation: of what the views show; empty: nothing certain.
     """
 
     name: ClassVar[str] = "phase"
@@ -89,7 +88,7 @@ class Phase:
     )
 
     length: float | None = field(default=None, compare=False)
-    seen: str = field(default="", compare=False)
+    explanation: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         others = self.distance_mm, self.energy_kev, self.unsharp
@@ -115,48 +114,48 @@ class Phase:
         return delta_beta(str(self.material), energy_kev)
 
     def memory(self, part: ScanPart) -> StepMemory:
-        from recon.features.phase import TRIAL_ROWS, TRIAL_VOLUMES, Paganin
+        from recon.features.phase import TRIAL_COPIES, TRIAL_ROWS, Paganin
 
         if self.material is None:
             return StepMemory()
-        looks, cols = self.material == _AUTO, part.geometry.detector_shape[1]
-        paganin = Paganin(1.0) if looks else self.filter_of(part.source, part.selection)[0]
-        search = 4 * TRIAL_ROWS * cols * TRIAL_VOLUMES * (part.geometry.n_views + cols) if looks else 0
+        searches, cols = self.material == _AUTO, part.geometry.detector_shape[1]
+        paganin = Paganin(1.0) if searches else self.filter_of(part.source, part.selection)[0]
+        search = 4 * TRIAL_ROWS * cols * TRIAL_COPIES * (part.geometry.n_views + cols) if searches else 0
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
-    def learnt(self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry) -> Phase | None:
+    def estimated(
+        self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry
+    ) -> Phase | None:
         """This step with what these views show; None where it was said, or where nothing is certain."""
-        from recon.features.phase import LEAST_GAIN, TRIAL_ROWS, fringes_seen
+        from recon.features.phase import LEAST_DROP, length_by_held_out_views
         from recon.prep.overshoot import Overshoot
-        from recon.voxels.field_edges import busiest_rows
 
-        still = geometry.is_straight and not geometry.shifts.any() and source.row_pitch_mm is None
-        looks = self.material == _AUTO and self.length is None and views.weights is None and still
-        if not looks or not (overshoot := Overshoot.of(views.data)).certain:
+        undistorted = geometry.is_straight and not geometry.shifts.any() and source.row_pitch_mm is None
+        searches = self.material == _AUTO and self.length is None and views.weights is None and undistorted
+        if not searches or not (overshoot := Overshoot.of(views.data)).certain:
             return None
-        height = min(TRIAL_ROWS, views.data.shape[1])
-        middle = round(min(max(geometry.axis_row - height / 2, 0), views.data.shape[1] - height))
-        rows = slice(middle, middle + height) if geometry.is_cone else busiest_rows(views.data, height)
-        some, floor = np.ascontiguousarray(views.data[:, rows]), selection.step(Preparation).floor
-        shown = fringes_seen(some, geometry.rows(rows.start, rows.stop), floor, ~views.masked[rows])
-        if shown is None:
-            return replace(self, seen=f"{overshoot.in_words()} {_NO_FILTER}")
-        if shown.gain < LEAST_GAIN:
-            little = (
-                f"A filter over {shown.length:.3g} pixels predicts views held out {shown.gain:.0%} better, which is"
+        floor = selection.step(Preparation).floor
+        filter = length_by_held_out_views(views.data, geometry, floor, ~views.masked)
+        if filter is None:
+            return replace(self, explanation=f"{overshoot.in_words()} {_NO_FILTER}")
+        if filter.gain < LEAST_DROP:
+            why = (
+                f"A filter over {filter.length:.3g} pixels lowers the residual of views held out by {filter.gain:.0%}, "
+                f"and blurs cracks; it takes {LEAST_DROP:.0%} to be applied unasked. --phase paganin:RATIO applies one."
             )
-            seen = f"{overshoot.in_words()} {little} too little for the cracks that it blurs."
-            return replace(self, seen=f"{seen} Give --phase paganin:RATIO (delta/beta) to take one.")
-        seen = (
-            f"{overshoot.in_words()} Views held out choose the square of the filter's length within "
-            f"{shown.factor - 1:.0%}, and are predicted {shown.gain:.0%} better. --phase none leaves it out."
+            return replace(self, explanation=f"{overshoot.in_words()} {why}")
+        why = (
+            f"Views held out choose the square of the filter's length within {filter.factor - 1:.0%}, and their "
+            f"residual is {filter.gain:.0%} lower. --phase none leaves the filter out."
         )
-        return replace(self, length=shown.length, seen=seen)
+        return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
-            seen = self.seen or (self.unsharp and "Without a filter --unsharp is not used; give --phase paganin:RATIO.")
-            return None, StepDone(f"Phase: not retrieved. {seen}" if seen else "", {"phase": "not retrieved"})
+            why = self.explanation or (
+                self.unsharp and "Without a filter --unsharp is not used; give --phase paganin:RATIO."
+            )
+            return None, StepDone(f"Phase: not retrieved. {why}" if why else "", {"phase": "not retrieved"})
         paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
@@ -204,7 +203,7 @@ class Phase:
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
         sentence = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
-        return paganin, f"{sentence} {self.seen}".rstrip()
+        return paganin, f"{sentence} {self.explanation}".rstrip()
 
 
 def _stated(source: ScanSource) -> float | None:

@@ -111,6 +111,11 @@ def test_info_tells_of_fringes(folder: Path, square: float) -> None:
     assert ("phase fringes" in beamline("info", "can.h5").stdout) == bool(square)
 
 
+def test_info_tells_of_the_fringes_of_a_tooth(shared_data: Path) -> None:
+    """Of which recon tells, too: both look at as many views. A third of these are not certain of them."""
+    assert "phase fringes" in beamline("info", str(shared_data / "aps2bm_tooth_181x2x640.h5")).stdout
+
+
 def test_validate_passes_what_we_write(folder: Path) -> None:
     result = beamline("validate", "scan.h5")
     assert result.exit_code == 0, result.output

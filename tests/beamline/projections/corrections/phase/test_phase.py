@@ -17,7 +17,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
-from recon.features.phase import FringesSeen
+from recon.features.phase import FilterLength
 from recon.prep.correct import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.projections.corrections.test_memory import peak
@@ -99,7 +99,9 @@ def test_fringes_are_undone_by_default_and_said_with_the_ratio_where_it_is_known
     found = _prepared(source)
     sentence = found.done["phase"].sentence
     assert (
-        "(by views held out)" in sentence and "below the air" in sentence and "--phase none leaves it out" in sentence
+        "(by views held out)" in sentence
+        and "below the air" in sentence
+        and "--phase none leaves the filter out" in sentence
     )
     length = float(sentence.split("over ")[1].split(" pixels")[0])
     by_hand = replace(Phase(), length=length)
@@ -125,7 +127,7 @@ def test_views_of_counted_photons_are_left_alone() -> None:
 
 
 def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recon.features.phase.fringes_seen", lambda *_: None)
+    monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: None)
     found = _prepared(_rimmed(0.8))
     assert "No filter predicts" in found.done["phase"].sentence
     np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
@@ -133,10 +135,10 @@ def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.Monkey
 
 def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: pytest.MonkeyPatch) -> None:
     """It blurs: a tooth's thin cracks lose half their depth by one that predicts views held out 8 % better."""
-    monkeypatch.setattr("recon.features.phase.fringes_seen", lambda *_: FringesSeen(1.4, 1.1, 0.08))
+    monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: FilterLength(1.4, 1.1, 0.08))
     found = _prepared(_rimmed(0.8))
     sentence = found.done["phase"].sentence
-    assert "over 1.4 pixels predicts views held out 8% better, which is too little" in sentence
+    assert "over 1.4 pixels lowers the residual of views held out by 8%" in sentence
     np.testing.assert_array_equal(found.projections.data, _prepared(_rimmed(0.8), Phase(None)).projections.data)
 
 
@@ -147,7 +149,7 @@ def test_the_search_takes_no_more_memory_than_it_states() -> None:
     part = ScanPart(source, Selection(), geometry)  # type: ignore[arg-type]
     masked = np.zeros(views.shape[1:], np.bool_)
     given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
-    taken = peak(lambda: Phase().learnt(source, Selection(), given, geometry))  # type: ignore[arg-type]
+    taken = peak(lambda: Phase().estimated(source, Selection(), given, geometry))  # type: ignore[arg-type]
     assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
 
 
