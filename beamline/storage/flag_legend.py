@@ -150,12 +150,34 @@ class FrameFlags:
         regions = None if self.regions is None else self.regions[frames]
         return FrameFlags(self.bits[frames], self.legend, scores, regions)
 
-    def after(self, n: int) -> FrameFlags:
-        """The flags after `n` frames, which no check has seen, were put in front."""
-        bits = np.concatenate([np.zeros(n, self.bits.dtype), self.bits])
-        scores = None if self.scores is None else np.pad(self.scores, ((n, 0), (0, 0)), constant_values=np.nan)
-        regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)
-        return FrameFlags(bits, self.legend, scores, regions)
+    def of_groups(self, groups: Sequence[Sequence[int]]) -> FrameFlags:
+        """The combined flags of the frames of each group: scores farthest from 0, regions as the box around theirs."""
+        each = (("bits", np.bitwise_or.reduce), ("scores", _greatest), ("regions", _box_around))
+        columns: dict[str, Any] = {
+            name: np.array([of_group(known[rows]) for rows in groups], known.dtype).reshape(-1, *known.shape[1:])
+            for name, of_group in each
+            if (known := getattr(self, name)) is not None
+        }
+        return replace(self, **columns)
+
+    @classmethod
+    def joined(cls, each: Sequence[FrameFlags | None], sizes: Sequence[int] | NDArray[np.int64]) -> FrameFlags | None:
+        """The flags of frames one after another, of so many each; None for those that no monitor looked at.
+
+        The legend is theirs if they have the same, else today's.
+        """
+        known = [flags for flags in each if flags is not None]
+        if not known:
+            return None
+        legend = known[0].legend if len({flags.legend for flags in known}) == 1 else TODAY
+        parts = list[FrameFlags]()
+        for flags, n in zip(each, sizes, strict=True):
+            blank = np.full((n, len(legend)), np.nan, np.float32), np.full((n, len(legend), 4), -1, np.int32)
+            own = cls(np.zeros(n, np.uint64), legend, *blank) if flags is None else flags
+            parts.append(own if own.legend == legend else own.of_today())
+        bits, *others = ([getattr(part, name) for part in parts] for name in ("bits", "scores", "regions"))
+        whole = all(column is not None for other in others for column in other)
+        return cls(np.concatenate(bits), legend, *(map(np.concatenate, others) if whole else ()))
 
     def without(self, bit: int) -> FrameFlags:
         """The flags without those of one check."""
@@ -175,6 +197,21 @@ class FrameFlags:
             if any(by_level.values()):
                 counted[entry.name] = {str(level): n for level, n in by_level.items() if n}
         return counted
+
+
+def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[check] the scores [frame, check] farthest from 0; NaN where no frame has one."""
+    at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
+    return np.asarray(scores[at, np.arange(scores.shape[1])])
+
+
+def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
+    """[check, 4] the box around regions [frame, check, 4]; -1 where no frame has one."""
+    there = regions[..., :1] >= 0
+    low = np.where(there, regions, np.iinfo(np.int32).max).min(axis=0)
+    high = regions.max(axis=0)
+    box = np.stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]], axis=1)
+    return np.where(there.any(axis=0), box, -1).astype(np.int32)
 
 
 TODAY = tuple(FlagBit(check.name, check.bit, check.unit, check.meaning) for check in CHECKS)

@@ -74,6 +74,7 @@ class ArraySource:
         self.exposures = np.full(len(data), np.nan) if exposures is None else exposures
         self.image_key, self.angles = np.array(keys, np.int32), angles
         self.shape, self.dtype = data.shape[1:], data.dtype
+        self.frame_bytes, self.triggers, self.framestamps = data[0].nbytes, np.arange(len(data)), np.full(len(data), 7)
         self.was_read: list[tuple[list[int], int]] = []
 
     def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:

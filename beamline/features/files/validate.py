@@ -20,7 +20,7 @@ from beamline.features.files.nexus import nexus_findings
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import BriefSource
+from beamline.storage.readers.wrapped import brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
@@ -227,7 +227,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     until = clock() + LOOK
-    brief = BriefSource(source, lambda: clock() > until)
+    brief = brief_source(source, lambda: clock() > until)
     findings = source_findings(brief)
     attributes = dict(source.attributes)
     if not source.finished and not held(source.path):

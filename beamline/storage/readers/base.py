@@ -93,7 +93,9 @@ class ScanSource(ABC):
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
-        stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
+        shifts: float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it; NaN
+            in other frames, None where it says nothing.
+        stated_ending: `ending` of a format in which it does not change.
     """
 
     path: Path
@@ -124,7 +126,7 @@ class ScanSource(ABC):
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None
-    stated_shifts: NDArray[np.float64] | None = None
+    shifts: NDArray[np.float64] | None = None
     stated_ending: ScanEnding = ScanEnding()
 
     @property
@@ -163,12 +165,14 @@ class ScanSource(ABC):
         return None
 
     @property
-    def shifts(self) -> NDArray[np.float64] | None:
-        """float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it.
+    def triggers(self) -> NDArray[np.int64]:
+        """int64 [frame], as of `Frame`; -1 where the record of a frame cannot be trusted."""
+        return count_in_blocks(self.image_key)
 
-        NaN in other frames; None where it says nothing.
-        """
-        return self.stated_shifts
+    @property
+    def framestamps(self) -> NDArray[np.int64]:
+        """int64 [frame], the camera's own counter; -1 where the file has none."""
+        return np.full(self.image_key.size, -1)
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
@@ -219,25 +223,29 @@ class ScanSource(ABC):
         return int(self.image_key.size)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on. Framestamps are -1 and times NaN if the format has none.
+        """The frames from `first` on, each with all that is known of it.
 
         Raises:
             DataError: the pixels are not the uint16 that a Frame holds.
         """
         self.require_counts()
-        keys, angles, exposures = self.image_key, self.angles, self.exposures
-        triggers = count_in_blocks(keys)
-        for i in range(first, keys.size):
+        n, triggers, framestamps = self.image_key.size, self.triggers, self.framestamps
+        times = np.full(n, np.nan) if (known := self.times) is None else known
+        replaces = np.full(n, -1) if (rows := self.replaces) is None else rows
+        aside = np.zeros(n) if self.aside_mm is None else np.nan_to_num(self.aside_mm)
+        for i in range(first, n):
             counts = read_known(self, [i])[0]
             yield Frame(
                 counts=counts,
-                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(keys[i])),
+                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(self.image_key[i])),
                 index=i,
                 trigger=int(triggers[i]),
-                framestamp=-1,
-                angle=float(angles[i]),
-                time=np.nan,
-                exposure=float(exposures[i]),
+                framestamp=int(framestamps[i]),
+                angle=float(self.angles[i]),
+                time=float(times[i]),
+                exposure=float(self.exposures[i]),
+                replaces=int(replaces[i]),
+                aside=float(aside[i]),
             )
 
     def require_counts(self) -> None:

@@ -2,135 +2,81 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, frame_indices, read_known
+from beamline.storage.readers.base import Attributes, Quantity, ScanSource, frame_indices, read_known
+from beamline.storage.readers.frames import BY_FRAME, Frames, Read
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.readers.supplied import assign
-from beamline.storage.readers.wrapped import WrappedSource
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import FrameKind
 
 
-class OverlaidSource(WrappedSource):
-    """A ScanSource with references in front of the frames of `base`: darks, flats, then these frames.
+def overlaid(
+    base: ScanSource,
+    *,
+    angles: NDArray[np.float64] | None = None,
+    angles_from: str = "",
+    of_views: bool = False,
+    darks: NDArray[Any] | None = None,
+    flats: NDArray[Any] | None = None,
+    quantity: Quantity | None = None,
+) -> ScanSource:
+    """A scan with references in front: darks, flats, then the frames of `base`.
 
-    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
+    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
+    all parts of the scan. All frames have one dtype, as of one camera.
+
+    Args:
+        angles: radians, for `base` (see `supplied.assign`); `angles_from` names them in errors.
+        of_views: the angles are those of projections alone.
+        darks, flats: [frame, row, col].
+
+    Raises:
+        DataError: shapes or counts do not fit.
     """
-
-    def __init__(
-        self,
-        base: ScanSource,
-        *,
-        angles: NDArray[np.float64] | None = None,
-        angles_from: str = "",
-        of_views: bool = False,
-        darks: NDArray[Any] | None = None,
-        flats: NDArray[Any] | None = None,
-        quantity: Quantity | None = None,
-    ) -> None:
-        """Lay over `base`.
-
-        Args:
-            angles: radians, for `base` (see `supplied.assign`); `angles_from` names them in errors.
-            of_views: the angles are those of projections alone.
-            darks, flats: [frame, row, col].
-
-        DataError where shapes or counts do not fit.
-        """
-        super().__init__(base)
-        self._replaced = {FrameKind.DARK: darks, FrameKind.FLAT: flats}
-        given = [(kind, images) for kind, images in self._replaced.items() if images is not None]
-        for kind, images in given:
-            if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
-                raise DataError(
-                    f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
-                    f"{base.shape} as in {base.path}."
-                )
-        # One dtype, as of one camera: references are measured like the frames, and averages of them are floats.
-        self.dtype = np.result_type(base.dtype, *(images.dtype for _, images in given))
-        blocks = [images.astype(self.dtype) for _, images in given]
-        self._front = np.concatenate(blocks) if blocks else np.empty((0, *base.shape), self.dtype)
-        self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
-        self._angles = None if angles is None else assign(base, angles, angles_from, of_views=of_views)
-        self._quantity = quantity
-        self._update()
-
-    def _update(self) -> None:
-        """Take over the present state of `base`; added references have no angles and exposures."""
-        base = self._base
-        keys = base.image_key.copy()
-        for kind, images in self._replaced.items():
-            if images is not None:
-                keys[keys == kind] = FrameKind.INVALID
-        self.image_key = np.concatenate([self._front_key, keys]).astype(np.int32)
-        self.angles = self.of_frames(base.angles if self._angles is None else self._angles)
-        self.exposures = self.of_frames(base.exposures)
-        has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
-        stated: Quantity = "counts" if has_both and base.quantity == "unknown" else base.quantity
-        self.quantity = self._quantity or stated
-
-    @property
-    def flags(self) -> FrameFlags | None:
-        flags = self._base.flags
-        return None if flags is None else flags.after(len(self._front))
-
-    @property
-    def replaces(self) -> NDArray[np.int64] | None:
-        rows, n = self._base.replaces, len(self._front)
-        return None if rows is None else np.concatenate([np.full(n, -1), np.where(rows < 0, -1, rows + n)])
-
-    @property
-    def part_starts(self) -> NDArray[np.int64]:
-        """The parts of `base`, the first including the references in front; added flats are valid for all parts."""
-        if self._replaced[FrameKind.FLAT] is not None:
-            return np.zeros(1, np.int64)
-        starts = self._base.part_starts
-        return np.where(starts > 0, starts + len(self._front), 0)
-
-    def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate([np.full((len(self._front), *known.shape[1:]), np.nan), known])
-
-    @property
-    def altered(self) -> frozenset[int]:
-        return frozenset(row + len(self._front) for row in self._base.altered)
-
-    @property
-    def damaged(self) -> frozenset[int]:
-        return frozenset(row + len(self._front) for row in self._base.damaged)
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        n = len(self._front)
-        indices = frame_indices(frames, n + self._base.image_key.size)
-        front = indices < n
-        if not front.any():
-            return self._base.read(indices - n, rows).astype(self.dtype, copy=False)
-        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
-        out[front] = self._front[indices[front], rows]
-        if not front.all():
-            out[~front] = self._base.read(indices[~front] - n, rows)
-        return out
-
-    def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on; those of `base` keep their metadata."""
-        if len(self._front) or self.dtype != np.uint16:
-            return super().frames(first)
-        angles = self.angles
-        return (replace(frame, angle=float(angles[frame.index])) for frame in self._frames_of_base(first))
+    given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
+    for kind, images in given.items():
+        if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
+            raise DataError(
+                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                f"{base.shape} as in {base.path}."
+            )
+    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
+        quantity = quantity or "counts"
+    own: dict[str, Any] = {} if angles is None else {"angles": assign(base, angles, angles_from, of_views=of_views)}
+    base = Frames(
+        base,
+        quantity=quantity or base.quantity,
+        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
+        **own,
+    )
+    if not given:
+        return base
+    stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
+    front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
+    n = front.image_key.size
+    return Frames(
+        front,
+        base,
+        in_order=base.in_order,
+        checksummed=base.checksummed,
+        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
+    )
 
 
+_REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
 JOINED_DEG = "frames_per_view_joined_deg"
 """Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
 _EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds
 
 
-class AveragedSource(WrappedSource):
+class AveragedSource(Frames):
     """A ScanSource whose projections are means of those of `base`; darks and flats are unchanged, invalid frames are
     omitted.
 
@@ -145,15 +91,28 @@ class AveragedSource(WrappedSource):
 
     def __init__(self, base: ScanSource, n: int) -> None:
         """Raises ConfigError where no view would have more than one frame, or the scan is one of counts that emit."""
-        super().__init__(base)
-        self.dtype, self.numbers, self.frames_per_view = np.dtype(np.float32), None, n
-        self._groups: list[list[int]] = []  # rows of base, by row of this source
-        self._looked_at = 0  # rows of base that belong to a group, or to none
-        if base.plan.get("frames_per_view") == n and "angles_deg" in base.plan:
-            self.plan = {**base.plan, "angles_deg": base.plan["angles_deg"][::n]}
         if base.emission is not None:
             raise ConfigError(f"--frames-per-view: {base.path} is of an emission, whose counts are not averaged.")
-        self._update()
+        self._base, self._n, self._groups = base, n, list[list[int]]()
+        super().__init__(
+            base,
+            pixels=self._mean,
+            dtype=np.dtype(np.float32),
+            numbers=None,
+            frames_per_view=n,
+            frame_bytes=lambda each: each * n,
+            image_key=self._kinds,
+            exposures=lambda known: known[self._first()],
+            **dict.fromkeys(("angles", *BY_FRAME), self._means),
+            attributes=self._and_joined,
+            flags=lambda flags: None if flags is None else flags.of_groups(self._used),
+            part_starts=lambda starts: np.unique(np.searchsorted(self._first(), starts)),
+            damaged=lambda rows: frozenset(i for i, group in enumerate(self._used) if rows.issuperset(group)),
+            replaces=lambda rows: None,  # such frames are gone
+            altered=frozenset(),
+        )
+        if base.plan.get("frames_per_view") == n and "angles_deg" in base.plan:
+            self.plan = {**base.plan, "angles_deg": base.plan["angles_deg"][::n]}
         if base.finished and not any(len(group) > 1 for group in self._groups):
             views = int((base.image_key == FrameKind.PROJECTION).sum())
             raise ConfigError(
@@ -162,103 +121,56 @@ class AveragedSource(WrappedSource):
             )
 
     def _update(self) -> None:
-        base = self._base
-        self._assign(self._apart())
-        groups = self._groups
-        first = np.array([group[0] for group in groups], np.int64)
-        usable = [[row for row in group if base.image_key[row] != FrameKind.INVALID] for group in groups]
-        self._usable = [rows or group for rows, group in zip(usable, groups, strict=True)]
-        self._used = self._without_alarms()
-        lost = np.array([not rows for rows in usable], np.bool_)
-        self.image_key = np.where(lost, FrameKind.INVALID, base.image_key[first]).astype(np.int32)
-        self.angles, self.exposures = self.of_frames(base.angles), base.exposures[first]
+        keys, flags = self._base.image_key, self._base.flags
+        self._groups += self._since(self._apart(), self._groups[-1][-1] + 1 if self._groups else 0)
+        usable = ([row for row in group if keys[row] != FrameKind.INVALID] for group in self._groups)
+        self._usable = [rows or group for rows, group in zip(usable, self._groups, strict=True)]
+        alarmed = np.zeros(keys.size, np.bool_) if flags is None else flags.alarmed
+        self._used = [[row for row in rows if not alarmed[row]] or rows for rows in self._usable]
+        super()._update()
+
+    def _first(self) -> NDArray[np.int64]:
+        """The first row of base of each view."""
+        return np.array([group[0] for group in self._groups], np.int64)
 
     def _apart(self) -> float:
         """Radians from a view's first frame from which on a frame is of another view."""
         views = self._base.image_key == FrameKind.PROJECTION
         planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
-        angles = planned if planned.size > self.frames_per_view else self._base.angles[views]
-        steps = np.abs(angles[self.frames_per_view :] - angles[: -self.frames_per_view])
+        angles = planned if planned.size > self._n else self._base.angles[views]
+        steps = np.abs(angles[self._n :] - angles[: -self._n])
         steps = steps[np.isfinite(steps) & (steps > 0)]
-        return float(np.median(steps)) * (1 - 0.5 / self.frames_per_view) if steps.size else np.inf
+        return float(np.median(steps)) * (1 - 0.5 / self._n) if steps.size else np.inf
 
-    def _assign(self, apart: float) -> None:
-        """Put the rows of base that came since into groups; rows of a view that may still get frames wait."""
-        keys, angles, n = self._base.image_key, self._base.angles, self.frames_per_view
-        open_group: list[int] = []
-        for row in range(self._looked_at, keys.size):
-            key = keys[row]
-            if key == FrameKind.INVALID:
-                continue
-            near = bool(open_group) and not abs(angles[row] - angles[open_group[0]]) >= apart
-            if open_group and not (key == FrameKind.PROJECTION and near and len(open_group) < n):
-                self._groups.append(open_group)
-                open_group = []
-            if key == FrameKind.PROJECTION:
-                open_group.append(row)
-                if len(open_group) == n:
-                    self._groups.append(open_group)
-                    open_group = []
-            else:
-                self._groups.append([row])
-        if open_group and self._base.finished:
-            self._groups.append(open_group)
-            open_group = []
-        self._looked_at = open_group[0] if open_group else int(keys.size)
+    def _since(self, apart: float, first: int) -> list[list[int]]:
+        """The rows of base from `first` on, by view; without those of a view that may still get frames."""
+        keys, angles, groups = self._base.image_key, self._base.angles, list[list[int]]()
+        view, may_grow = list[int](), False
+        for row in (first + np.flatnonzero(keys[first:] != FrameKind.INVALID)).tolist():
+            near = may_grow and keys[row] == FrameKind.PROJECTION and not abs(angles[row] - angles[view[0]]) >= apart
+            if not near:
+                groups.append(view := [])
+            view.append(row)
+            may_grow = bool(keys[row] == FrameKind.PROJECTION) and len(view) < self._n
+        return groups[:-1] if may_grow and not self._base.finished else groups
 
-    def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _kinds(self, keys: NDArray[np.int32]) -> NDArray[np.int32]:
+        return keys[[rows[0] for rows in self._usable]]
+
+    def _means(self, known: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
         """Values [row] of this scan: means over the frames averaged into each row."""
+        if known is None:
+            return None
         return np.array([known[rows].mean(axis=0) for rows in self._used]).reshape(-1, *known.shape[1:])
 
-    def _without_alarms(self) -> list[list[int]]:
-        """Rows of base that a row is the mean of, without those with an alarm where others have none."""
-        flags = self._base.flags
-        if flags is None or not flags.alarmed.any():
-            return self._usable
-        return [[row for row in rows if not flags.alarmed[row]] or rows for rows in self._usable]
+    def _and_joined(self, known: Attributes) -> Attributes:
+        """The scan's attributes, with how many frames were left out, and the largest angle between two of a view."""
+        angles, out = self._base.angles, sum(map(len, self._usable)) - sum(map(len, self._used))
+        joined = float(np.degrees(max((np.ptp(angles[rows]) for rows in self._groups if len(rows) > 1), default=0.0)))
+        facts = {"frames_per_view": self._n, "frames_left_out_by_alarms": out, JOINED_DEG: joined}
+        return {**known, **{name: value for name, value in facts.items() if value}}
 
-    @property
-    def attributes(self) -> Attributes:
-        out = sum(map(len, self._usable)) - sum(map(len, self._used))
-        facts = {"frames_per_view": self.frames_per_view, "frames_left_out_by_alarms": out, JOINED_DEG: self._joined()}
-        return {**self._base.attributes, **{name: value for name, value in facts.items() if value}}
-
-    def _joined(self) -> float:
-        """The largest angle between two frames of a view."""
-        angles = self._base.angles
-        return float(np.degrees(max((np.ptp(angles[rows]) for rows in self._groups if len(rows) > 1), default=0.0)))
-
-    @property
-    def frame_bytes(self) -> int:
-        return self._base.frame_bytes * self.frames_per_view
-
-    @property
-    def flags(self) -> FrameFlags | None:
-        """The combined flags of the frames averaged into each row; a region is the box around theirs."""
-        flags = self._base.flags
-        if flags is None:
-            return None
-        bits = np.array([np.bitwise_or.reduce(flags.bits[rows]) for rows in self._used], flags.bits.dtype)
-        scores, regions = flags.scores, flags.regions
-        if scores is not None:
-            scores = np.stack([_greatest(scores[rows]) for rows in self._used]) if self._used else scores[:0]
-        if regions is not None:
-            regions = np.stack([_box_around(regions[rows]) for rows in self._used]) if self._used else regions[:0]
-        return FrameFlags(bits, flags.legend, scores, regions)
-
-    @property
-    def part_starts(self) -> NDArray[np.int64]:
-        first = np.array([group[0] for group in self._groups], np.int64)
-        return np.unique(np.searchsorted(first, self._base.part_starts))
-
-    @property
-    def damaged(self) -> frozenset[int]:
-        rows = self._base.damaged
-        return frozenset(i for i, group in enumerate(self._used) if rows.issuperset(group)) if rows else rows
-
-    replaces, altered = ScanSource.replaces, ScanSource.altered  # such frames are gone
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+    def _mean(self, read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
         base = self._base
         wanted = [self._used[i] for i in frame_indices(frames, len(self._used)).tolist()]
         shape = len(wanted), len(range(self.shape[0])[rows]), self.shape[1]
@@ -276,21 +188,6 @@ class AveragedSource(WrappedSource):
             if group and base.unreadable.keys() >= set(group):
                 raise UnreadableError(base.unreadable[group[0]])
         return (total / np.maximum(counted, 1)[:, None, None]).astype(np.float32)
-
-
-def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[check] the scores [frame, check] farthest from 0; NaN where no frame has one."""
-    at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
-    return np.asarray(scores[at, np.arange(scores.shape[1])])
-
-
-def _box_around(regions: NDArray[np.int32]) -> NDArray[np.int32]:
-    """[check, 4] the box around regions [frame, check, 4]; -1 where no frame has one."""
-    there = regions[..., :1] >= 0
-    low = np.where(there, regions, np.iinfo(np.int32).max).min(axis=0)
-    high = regions.max(axis=0)
-    box = np.stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]], axis=1)
-    return np.where(there.any(axis=0), box, -1).astype(np.int32)
 
 
 def stated_frames_per_view(source: ScanSource) -> int:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, read_known
-from beamline.storage.readers.wrapped import UNPACKED, WrappedSource
+from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.frames import Frames, Read
+from beamline.storage.readers.wrapped import UNPACKED
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.views import spread
@@ -21,28 +22,23 @@ _ERRORS = 2.5  # standard deviations of that error
 _FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
 
 
-class MarkedSource(WrappedSource):
-    """A ScanSource whose pixels without data are set to 0 in all frames, flats included, so that they are filled like
-    unlit ones.
+def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
+    """A scan whose pixels without data are 0 in all frames, flats included, so that they are filled like unlit ones;
+    and whether it is one of counted photons, whose dark is 0 and absent.
     """
 
-    def __init__(self, base: ScanSource, no_data: Mask) -> None:
-        super().__init__(base)
-        self._no_data = no_data
-        self.not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
-        self.counter = not (base.image_key == FrameKind.DARK).any() and counts_photons(self)
-        """It is one of photons, whose dark is 0 and absent."""
+    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
+        images = read(frames, rows)
+        images[:, no_data[rows]] = 0
+        return images
 
-    @property
-    def attributes(self) -> Attributes:
-        of_darks = {"darks": "0, as flats vary as counted photons do"} if self.counter else {}
-        marked = f"{self._no_data.mean():.2%}, filled from their neighbours"
-        return {**self._base.attributes, "pixels_without_data": marked, **of_darks}
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        pixels = self._base.read(frames, rows)
-        pixels[:, self._no_data[rows]] = 0
-        return pixels
+    facts = {"pixels_without_data": f"{no_data.mean():.2%}, filled from their neighbours"}
+    not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
+    source = Frames(base, pixels=pixels, not_used=not_used, attributes=lambda known: {**known, **facts})
+    counter = not (base.image_key == FrameKind.DARK).any() and counts_photons(source)
+    if counter:
+        facts["darks"] = "0, as flats vary as counted photons do"
+    return source, counter
 
 
 def no_data_of(source: ScanSource) -> Mask | None:

@@ -5,7 +5,7 @@ What counts is the structure, an NXdetector with `data` [frame, row, col] and `i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
@@ -31,7 +31,6 @@ from beamline.storage.readers.base import (
     ScanSource,
     count_in_blocks,
     frame_indices,
-    read_known,
 )
 from beamline.storage.readers.nexus import (
     Places,
@@ -46,7 +45,7 @@ from beamline.storage.readers.nexus import (
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 
 _T = TypeVar("_T")
@@ -275,14 +274,25 @@ class NXtomoSource(ScanSource):
 
     @property
     @_guarded
+    def triggers(self) -> NDArray[np.int64]:
+        return self._logged("trigger", count_in_blocks(self.image_key))
+
+    @property
+    @_guarded
+    def framestamps(self) -> NDArray[np.int64]:
+        return self._logged("framestamp", np.full(self.n, -1))
+
+    @property
+    @_guarded
     def replaces(self) -> NDArray[np.int64] | None:
-        rows = self._replaces() if self._ours else np.empty(0, np.int64)
+        rows = self._logged("replaces", np.full(self.n, -1)) if self._ours else np.full(self.n, -1)
+        require_earlier(rows)
         return rows if (rows >= 0).any() else None
 
-    def _replaces(self) -> NDArray[np.int64]:
-        rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n].astype(np.int64)
+    def _logged(self, name: str, default: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Whole numbers [frame] of the log, -1 where the record is altered."""
+        rows = self._column(f"frame_log/{name}", default)[: self.n].astype(np.int64)
         rows[[*self._altered]] = -1
-        require_earlier(rows)
         return rows
 
     @property
@@ -340,31 +350,6 @@ class NXtomoSource(ScanSource):
     @property
     def altered(self) -> frozenset[int]:
         return frozenset(self._altered)
-
-    def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, each with all its metadata in the file."""
-        self.require_counts()
-        with hdf5.readable(self.path):
-            time = np.full(self.n, np.nan) if (known := self.times) is None else known
-            trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
-            framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
-            replaces = self._replaces() if self._ours else np.full(self.n, -1)
-            for column in (trigger, framestamp):
-                column[[*self._altered]] = -1
-        for i in range(first, self.n):
-            counts = read_known(self, [i])[0]
-            yield Frame(
-                counts=counts,
-                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(self.image_key[i])),
-                index=i,
-                trigger=int(trigger[i]),
-                framestamp=int(framestamp[i]),
-                angle=float(self.angles[i]),
-                time=float(time[i]),
-                exposure=float(self.exposures[i]),
-                replaces=int(replaces[i]),
-                aside=0.0 if self.aside_mm is None else float(self.aside_mm[i]),
-            )
 
     def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
         item = datasets.dataset(self._places.entry, path)

@@ -16,20 +16,20 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.changed import AveragedSource, OverlaidSource, angles_of_frames, stated_frames_per_view
+from beamline.storage.readers.changed import AveragedSource, angles_of_frames, overlaid, stated_frames_per_view
 from beamline.storage.readers.nexus import find
-from beamline.storage.readers.no_data import MarkedSource, no_data_of
+from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.side_files import SidedSource, SideFile, read_side_file, side_of
+from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, sided
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.supplied import Angles, Images, load_angles, load_images, parse_angles, select_rows
 from beamline.storage.readers.wrapped import (
     UNPACKED,
-    CroppedSource,
-    KeyedSource,
-    PartsSource,
-    TurnedSource,
-    UnsignedSource,
+    as_unsigned,
+    cropped,
+    in_parts,
+    keyed,
+    turned,
     type_wrapped,
 )
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -159,11 +159,11 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
         base = file(path)
         if options.then:
-            base = PartsSource([base, *map(file, options.then[:-1])], file(options.then[-1]), path)
+            base = in_parts([base, *map(file, options.then[:-1])], file(options.then[-1]), path)
         if options.earlier:
-            base = PartsSource([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
+            base = in_parts([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
         if options.frames is not None:
-            base = KeyedSource(base, options.frames)
+            base = keyed(base, options.frames)
         opened.pop_all()
     return base
 
@@ -173,18 +173,18 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     quantity = options.quantity
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
-        base = SidedSource(base, side)
+        base = sided(base, side)
     angle_table, angles_from = _angle_table(options, base, side)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
-        base = UnsignedSource(base, dtype)
+        base = as_unsigned(base, dtype)
     darks, flats = _references(base, options, None if side is None else side.white)
     if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
-        base = marked = MarkedSource(base, no_data)
-        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and marked.counter else darks
+        base, counts_photons = marked_source(base, no_data)
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
     angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
     if any(given is not None for given in (angles_of_all, darks, flats, quantity)):
-        base = OverlaidSource(
+        base = overlaid(
             base,
             angles=angles_of_all,
             angles_from=angles_from,
@@ -196,8 +196,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     if n > 1:
         base = AveragedSource(base, n)
     if options.horizontal_axis:
-        base = TurnedSource(base)
-    return base if options.cols is None else CroppedSource(base, options.cols)
+        base = turned(base)
+    return base if options.cols is None else cropped(base, options.cols)
 
 
 def _angle_table(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import SETTINGS, decoded, require_regular
 from beamline.storage.readers.base import NotUsed, ScanSource
-from beamline.storage.readers.wrapped import WrappedSource
+from beamline.storage.readers.frames import Frames
 from drivers.base.frame import FrameKind
 
 _MOST = 20  # files beside a scan that are looked at
@@ -119,22 +119,21 @@ class SideFile:
         )
 
 
-class SidedSource(WrappedSource):
-    """A ScanSource with the distances and the pixel size of a vendor's file."""
-
-    def __init__(self, base: ScanSource, side: SideFile) -> None:
-        """Raises DataError where it is of another number of projections."""
-        super().__init__(base)
-        views = int((base.image_key == FrameKind.PROJECTION).sum())
-        if views != side.count:
-            raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
-        self.cone, self.pixel_size_mm, self.row_pitch_mm = side.cone, side.pixel_mm, None
-        self._side = side
-        self.not_used = tuple(field for field in base.not_used if field.where != side.path.name)
-
-    @property
-    def attributes(self) -> Mapping[str, str | float | int]:
-        return {**self._base.attributes, "from": f"{self._side.path.name}, {self._side}"}
+def sided(base: ScanSource, side: SideFile) -> ScanSource:
+    """A scan with the distances and the pixel size of a vendor's file; DataError where that has another number of
+    projections.
+    """
+    views = int((base.image_key == FrameKind.PROJECTION).sum())
+    if views != side.count:
+        raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
+    return Frames(
+        base,
+        cone=side.cone,
+        pixel_size_mm=side.pixel_mm,
+        row_pitch_mm=None,
+        not_used=tuple(field for field in base.not_used if field.where != side.path.name),
+        attributes=lambda known: {**known, "from": f"{side.path.name}, {side}"},
+    )
 
 
 def read_side_file(path: Path) -> SideFile:

@@ -28,7 +28,7 @@ from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, joined_file_of
-from beamline.storage.readers.changed import OverlaidSource
+from beamline.storage.readers.changed import overlaid
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
@@ -184,8 +184,8 @@ def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path
         with open_scan(path) as source, h5py.File(run / "scan.h5") as part:
             frames = int(part[layout.COMMITTED][()])
             assert source.part_starts.tolist() == [0, frames]
-            assert OverlaidSource(source, darks=images).part_starts.tolist() == [0, frames + 2]
-            assert OverlaidSource(source, flats=images).part_starts.tolist() == [0]
+            assert overlaid(source, darks=images).part_starts.tolist() == [0, frames + 2]
+            assert overlaid(source, flats=images).part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
         selection = Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore")))
         prepared = prepare_projections(source, selection, lambda said: None)

@@ -16,7 +16,7 @@ from beamline.monitor.checks import ALARM_SHIFT
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.changed import JOINED_DEG, AveragedSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import CroppedSource
+from beamline.storage.readers.wrapped import cropped
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -117,7 +117,7 @@ def test_an_alarmed_frame_has_no_part_in_a_view_that_has_others() -> None:
 def test_damaged_frames_are_left_out_and_a_view_of_them_alone_is_damaged() -> None:
     base = scan([VIEW] * 4, [0, 0, 5, 5])
     base.damaged = frozenset({1, 2, 3})
-    read = CroppedSource(AveragedSource(base, 2), (0, 2))
+    read = cropped(AveragedSource(base, 2), (0, 2))
     np.testing.assert_allclose(read.read([0]), means(base, [0])[..., :2], rtol=6e-8)
     assert read.damaged == {1} and read.frames_per_view == 2
 

@@ -14,7 +14,7 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import CroppedSource
+from beamline.storage.readers.wrapped import cropped
 from beamline.storage.rules.treatment import treatment_of
 from recon.prep.resample import Distortion
 from tests.beamline.array_source import ArraySource
@@ -68,14 +68,14 @@ class _Flagged(ArraySource):
 
 
 def test_rows_are_read_as_late_as_in_the_whole_scan() -> None:
-    assert CroppedSource(_Flagged(), (40, 100)).row_period == 2e-5  # type: ignore[arg-type]
+    assert cropped(_Flagged(), (40, 100)).row_period == 2e-5  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])
 def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int, right: int) -> None:
     from beamline.projections.usable_views import regions_of
 
-    source: Any = CroppedSource(_Flagged(), cols)  # type: ignore[arg-type]
+    source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
     assert source.axis_col == 52.5 - cols[0]
     treated = treatment_of(source.flags, np.ones(3, np.bool_), source.shape)
     (box,) = regions_of(treated.flags, source.shape).boxes
@@ -86,7 +86,7 @@ def test_the_lens_keeps_its_centre() -> None:
     lens = Distortion(48.0, 5.0, (1.0, 0.0, 1e-4))
     places = []
     for cols in ((0, 100), (30, 90)):
-        source: Any = CroppedSource(_Flagged(), cols)  # type: ignore[arg-type]
+        source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
         found = TiltAndLens(distortion=lens).of(source, Selection())
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage import datasets
-from beamline.storage.readers.changed import OverlaidSource
+from beamline.storage.readers.changed import overlaid
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -148,7 +148,7 @@ def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
     with open_scan(path) as source:
         np.testing.assert_array_equal(source.currents, [np.nan, 199.5, 200.0, 190.0, 180.0, np.nan])
     with open_scan(path) as source:
-        over = OverlaidSource(source, darks=np.zeros((2, 4, 5), np.uint16))
+        over = overlaid(source, darks=np.zeros((2, 4, 5), np.uint16))
         np.testing.assert_array_equal(over.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 

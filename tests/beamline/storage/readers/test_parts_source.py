@@ -1,4 +1,4 @@
-"""PartsSource: the parts of a scan that grows, as the file that joins them has them once it has ended."""
+"""in_parts: the parts of a scan that grows, as the file that joins them has them once it has ended."""
 
 from __future__ import annotations
 

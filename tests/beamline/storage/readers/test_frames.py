@@ -1,0 +1,57 @@
+"""Frames: columns, rows and pixels of several sources as those of one scan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from beamline.storage.flag_legend import TODAY, FrameFlags
+from beamline.storage.readers.frames import Frames
+from tests.beamline.array_source import ArraySource
+
+
+def _of(n: int, first: int = 0) -> Any:
+    frames = np.arange(first, first + 6 * n, dtype=np.uint16).reshape(n, 2, 3)
+    return ArraySource(frames, [0] * n, np.arange(n, dtype=float))
+
+
+def test_what_one_source_does_not_state_is_unknown_of_its_frames_alone() -> None:
+    one, other = _of(2), _of(3, 12)
+    other.currents, other.shifts = np.array([1.0, 2.0, 3.0]), np.ones((3, 2))
+    both = Frames(one, other)
+    np.testing.assert_array_equal(both.currents, [np.nan, np.nan, 1, 2, 3])
+    np.testing.assert_array_equal(both.shifts, [[np.nan] * 2] * 2 + [[1, 1]] * 3)
+    assert both.energies is None and both.flags is None and both.replaces is None
+    np.testing.assert_array_equal(both.angles, [0, 1, 0, 1, 2])
+
+
+def test_rows_count_from_the_first_frame_of_all() -> None:
+    one, other = _of(2), _of(3, 12)
+    one.damaged, other.damaged, other.altered = frozenset({1}), frozenset({0}), frozenset({2})
+    other.replaces, other.part_starts = np.array([-1, 0, -1]), np.array([0, 1])
+    other.flags = FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY)
+    both = Frames(one, other)
+    assert (both.damaged, both.altered) == ({1, 2}, {4})
+    assert both.replaces is not None and both.replaces.tolist() == [-1, -1, -1, 2, -1]
+    assert both.part_starts.tolist() == [0, 2, 3]
+    assert both.flags is not None and both.flags.flagged.tolist() == [False] * 3 + [True, False]
+    np.testing.assert_array_equal(both.read([4, 0, 3], slice(1, 2)).ravel(), [27, 28, 29, 3, 4, 5, 21, 22, 23])
+
+
+def test_what_differs_is_a_value_or_follows_the_source() -> None:
+    base = _of(2)
+    changed = Frames(
+        base,
+        pixels=lambda read, frames, rows: read(frames, rows) + 1,
+        axis_col=3.5,
+        attributes={"from": "a test"},
+        image_key=lambda keys: np.where(np.arange(keys.size) == 1, 1, keys).astype(np.int32),
+    )
+    assert (changed.axis_col, changed.attributes, changed.image_key.tolist()) == (3.5, {"from": "a test"}, [0, 1])
+    grown = _of(4)
+    base.image_key, base.angles, base.exposures, base.read = grown.image_key, grown.angles, grown.exposures, grown.read
+    base.triggers, base.framestamps = grown.triggers, grown.framestamps
+    assert changed.image_key.size == 2 and changed.refresh() == 4
+    frame = next(changed.frames(3))
+    assert (frame.index, frame.trigger, frame.framestamp, int(frame.counts[0, 0])) == (3, 3, 7, 19)
