@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, rows_of
 from beamline.projections.step import StepDone
+from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
 from recon.prep.correct import Projections
 
@@ -33,29 +35,39 @@ def read_binned(
     """Read frames [frame, row, col], averaged into bins; NaN is excluded from the averages.
 
     Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
-    columns that do not fill a bin go.
+    columns that do not fill a bin go. Where a frame lies in more pieces of the file than are held unpacked, some rows
+    of all frames are read after one another, else all rows of some frames.
     """
     height, width = (rows.stop - rows.start) // binning, source.shape[1] // binning
     whole = binning == 1 and source.dtype.kind in "ui"
     out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if whole else np.float32)
-    frame_bytes = (rows.stop - rows.start) * source.shape[1] * source.dtype.itemsize
-    batch = max(1, BATCH_BYTES // max(1, frame_bytes))
-    for start in range(0, len(frames), batch):
-        raw = read_known(source, frames[start : start + batch], rows)
+    row_bytes, by_rows = source.shape[1] * source.dtype.itemsize, _held_by_rows(source)
+    batch = len(frames) if by_rows else max(1, BATCH_BYTES // max(1, (rows.stop - rows.start) * row_bytes))
+    high = max(1, BATCH_BYTES // max(1, batch * row_bytes * binning)) if by_rows else max(1, height)
+    for top, start in product(range(0, height, high), range(0, len(frames), max(1, batch))):
+        end = min(top + high, height)
+        raw = read_known(source, frames[start : start + batch], slice(*(rows.start + n * binning for n in (top, end))))
         if binning > 1:
-            raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
-        out[start : start + batch] = raw
-        progress(min(start + batch, len(frames)), len(frames))
+            raw = _mean_bins(raw[..., : width * binning].astype(np.float32), binning)
+        out[start : start + batch, top:end] = raw
+        progress(len(frames) * end // height if by_rows else min(start + batch, len(frames)), len(frames))
     return out
+
+
+def _held_by_rows(source: ScanSource) -> bool:
+    """Whether a frame lies in pieces of several frames that are more than is held unpacked."""
+    frame = source.shape[0] * source.shape[1] * source.dtype.itemsize * source.frames_per_view
+    return source.frame_bytes > max(HELD, 2 * frame)
 
 
 def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
     """Memory of `read_binned` in bytes, its result included."""
     pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
     at_once = min(frames, max(1, BATCH_BYTES // max(1, pixels * itemsize))) * pixels
+    of_file = min(source.frame_bytes, HELD)
     if binning == 1:
-        return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize
-    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2)  # as float32, with a mask
+        return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize + of_file
+    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2) + of_file  # as float32, with a mask
 
 
 def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:

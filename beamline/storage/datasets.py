@@ -37,7 +37,9 @@ TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "
 
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
+_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _PIECE = 2**31  # bytes of a chunk of frames
+HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 
 
@@ -131,7 +133,7 @@ def piece_of(item: h5py.Dataset) -> int:
 
 def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
     """Bytes that HDF5 decompresses for one frame of a dataset of three dimensions; `frames` is the number of the frame
-    dimension.
+    dimension (or of another one, of whose places one is read).
     """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
@@ -175,8 +177,11 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
         raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
 
 
-def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
+def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
     """The dataset at a path; None if it is missing or has a null dataspace.
+
+    Of frames in pieces that hold parts of several, it keeps the unpacked pieces of a frame, or where these are too many
+    those of a row of all frames, until the next ones are read. `frames` is the number of the frame dimension.
 
     Raises:
         DataError: a list longer than any scan.
@@ -186,6 +191,13 @@ def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
         return None
     if item.ndim == 1 and item.size > _FRAMES:
         raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
+    several = item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
+    sizes = (bytes_unpacked(item, axis) for axis in (frames, int(not frames))) if several else ()
+    if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
+        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        access.set_chunk_cache(max(_SLOTS, 8 * kept // piece_of(item)), kept, 0.75)
+        del item  # HDF5 keeps the cache of a dataset that is open
+        item = h5py.Dataset(h5py.h5d.open(group.id, path.encode(), access))
     return item
 
 

@@ -46,8 +46,8 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
-        items = ((kind, where, datasets.dataset(file, where)) for kind, where in PLACES)
         order = _order(file["exchange/data"])
+        items = ((kind, where, datasets.dataset(file, where, (order or _USUAL)[0])) for kind, where in PLACES)
         stacks = [
             FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
             for kind, where, item in items

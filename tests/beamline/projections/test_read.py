@@ -24,6 +24,20 @@ def test_reading_is_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [len(frames) for frames, _ in source.was_read] == [3, 2]
 
 
+@pytest.mark.parametrize("binning", [1, 2])
+def test_rows_of_all_frames_are_read_where_the_pieces_of_a_frame_are_too_many_to_hold(
+    monkeypatch: pytest.MonkeyPatch, binning: int
+) -> None:
+    data = np.arange(5 * 8 * 4, dtype=np.uint16).reshape(5, 8, 4)
+    source, plain = ArraySource(data, [0] * 5, np.zeros(5)), ArraySource(data, [0] * 5, np.zeros(5))
+    source.frame_bytes = data.nbytes
+    monkeypatch.setattr("beamline.projections.read.HELD", 64)
+    monkeypatch.setattr("beamline.projections.read.BATCH_BYTES", 5 * 4 * 4 * 2)
+    got = read_binned(source, np.array([0, 2, 3, 4]), slice(1, 7), binning)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(got, read_binned(plain, np.array([0, 2, 3, 4]), slice(1, 7), binning))  # type: ignore[arg-type]
+    assert len({tuple(frames) for frames, _ in source.was_read}) == 1 < len({tuple(f) for f, _ in plain.was_read})
+
+
 @given(
     rows=st.integers(1, 9),
     cols=st.integers(1, 9),
