@@ -32,6 +32,7 @@ _DETECTOR = "measurement/instrument/detector"
 _FLATS = "process/acquisition/flat_fields"
 _ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
 _ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)  # keV and mm of a detector, of numbers without a unit
+_THETAS = {FrameKind.DARK: "exchange/theta_dark", FrameKind.FLAT: "exchange/theta_white"}
 TEXTS = {"title": "exchange/title", "sample": "measurement/sample/name"}
 PLACES = (
     (FrameKind.DARK, "/exchange/data_dark"),
@@ -57,7 +58,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         n_views = len(stacks[-1].frames)
         if own_angles:
             source.angles[-n_views:] = _theta(file, n_views)
-        source.take_order(_thetas(file, stacks))
+        source.take_order(_thetas(file, stacks), _later_flats(file, int((source.image_key == FrameKind.FLAT).sum())))
         _set_exposures(source, file)
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
@@ -76,24 +77,32 @@ class ExchangeSource(StacksSource):
     _of_stack: NDArray[np.int64] | None = None
     """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
 
-    def take_order(self, thetas: Sequence[NDArray[np.float64] | None]) -> None:
-        """Sort darks and flats among the views by the angles at which they were taken, if the file states them.
+    def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
+        """Sort darks and flats among the views, if the file says when flats were taken.
 
         Args:
-            thetas: radians of the darks and of the flats; None where the file states none.
+            thetas: radians at which the darks and the flats were taken, where the file states them.
+            later: the first of the flats that were taken after the views; None: the acquisition does not say.
         """
-        views = self.angles[self.image_key == FrameKind.PROJECTION]
-        known = [theta for theta in thetas if theta is not None]
+        kinds = self.image_key
+        views = self.angles[kinds == FrameKind.PROJECTION]
+        place = np.where(kinds == FrameKind.PROJECTION, np.cumsum(kinds == FrameKind.PROJECTION) - 1.0, -1.0)
         steps = np.diff(views)
-        if not known or len(known) < len(thetas) or not ((steps > 0).all() or (steps < 0).all()):
+        in_turn = bool((steps > 0).all() or (steps < 0).all())
+        for kind, theta in thetas.items() if in_turn else ():
+            at = np.abs(views - theta[:, None]).argmin(axis=1)
+            place[kinds == kind] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
+        turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
+        if later is None and not in_turn and turned.size == 1:  # views in any order; flats at two places of the stage
+            later = int(turned[0])
+        if later is not None:
+            place[np.flatnonzero(kinds == FrameKind.FLAT)[later:]] = views.size
+        elif FrameKind.FLAT not in thetas or not in_turn:
             return
-        at = np.concatenate([np.abs(views - theta[:, None]).argmin(axis=1) for theta in known])
-        after = at == views.size - 1  # those of the end
-        place = np.concatenate([np.where(after, views.size, at - 0.5), np.arange(views.size)])
         self._of_stack = np.argsort(place, kind="stable")
         for name in ("image_key", "angles", "exposures"):
             setattr(self, name, getattr(self, name)[self._of_stack])
-        self.in_order = True
+        self.in_order = in_turn and {*kinds.tolist()} <= {*thetas, FrameKind.PROJECTION}
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         if self._of_stack is None:
@@ -101,10 +110,18 @@ class ExchangeSource(StacksSource):
         return super().read(self._of_stack[frame_indices(frames, self.image_key.size)], rows)
 
 
-def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> list[NDArray[np.float64] | None]:
-    """Radians at which the frames of each stack of references were taken; None where the file does not state them."""
-    names = {FrameKind.DARK: "exchange/theta_dark", FrameKind.FLAT: "exchange/theta_white"}
-    return [_list(file, names[stack.kind], len(stack.frames)) for stack in stacks if stack.kind in names]
+def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, NDArray[np.float64]]:
+    """Radians at which the frames of each stack of references were taken, where the file states them."""
+    listed = {part.kind: _list(file, _THETAS[part.kind], len(part.frames)) for part in stacks if part.kind in _THETAS}
+    return {kind: theta for kind, theta in listed.items() if theta is not None}
+
+
+def _later_flats(file: h5py.File, n: int) -> int | None:
+    """The first of n flats that were taken after the views, where the acquisition says that it took them at both ends,
+    as many each time."""
+    mode = datasets.dataset(file, f"{_FLATS}/flat_field_mode")
+    each = datasets.scalar(file, f"{_FLATS}/num_flat_fields", _ANY) or n // 2
+    return n // 2 if mode is not None and _words(mode).lower() == "both" and 2 * each == n > 0 else None
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:

@@ -351,6 +351,8 @@ EXCHANGE: tuple[Entry, ...] = (
         "exposure of flats, where different_flat_exposure says that it is another; seconds without units",
         units=EXCHANGE_TIME_UNITS,
     ),
+    Entry("process/acquisition/flat_fields/flat_field_mode", "Both: flats were taken before and after the views"),
+    Entry("process/acquisition/flat_fields/num_flat_fields", "how many each time; of Both, half of data_white"),
     Entry("process/acquisition/flat_fields/different_flat_exposure", "Different: flats have flat_exposure_time"),
     Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
     Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),

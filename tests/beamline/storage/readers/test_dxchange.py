@@ -144,6 +144,26 @@ def test_what_is_no_real_number_is_refused(tmp_path: Path, parts: Parts, name: s
 
 
 @pytest.mark.parametrize(
+    ("theta", "white"),
+    [
+        (np.arange(8) * 20.0, [0, 0, 160, 160]),
+        (np.arange(8)[::-1] * 20.0, [170, 170, 0, 0]),  # backwards
+        (np.arange(8) * 111.246 % 180, [0, 0, 180, 180]),  # views in another order
+    ],
+)
+def test_flats_of_both_ends_with_their_angles_stand_around_the_views(
+    tmp_path: Path, theta: np.ndarray, white: list[int]
+) -> None:
+    """Nobody needs to say when the darks were taken."""
+    frames = {"data": np.full((8, 2, 3), 50), "data_white": np.arange(100, 124).reshape(4, 2, 3)}
+    parts = frames | {"data_dark": np.zeros((2, 2, 3)), "theta": theta, "theta_white": np.array(white)}
+    with open_scan(store(tmp_path / "s.h5", {k: v.astype(float) for k, v in parts.items()})) as source:
+        assert source.image_key.tolist() == [2, 2, 1, 1, *[0] * 8, 1, 1] and not source.in_order
+        np.testing.assert_array_equal(source.read([2, 3, 12, 13]), frames["data_white"])
+        np.testing.assert_allclose(np.degrees(source.angles[4:12]), theta)
+
+
+@pytest.mark.parametrize(
     ("chunks", "axes"),
     [((64, 256, 320), "theta:y:x"), ((64, 8, 32), "theta:y:x"), ((1, 64, 320), "y:theta:x")],
 )

@@ -229,6 +229,17 @@ USED_EXCHANGE |= {
         ],
         lambda s: s.exposures[:3].tolist(), [0.1, 0.1, 0.1],
     ),
+    f"{FLAT_FIELDS}/flat_field_mode": (
+        [("exchange/data_white", FRAMES[:2], None), (f"{FLAT_FIELDS}/flat_field_mode", "Both", None)],
+        lambda s: s.image_key.tolist(), [2, 1, 0, 0, 0, 0, 0, 1],
+    ),
+    f"{FLAT_FIELDS}/num_flat_fields": (
+        [
+            ("exchange/data_white", FRAMES[:2], None), (f"{FLAT_FIELDS}/flat_field_mode", "Both", None),
+            (f"{FLAT_FIELDS}/num_flat_fields", 2, None),
+        ],
+        lambda s: s.image_key.tolist(), [2, 1, 1, 0, 0, 0, 0, 0],
+    ),
     "exchange/theta_white": (
         [("exchange/theta_white", [72.0], "deg"), ("exchange/theta_dark", [0.0], "deg")],
         lambda s: s.image_key.tolist(), [2, 0, 0, 1, 0, 0, 0],
