@@ -157,20 +157,17 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
     Args:
         values: of a row, by the label of their axis.
     """
-    rows = list(dict.fromkeys(outcome.trial.choice.label for outcome in table.compared if outcome.trial.choice))
+    rows = list(dict.fromkeys(_row(outcome) for outcome in table.compared))
     down = -(-len(values) // 2)
     height = 2.0 * down + 2.2
     figure = new_figure((WIDTH, height), constrained=False)
     panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
     figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
     for axes, (label, value) in zip(panels, values.items(), strict=False):
-        for method, pairs in _by_method(table, value).items():
-            places = [rows.index(outcome.trial.choice.label) for outcome, _ in pairs if outcome.trial.choice]
-            axes.plot(places, [v for _, v in pairs], marker="o", ms=4, lw=0.8, color=colour_of(method), label=method)
+        _draw(axes, table, lambda outcome: rows.index(_row(outcome)), value, "-")
         axes.set_ylabel(label, fontsize=8)
         axes.set_xticks(range(len(rows)), rows, rotation=90, fontsize=6.5)
         axes.tick_params(axis="y", labelsize=7)
-        axes.grid(alpha=0.3)
     panels[0].legend(fontsize=8)
     return png(figure)
 
@@ -184,36 +181,32 @@ def against_cost(table: TrialTable, label: str, value: Value, costs: Mapping[str
     figure = new_figure((WIDTH, 3.6))
     panels = figure.subplots(1, len(costs), sharey=True)
     for axes, (name, cost) in zip(panels, costs.items(), strict=True):
-        for method, pairs in _by_method(table, value).items():
-            for n, kind in enumerate(dict.fromkeys(_kind(o) for o, _ in pairs)):
-                same = [(cost(o), v) for o, v in pairs if _kind(o) == kind]
-                style, words = (f"{_KINDS[n % len(_KINDS)]}-", f"{method}, {kind}") if kind else ("o", method)
-                axes.plot(*zip(*same, strict=True), style, ms=4, lw=0.8, color=colour_of(method), label=words)
+        _draw(axes, table, cost, value)
         axes.set_xlabel(name)
         _scale(axes, [cost(outcome) for outcome in table.compared])
-        axes.grid(alpha=0.3)
     panels[0].set_ylabel(label)
-    if any(_kind(outcome) for outcome in table.compared):
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-    else:
-        panels[0].legend(fontsize=8)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return png(figure)
 
 
-def _kind(outcome: Outcome) -> str:
-    """Of a row that is a scan of its own; else empty."""
-    choice = outcome.trial.choice
-    return choice.label.partition(":")[0] if choice is not None and choice.facts else ""
+def _row(outcome: Outcome) -> str:
+    return "" if outcome.trial.choice is None else outcome.trial.choice.label
 
 
-def _by_method(table: TrialTable, value: Value) -> dict[str, list[tuple[Outcome, float]]]:
-    """The rows of each method that have a finite value."""
-    pairs_of: dict[str, list[tuple[Outcome, float]]] = {}
+def _draw(axes: Axes, table: TrialTable, place: Callable[[Outcome], float], value: Value, line: str = "") -> None:
+    """The rows that have a finite value: a colour a method, and a marker and line a kind of scan, if it is one of its
+    own; `line` joins the others."""
+    points: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for outcome in table.compared:
-        of_row, rows = value(outcome), pairs_of.setdefault(outcome.trial.method, [])
-        if of_row is not None and math.isfinite(of_row):
-            rows.append((outcome, of_row))
-    return pairs_of
+        kind = _row(outcome).partition(":")[0] if outcome.trial.facts else ""
+        if (of_row := value(outcome)) is not None and math.isfinite(of_row):
+            points.setdefault((outcome.trial.method, kind), []).append((place(outcome), of_row))
+    kinds = list(dict.fromkeys(kind for _, kind in points))
+    for (method, kind), same in points.items():
+        style = _KINDS[kinds.index(kind) % len(_KINDS)] + ("-" if kind else line)
+        words = f"{method}, {kind}" if kind else method
+        axes.plot(*zip(*same, strict=True), style, ms=4, lw=0.8, color=colour_of(method), label=words)
+    axes.grid(alpha=0.3)
 
 
 def colour_of(method: str) -> str:

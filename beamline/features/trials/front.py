@@ -1,119 +1,40 @@
-"""Front: how a trade-off is written: its columns, the Pareto front of quality and cost, and what follows from it."""
+"""Front: what follows from a trade-off: its pictures, and the Pareto front of quality and cost in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
 from itertools import pairwise
-from operator import attrgetter
-from typing import Any
 
 from beamline.features.trials.figures import cost_curves, pareto_plot
-from beamline.features.trials.layout import TableColumn, TableLayout, in_digits
+from beamline.features.trials.layout import Figure, TableLayout
 from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
-from beamline.features.trials.trial import Outcome
-from beamline.projections.scan_statistics import Light
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.assess.time_model import duration_text
 
-
-@dataclass(frozen=True)
-class _Figure:
-    """How the tables name a metric. `{}` in `heading` and `legend` is the unit of length."""
-
-    short: str
-    heading: str
-    legend: str
-    shown: Callable[[float], str]
-
-
 _FIGURES = {
-    "psnr": _Figure("PSNR", "PSNR (dB)", "dB against the truth", partial(in_digits, "psnr")),
-    "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", partial(in_digits, "ssim3d")),
-    "rmse": _Figure("RMSE", "RMSE", "of the activity", partial(in_digits, "rmse")),
-    "signal_to_background": _Figure(
-        "S/B", "signal/background", "hot regions over the body", partial(in_digits, "recovery")
-    ),
-    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", partial(in_digits, "sbr_error")),
-    "recovery": _Figure(
-        "hot", "contrast recovery", "contrast of hot regions over the truth's", partial(in_digits, "recovery")
-    ),
-    "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", partial(in_digits, "spillover")),
-    "variation": _Figure(
-        "noise", "noise", "standard deviation of the body over its level", partial(in_digits, "variation")
-    ),
-    "residual_held_out": _Figure(
-        "held out", "held-out res.", METRICS["residual_held_out"].label, partial(in_digits, "residual_held_out")
-    ),
-    "resolution": _Figure(
-        "FSC",
-        "FSC ({})",
-        "period in {} to which two halves of the views agree",
-        lambda value: f"{value:.3g}" if math.isfinite(value) else "none",
-    ),
+    each.metric: each
+    for each in (
+        Figure("psnr", "PSNR", "PSNR (dB)", "dB against the truth"),
+        Figure("ssim3d", "SSIM", "SSIM 3D", "mean over the slices of three directions"),
+        Figure("rmse", "RMSE", "RMSE", "of the activity"),
+        Figure("signal_to_background", "S/B", "signal/background", "hot regions over the body"),
+        Figure("sbr_error", "S/B err", "its largest error", "of a hot region, relative"),
+        Figure("recovery", "hot", "contrast recovery", "contrast of hot regions over the truth's"),
+        Figure("spillover", "cold", "spillover", "level of cold regions over the body's"),
+        Figure("variation", "noise", "noise", "standard deviation of the body over its level"),
+        Figure("residual_held_out", "held out", "held-out res.", METRICS["residual_held_out"].label),
+        Figure("resolution", "FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
+    )
 }
-
 _NEAR = 1.0  # dB below the best figure: a tenth more error
 _FSC = (
     "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
     "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
     "at the slices."
 )
-
-
-def _columns(table: TrialTable) -> Sequence[TableColumn]:
-    settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
-    return [
-        *(TableColumn(name, attrgetter(f"trial.{name}")) for name in ("group", "method", "views", "binning")),
-        *(TableColumn(name, partial(_setting, name)) for name in settings),
-        TableColumn("status", lambda o: o.status),
-        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
-        TableColumn("seconds", lambda o: o.seconds, "s", "s", words=_time),
-        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", words=_time),
-        TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0),
-        TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, lambda n: f"{n / 1e6:.0f}"),
-        TableColumn("gaussians_end", lambda o: o.gaussians),
-        *dose_columns(table),
-        *(
-            TableColumn(
-                name,
-                partial(_metric, name),
-                figure.heading.format(table.length_unit),
-                figure.short,
-                9,
-                figure.shown,
-                metric=True,
-            )
-            for name, figure in _figures(table).items()
-        ),
-        TableColumn("quality_db", lambda o: o.quality(table.by)),
-        TableColumn("message", lambda o: o.message),
-    ]
-
-
-def _marked(table: TrialTable) -> set[int]:
-    best = {id(table.compared[i]) for i in table.front(TIME)}
-    return {n for n, outcome in enumerate(table.outcomes) if id(outcome) in best}
-
-
-def _legend(table: TrialTable) -> Sequence[str]:
-    figures = _figures(table).values()
-    words = "; ".join(f"{each.short}: {each.legend.format(table.length_unit)}" for each in figures)
-    return [*([f"{words}."] if words else []), "*: on the front of time and quality."]
-
-
-def _record(table: TrialTable) -> Mapping[str, Any]:
-    return {
-        "quality": table.by,
-        "length_unit": table.length_unit,
-        "trials": [outcome.as_record() for outcome in table.outcomes],
-        "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
-        "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
-    }
 
 
 def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
@@ -143,40 +64,6 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
             caption += " Of several volumes, the one that the middle view shows, by its time or energy."
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     return pictures
-
-
-def dose_columns(table: TrialTable) -> list[TableColumn]:
-    """The dose of each trial, where the light is known."""
-    if (light := table.light) is None:
-        return []
-    return [TableColumn(name, partial(_dose, light, name)) for name in light.of(1)]
-
-
-def _dose(light: Light, name: str, outcome: Outcome) -> float:
-    return light.of(outcome.trial.frames)[name]
-
-
-def _setting(name: str, outcome: Outcome) -> Any:
-    return outcome.trial.settings.get(name)
-
-
-def _metric(name: str, outcome: Outcome) -> float | None:
-    return outcome.metrics.get(name)
-
-
-def _figures(table: TrialTable) -> dict[str, _Figure]:
-    """Of the metrics that any trial has."""
-    return {name: figure for name, figure in _FIGURES.items() if any(name in o.metrics for o in table.outcomes)}
-
-
-def _time(seconds: float) -> str:
-    """s to three significant digits in at most seven characters; whole ones from a hundred on."""
-    if not math.isfinite(seconds):
-        return "n/a"
-    if 0 < seconds < 1e-3:
-        return f"{seconds:.2e}".replace("e-0", "e-")
-    digits = 2 - math.floor(math.log10(seconds)) if seconds > 0 else 0
-    return f"{seconds:.{max(0, digits)}f}"
 
 
 def _duration(seconds: float) -> str:
@@ -246,7 +133,6 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
 
 
 TRADEOFF = TableLayout(
-    "tradeoff", "tradeoff.html", "trials", "What accuracy costs", lambda outcome: (outcome.trial.label,), _columns,
-    conclusions, _record, _pictures, marked=_marked, legend=_legend,
-)  # fmt: skip
+    "tradeoff", "tradeoff.html", "trials", "What accuracy costs", _FIGURES, conclusions, _pictures, front=True
+)
 """The table of a trade-off, whose rows on the front of time and quality stand out."""

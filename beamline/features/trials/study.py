@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -16,14 +14,12 @@ from beamline.core.files import REPORT
 from beamline.core.sinks import Warn
 from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.figures import against_cost, figures_of_rows
-from beamline.features.trials.front import dose_columns
-from beamline.features.trials.layout import Planned, TableColumn, TableLayout, in_digits, records
+from beamline.features.trials.layout import Figure, Planned, TableLayout, known
 from beamline.features.trials.runner import ComparedScan, opened_scan
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewChoice, ViewSet
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.scan_statistics import dose_scale
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
@@ -34,14 +30,16 @@ from recon.base.method import Plain
 from recon.methods import BASELINE, by_name
 
 REFERENCE = "all views"
-_FIGURES = {
-    "psnr_all": ("PSNR all views", "psnr"), "ssim_all": ("SSIM all views", "ssim3d"),
-    "psnr_truth": ("PSNR truth", "psnr"),
-    "ssim_truth": ("SSIM truth", "ssim3d"), "snr": ("SNR rims", "snr"), "cnr": ("CNR rims", "cnr"),
-    "residual_held_out": ("residual", "residual_held_out"),
-}  # fmt: skip
-"""Heading, and the metric that says how many digits it has, by name in files."""
-_MEASURED = {"psnr_truth": "psnr", "ssim_truth": "ssim3d"}  # names of metrics against the truth where trials end
+FIGURES = {
+    "psnr_all": Figure("psnr_all", "PSNR all views", digits_of="psnr"),
+    "ssim_all": Figure("ssim_all", "SSIM all views", digits_of="ssim3d"),
+    "psnr_truth": Figure("psnr", "PSNR truth"),
+    "ssim_truth": Figure("ssim3d", "SSIM truth"),
+    "snr": Figure("snr", "SNR rims"),
+    "cnr": Figure("cnr", "CNR rims"),
+    "residual_held_out": Figure("residual_held_out", "residual"),
+}
+"""By name in files."""
 
 
 @dataclass(frozen=True)
@@ -165,59 +163,31 @@ def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
 def layout_of(study: Study) -> TableLayout:
     """The table of a study: a row for each choice of views and method."""
     return TableLayout(
-        "study", REPORT, "rows", study.title, lambda outcome: (_choice(outcome).label, outcome.trial.method), _columns,
-        lambda table: [*draws(table), *table.notes],
-        lambda table: {"study": study.name, "notes": list(table.notes), "rows": records(table, layout_of(study))},
-        _pictures, study.question,
+        "study", REPORT, "rows", study.title, FIGURES, lambda table: [*draws(table), *table.notes], _pictures,
+        study.question, {"study": study.name},
     )  # fmt: skip
 
 
-def _columns(table: TrialTable) -> Sequence[TableColumn]:
-    timed, shown = table.timed, names(table)
-    return [
-        TableColumn("row", lambda o: _choice(o).label),
-        TableColumn("method", lambda o: o.trial.method),
-        TableColumn("views", lambda o: o.trial.views),
-        TableColumn("window", lambda o: _choice(o).window),
-        TableColumn("frames", lambda o: o.trial.frames),
-        *dose_columns(table),
-        *(TableColumn(name, partial(_fact, name), name, name, 11, "{:.4g}".format) for name in _facts(table)),
-        TableColumn("status", lambda o: o.status),
-        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, "{:g}".format),
-        TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", words="{:.1f}".format),
-        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", words="{:.1f}".format),
-        TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0),
-        *(
-            TableColumn(
-                name,
-                partial(value_of, name),
-                words * (name in shown),
-                words,
-                12,
-                partial(in_digits, metric),
-                metric=True,
-            )
-            for name, (words, metric) in _FIGURES.items()
-        ),
-        TableColumn("message", lambda o: o.message),
-    ]
-
-
 def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
-    pictures, figures = [], names(table)
+    pictures = []
     if table.compared:
         caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
-        axes = {name: words + " (dB)" * bool(METRICS[metric].unit) for name, (words, metric) in _FIGURES.items()}
-        picture = figures_of_rows(table, {axes[name]: partial(value_of, name) for name in figures})
-        pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
-        first = "psnr_truth" if "psnr_truth" in figures else figures[0]
+        axes = {
+            each.short + " (dB)" * bool(METRICS[each.digits_of or each.metric].unit): each.of
+            for each in known(table, FIGURES).values()
+        }
+        pictures.append(("figures.png", Picture("Figures of all rows", caption, figures_of_rows(table, axes))))
         caption = "Each frame of the scan has the same dose; one that several views share is counted once."
-        a_frame, dose = dose_scale(table.light)
-        costs = {dose: lambda o: o.trial.frames * a_frame, "processor time (s)": lambda o: o.cpu_seconds}
-        if _facts(table):
+        dose = table.dose
+        costs = {dose.axis: lambda o: dose.of(o) * dose.scale, "processor time (s)": lambda o: o.cpu_seconds}
+        if any(o.trial.facts for o in table.compared):
             caption = "A line joins the plans of a kind and method, from many views to few."
-            costs = {"dose (photons a pixel)": partial(_fact, DOSE), "scan time (s)": partial(_fact, SCAN_TIME)}
-        picture = against_cost(table, axes[first], partial(value_of, first), costs)
+            costs = {
+                "dose (photons a pixel)": lambda o: o.trial.facts[DOSE],
+                "scan time (s)": lambda o: o.trial.facts[SCAN_TIME],
+            }
+        first = next((axis for axis in axes if axis.startswith("PSNR truth")), next(iter(axes)))
+        picture = against_cost(table, first, axes[first], costs)
         pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
@@ -227,41 +197,18 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
     return pictures
 
 
-def _choice(outcome: Outcome) -> ViewChoice:
-    assert outcome.trial.choice is not None
-    return outcome.trial.choice
-
-
-def _facts(table: TrialTable) -> list[str]:
-    """Headings of what is known of how views were taken."""
-    return list(dict.fromkeys(name for outcome in table.outcomes for name in _choice(outcome).facts))
-
-
-def _fact(name: str, outcome: Outcome) -> float:
-    return _choice(outcome).facts.get(name, math.nan)
-
-
-def value_of(name: str, outcome: Outcome) -> float | None:
-    """A figure of a row; None where it is not known."""
-    return outcome.metrics.get(_MEASURED.get(name, name))
-
-
-def names(table: TrialTable) -> list[str]:
-    """Figures that any row has."""
-    return [name for name in _FIGURES if any(value_of(name, outcome) is not None for outcome in table.outcomes)]
-
-
 def draws(table: TrialTable) -> list[str]:
     """Sentences: mean and range of the figures over the draws of one choice."""
+    families: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in table.compared:
+        if outcome.trial.choice is not None and outcome.trial.choice.family:
+            families.setdefault((outcome.trial.method, outcome.trial.choice.family), []).append(outcome)
     sentences = []
-    families = dict.fromkeys((_choice(o).family, o.trial.method) for o in table.compared if _choice(o).family)
-    for family, method in families:
-        rows = [o for o in table.compared if (_choice(o).family, o.trial.method) == (family, method)]
+    for (method, family), rows in families.items():
         parts = []
-        for name in names(table):
-            values = [value for o in rows if (value := value_of(name, o)) is not None]
-            words, metric = _FIGURES[name]
-            mean, low, high = (in_digits(metric, float(of(values))) for of in (np.mean, min, max))
-            parts.append(f"{words} {mean} ({low} to {high})")
+        for figure in known(table, FIGURES).values():
+            values = [value for row in rows if (value := figure.of(row)) is not None]
+            mean, low, high = (figure.words(float(of(values))) for of in (np.mean, min, max))
+            parts.append(f"{figure.short} {mean} ({low} to {high})")
         sentences.append(f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}.")
     return sentences

@@ -59,6 +59,16 @@ class Trial:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
 
+    @property
+    def window(self) -> int:
+        """Views of the scan that are averaged into each of its views."""
+        return 1 if self.choice is None else self.choice.window
+
+    @property
+    def facts(self) -> Mapping[str, float]:
+        """On how its views were taken, by heading."""
+        return {} if self.choice is None else self.choice.facts
+
     def build(self) -> Method:
         """The method with the settings of the trial.
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
+from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import launch as trial_run
 from beamline.features.trials.launch import (
     JOB,
@@ -94,7 +95,8 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
     assert outcome.status == "done", outcome.message
     assert outcome.quality("psnr") > 20
-    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes
+    assert (outcome.peak_bytes is None) != STATUS.is_file()  # Linux
+    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes < (peak_memory() or 0)
 
 
 def test_values_survive_the_file(tmp_path: Path) -> None:
