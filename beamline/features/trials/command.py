@@ -271,7 +271,7 @@ def study(request: StudyRequest) -> None:
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.study import StudyOptions, layout_of, planned_study
+    from beamline.features.trials.study import layout_of, planned_study
 
     methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
@@ -283,6 +283,6 @@ def study(request: StudyRequest) -> None:
         source, selection, folder, methods, request.truth, _light(request), request.seconds, seed=request.seed,
         command=repeating(context, request.file, folder),
     )  # fmt: skip
-    options = StudyOptions(scan, STUDIES[request.which], settings, request.ramp, request.draws)
-    plan = partial(planned_study, options)
-    _compare(scan, layout_of(options.study), plan, dry=request.dry, as_json=request.as_json)
+    asked = STUDIES[request.which]
+    plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
+    _compare(scan, layout_of(asked), plan, dry=request.dry, as_json=request.as_json)

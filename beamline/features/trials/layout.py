@@ -132,7 +132,7 @@ class Planned:
         table: before any trial is done.
         started: the event that says so.
         references: trials whose volumes others are compared with, in addition to the truth: each with those of its
-            method. The first one has the dense and the empty regions.
+            method. Without a truth the first one has the dense and the empty regions.
     """
 
     data: TrialData

@@ -165,12 +165,14 @@ def run_comparison(
         planned.data.save(work / DATA)
         del planned
         rig = _Rig(work, scan.seed, end, now, emit, expected)
-        for n, reference in enumerate(references):
+        contrast = truth
+        for reference in references:
             volume = _add_reference(rig, reference, slices)
-            if n == 0:
-                with suppress(ValueError):  # no contrast
-                    dense = metrics.kmeans_mask(metrics.sampled(volume if truth is None else truth), rig.seed)
-                    write_array(work / DATA / "data.regions.npy", dense)
+            contrast = volume if contrast is None else contrast
+        if contrast is not None and "snr" in layout.figures:
+            with suppress(ValueError):  # it has no dense and empty regions
+                dense = metrics.kmeans_mask(metrics.sampled(contrast), rig.seed)
+                write_array(work / DATA / "data.regions.npy", dense)
         if truth is not None:
             slices.add("truth", truth)
         emit(StateEntered("compiling", "Compiling kernels that are not in the cache"))

@@ -14,9 +14,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from beamline.core.machine import machine
-from beamline.features.trials import figures as tradeoff_figures
-from beamline.features.trials.figures import colour_of, cost_curves, pareto_plot
-from beamline.features.trials.front import TRADEOFF, conclusions
+from beamline.features.trials import front as tradeoff_figures
+from beamline.features.trials.front import TRADEOFF, colour_of, conclusions, cost_curves, pareto_plot
 from beamline.features.trials.layout import finite, text, to_csv, to_html, write_page, write_table
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
