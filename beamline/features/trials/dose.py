@@ -19,7 +19,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan, table_of
-from beamline.features.trials.table import TrialTable
+from beamline.features.trials.trial import TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, ViewChoice
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import axis_col_of, scene_of

@@ -10,8 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from beamline.features.trials.layout import Figure, TableLayout
-from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import (
+    HELD_OUT,
+    LEAST_GAIN,
+    MEMORY,
+    QUALITIES,
+    TIME,
+    Outcome,
+    Trial,
+    TrialCost,
+    TrialTable,
+)
 from beamline.report.figures import one_panel, png
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
@@ -53,7 +62,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
     for cost in (TIME, MEMORY, *doses):
         if table.front(cost):
             caption = (
-                f"{table.quality.words} of every trial against its {cost.words}. The line is the best quality "
+                f"{QUALITIES[table.by][0]} of every trial against its {cost.words}. The line is the best quality "
                 "at each cost; its corners are the trials that no other beats in both."
             )
             picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
@@ -87,7 +96,7 @@ def conclusions(table: TrialTable) -> list[str]:
     """Sentences: the time of each further dB along the front."""
     compared, qualities, seconds = table.compared, table.qualities, table.costs(TIME)
     kept = table.front(TIME)
-    out = [f"Quality: {table.quality.words}, dB."]
+    out = [f"Quality: {QUALITIES[table.by][0]}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
     first, best, pick = compared[kept[0]], compared[kept[-1]], kept[worth_its_time(table) or 0]
@@ -99,7 +108,7 @@ def conclusions(table: TrialTable) -> list[str]:
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for i, j in pairwise(kept):
         rise, cost = qualities[j] - qualities[i], seconds[j] - seconds[i]
-        chance = f" ± {table.chance(j, i):.2f}" * table.quality.of_views
+        chance = f" ± {table.chance(j, i):.2f}" * (table.by == HELD_OUT)
         price = f"{_duration(cost)} more ({_duration(cost / rise)} a dB)"
         out.append(f"+{rise:.2f}{chance} dB for {price}: {compared[j].trial.label}.")
     out += _level(table, kept[-1])
@@ -135,7 +144,7 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
         [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],
         table.front(cost),
         cost.axis,
-        table.quality.axis,
+        QUALITIES[table.by][1],
         cost.unit,
         worth_its_time(table) if cost is TIME else None,
     )

@@ -19,8 +19,7 @@ from beamline.core.machine import machine_line
 from beamline.core.sinks import Warn
 from beamline.core.text import csv_text
 from beamline.features.trials.launch import TrialData
-from beamline.features.trials.table import MEMORY, TIME, TrialTable
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MEMORY, TIME, Outcome, Trial, TrialTable
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet

@@ -21,8 +21,7 @@ from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.forecast import Expected, Timed, expected_seconds, trials_left
 from beamline.features.trials.launch import DATA, TrialData, compile_kernels, run_trial, write_array
 from beamline.features.trials.layout import Plan, TableLayout, event_of, write_page, write_table
-from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import Light, LightAsked, light_in

@@ -17,8 +17,7 @@ from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.front import colour_of, scale
 from beamline.features.trials.layout import Figure, Planned, TableLayout, known
 from beamline.features.trials.runner import ComparedScan, opened_scan
-from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewChoice, ViewSet
 from beamline.projections.prepared import PreparedProjections
 from beamline.report.figures import WIDTH, new_figure, png

@@ -23,8 +23,7 @@ from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.layout import Planned
 from beamline.features.trials.runner import ComparedScan, opened_scan, table_of
-from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.prepared import PreparedProjections, hold_out, with_views_held_out
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.plan import times_of
@@ -95,7 +94,7 @@ def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
         if scan.seconds is None
         else plan_in_equal_time(methods, n, start, scan.seconds)
     )
-    return data, table.with_fact("views used", str(n)), trials
+    return data, replace(table, scan={**table.scan, "views used": str(n)}), trials
 
 
 def split(prepared: PreparedProjections, truth: F32 | None) -> TrialData:
@@ -125,7 +124,7 @@ def _in_time(scan: ComparedScan, volumes: int, warn: Warn) -> Comparison:
     begun = seconds - seconds.min()
     start = default_count(held.geometry, held.geometry.sample_pitch)
     trials = plan_in_time(scan.methods or _WITH_JOINT, n, start, volumes)
-    table = table.with_fact("views used", f"{n}, over {np.ptp(seconds):.4g} s")
+    table = replace(table, scan={**table.scan, "views used": f"{n}, over {np.ptp(seconds):.4g} s"})
     return TrialData(replace(held, times=begun[:n]), None, begun[n:]), table, trials
 
 

@@ -17,9 +17,8 @@ from beamline.core.machine import machine
 from beamline.features.trials import front as tradeoff_figures
 from beamline.features.trials.front import TRADEOFF, colour_of, conclusions, cost_curves, pareto_plot
 from beamline.features.trials.layout import finite, text, to_csv, to_html, write_page, write_table
-from beamline.features.trials.table import TrialTable
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.report.html import Picture
 from beamline.report.sheets import SliceSheet
 from recon import methods
