@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +30,6 @@ from recon.prep.counts import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
-_VALUES = "values.json"
 _SMALL = 4096  # bytes of a file that is read at once
 
 
@@ -74,7 +72,7 @@ class TrialData:
         return None if rays is None else rays[self.geometry.n_views :]
 
     def save(self, folder: Path) -> None:
-        """Into a new folder: each array in a .npy file, numbers and words in one of JSON, without how it was prepared.
+        """Into a new folder: each array, number and word in a .npy file, without how the views were prepared.
 
         Files `reference.METHOD.npy` and `data.regions.npy` may follow.
 
@@ -91,32 +89,34 @@ class TrialData:
         }
         values |= {f"geometry.{name}": value for name, value in arrays_of(self.geometry).items()}
         if views.held_out is not None:
-            unseen = {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
-            values |= {"held_out.lines": views.held_out[0], **unseen}
-        plain = {name: value for name, value in values.items() if isinstance(value, str | float | int | np.generic)}
+            values["held_out.lines"] = views.held_out[0]
+            values |= {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
         with named_on_failure(folder):
             folder.mkdir()
-            (folder / _VALUES).write_text(json.dumps(plain, default=np.generic.item), encoding="utf-8")
         for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                write_array(folder / f"{name}.npy", value)
+            if isinstance(value, np.ndarray | np.generic | str | float | int):
+                write_array(folder / f"{name}.npy", np.asarray(value))
 
     @classmethod
     def load(cls, folder: Path) -> TrialData:
         """What `save` of the same program wrote; large arrays stay in their files until they are used."""
-        values = json.loads((folder / _VALUES).read_text(encoding="utf-8")) | {
-            path.stem: np.load(path, "r" if path.stat().st_size > _SMALL else None) for path in folder.glob("*.npy")
-        }
+
+        def arrays(part: str) -> dict[str, Any]:
+            files = folder.glob(f"{part}.*.npy")
+            return {
+                path.stem.partition(".")[2]: np.load(path, "r" if path.stat().st_size > _SMALL else None)
+                for path in files
+            }
 
         def of(part: str) -> dict[str, Any]:
-            return {name.removeprefix(f"{part}."): v for name, v in values.items() if name.startswith(f"{part}.")}
+            return {name: each if each.ndim else each.item() for name, each in arrays(part).items()}
 
-        geometry = geometry_of_arrays(of("geometry"))
+        geometry = geometry_of_arrays(arrays("geometry"))
         prepared = PreparedProjections(
             Projections(**of("projections")),
             geometry,
             axis=None,
-            held_out=(held["lines"], geometry_of_arrays(of("unseen"))) if (held := of("held_out")) else None,
+            held_out=(held["lines"], geometry_of_arrays(arrays("unseen"))) if (held := of("held_out")) else None,
             emission=Emission(geometry=geometry, **counted) if (counted := of("emission")) else None,
             energies=Energies(**energies) if (energies := of("energies")) else None,
             **of("prepared"),
@@ -208,12 +208,12 @@ JOB = TypeAdapter(TrialJob)
 COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 
 
-def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | None = None) -> None:
+def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float = math.inf) -> None:
     """Fill the cache of compiled kernels for these trials, so that no trial's memory includes the compiler's.
 
     Args:
         work: a folder with the data, `DATA`.
-        max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
+        max_seconds: after which it is ended; what is missing is compiled by the trials.
     """
     # a method and its settings that are words decide which kernels are compiled
     kinds = {
@@ -224,14 +224,12 @@ def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | No
     _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
 
 
-def run_trial(
-    trial: Trial, work: Path, seed: int, max_seconds: float | None = None, keep: Path | None = None
-) -> Outcome:
+def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, keep: Path | None = None) -> Outcome:
     """Run one trial in a process of its own, which has ended when this returns or raises.
 
     Args:
         work: a folder with the data, `DATA`.
-        max_seconds: after which the process is killed; None: no limit.
+        max_seconds: after which the process is killed.
         keep: a .npy file for its volume [z, y, x]; None: the volume is forgotten.
 
     Raises:
@@ -248,9 +246,7 @@ def run_trial(
     return Outcome(trial, "failed", message=message)
 
 
-def _run(
-    job: TrialJob, work: Path, max_seconds: float | None
-) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
+def _run(job: TrialJob, work: Path, max_seconds: float) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
     """The last event of a process that does the job, and how it ended, see `run_to_end`."""
     path, last = work / "job.json", dict[str, Any]()
     with named_on_failure(path):
@@ -260,6 +256,5 @@ def _run(
         nonlocal last
         last = json_object(line) or last
 
-    limit = math.inf if max_seconds is None else max_seconds
-    ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=limit)
+    ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=max_seconds)
     return last, ended

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -102,6 +102,7 @@ class _Rig:
     Attributes:
         work: folder with the data.
         end: by `now`, when the last trial must be done; inf: no limit.
+        slices: get those that the page shows.
     """
 
     work: Path
@@ -110,20 +111,22 @@ class _Rig:
     now: Callable[[], float]
     emit: Callable[[Event], None]
     expected: Expected
+    slices: SliceSheet
 
     @property
-    def seconds(self) -> float | None:
-        """That are left; None: no limit."""
-        return None if self.end == math.inf else self.end - self.now()
+    def seconds(self) -> float:
+        """That are left; inf: no limit."""
+        return self.end - self.now()
 
-    def run(self, trial: Trial, seconds: float | None, keep: bool) -> tuple[Outcome, F32 | None]:
-        """The outcome within so many seconds, and the volume [z, y, x] if it is kept and there is one."""
-        path = self.work / "volume.npy"
-        outcome = run_trial(trial, self.work, self.seed, seconds, keep=path if keep else None)
-        if not (keep and path.exists()):
+    def run(self, trial: Trial, seconds: float, title: str = "") -> tuple[Outcome, F32 | None]:
+        """The outcome within so many seconds, and the volume [z, y, x] if its slice has a title and there is one."""
+        path, choice = self.work / "volume.npy", trial.choice
+        outcome = run_trial(trial, self.work, self.seed, seconds, keep=path if title else None)
+        if not (title and path.exists()):
             return outcome, None
         volume = np.load(path)
         path.unlink()
+        self.slices.add(title, volume, *(() if choice is None else (choice.family, trial.method)))
         return outcome, volume
 
 
@@ -163,10 +166,10 @@ def run_comparison(
     with _result_folder(scan.folder) as work:
         planned.data.save(work / DATA)
         del planned
-        rig = _Rig(work, scan.seed, end, now, emit, expected)
+        rig = _Rig(work, scan.seed, end, now, emit, expected, slices)
         contrast = truth
         for reference in references:
-            volume = _add_reference(rig, reference, slices)
+            volume = _add_reference(rig, reference)
             contrast = volume if contrast is None else contrast
         if contrast is not None and "snr" in layout.figures:
             with suppress(ValueError):  # it has no dense and empty regions
@@ -175,34 +178,30 @@ def run_comparison(
         if truth is not None:
             slices.add("truth", truth)
         emit(StateEntered("compiling", "Compiling kernels that are not in the cache"))
-        trials, seconds = [table.outcomes[n].trial for n in table.todo], rig.seconds
-        compile_kernels(trials, work, None if seconds is None else max(seconds, 0.0) * _COMPILING)
-        table = _run_all(table, layout, rig, slices, scan.folder)
+        trials = [table.outcomes[n].trial for n in table.todo]
+        compile_kernels(trials, work, max(rig.seconds, 0.0) * _COMPILING)
+        table = _run_all(table, layout, rig, scan.folder)
     write_page(scan.folder, table, layout, slices)
     summary = {"output": scan.folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
 
-def _add_reference(rig: _Rig, trial: Trial, slices: SliceSheet) -> F32:
+def _add_reference(rig: _Rig, trial: Trial) -> F32:
     """Make a volume that trials of its method are compared with.
 
     Raises:
         DataError: it failed.
     """
-    outcome, volume = rig.run(trial, rig.seconds, keep=True)
+    outcome, volume = rig.run(trial, rig.seconds, trial.title)
     if volume is None:
         raise DataError(f"{trial.title}, to compare with, failed: {outcome.message}. Nothing was written.")
     write_array(rig.work / DATA / f"reference.{trial.method}.npy", volume)
-    slices.add(f"{trial.choice.label if trial.choice else trial.title}: {trial.method}", volume)
     return volume
 
 
-def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet, folder: Path) -> TrialTable:
+def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) -> TrialTable:
     """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
-
-    Args:
-        slices: gets those that the page shows.
 
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
@@ -215,15 +214,12 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceShe
                 table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
                 continue
             eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.expected)
-            eta = eta if eta is None or seconds is None else min(eta, seconds)
             rate = 60 * n / max(rig.now() - begin, 1e-9)
-            rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta, rate))
+            rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta and min(eta, seconds), rate))
             started, whole = rig.now(), table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
-            outcome, volume = rig.run(trial, seconds, keep=trial.group in _SHOWN)
+            outcome, _ = rig.run(trial, seconds, trial.title * (trial.group in _SHOWN))
             table = whole.with_outcome(index, outcome)
-            if volume is not None:
-                slices.add(trial.title, volume, *(() if trial.choice is None else (trial.choice.family, trial.method)))
             timed.append(Timed.of(outcome, rig.now() - started))
             if table.n_done:
                 write_table(folder, table, layout)
@@ -236,12 +232,10 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceShe
     return table
 
 
-def _no_time(needed: float, remaining: float | None) -> str:
-    """Why a trial of so many seconds is not begun; empty: there is time. None: no limit."""
-    if remaining is None or needed < remaining:
-        return ""
+def _no_time(needed: float, remaining: float) -> str:
+    """Why a trial of so many seconds is not begun; empty: there is time."""
     about = f"it would take about {needed:.0f} s, and only {remaining:.0f} s were left"
-    return f"not begun: {about if remaining > 0 else 'no time was left'}"
+    return "" if needed < remaining else f"not begun: {about if remaining > 0 else 'no time was left'}"
 
 
 @contextmanager
@@ -251,11 +245,9 @@ def _result_folder(folder: Path) -> Iterator[Path]:
     An empty result folder is removed, too, because the next run would refuse it.
     """
     folder.mkdir()
-    work = folder / "work"
-    work.mkdir()
     try:
-        yield work
+        with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as work:
+            yield Path(work)
     finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):
+        with suppress(OSError):  # it has results
             folder.rmdir()

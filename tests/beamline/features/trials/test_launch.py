@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
@@ -37,13 +38,13 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
     ("program", "limit", "status", "said"),
     [
         ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
-        ("import sys; sys.exit('it broke')", None, "failed", "it broke"),
-        ('print(\'{"event": "failed", "message": "no matter"}\')', None, "failed", "no matter"),
+        ("import sys; sys.exit('it broke')", math.inf, "failed", "it broke"),
+        ('print(\'{"event": "failed", "message": "no matter"}\')', math.inf, "failed", "no matter"),
         ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5, "curve": [[1, 2]]}\')', 60.0, "done", ""),
     ],
 )
 def test_what_becomes_of_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float | None, status: str, said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float, status: str, said: str
 ) -> None:
     monkeypatch.setattr(trial_run, "COMMAND", [sys.executable, "-c", program])
     outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
