@@ -64,13 +64,6 @@ class TrialData:
             return energies.of_view.astype(np.float64)
         return np.zeros(self.geometry.n_views) if self.prepared.times is None else self.prepared.times
 
-    @property
-    def rays_held_out(self) -> F32 | None:
-        """Weights of the rays of the views held out; None: all alike."""
-        held_out = self.prepared.held_out
-        rays = None if held_out is None else self.prepared.ray_weights(held_out[1].n_views)
-        return None if rays is None else rays[self.geometry.n_views :]
-
     def save(self, folder: Path) -> None:
         """Into a new folder: each array, number and word in a .npy file, without how the views were prepared.
 

@@ -161,9 +161,9 @@ def columns(table: TrialTable, layout: TableLayout) -> list[TableColumn]:
         TableColumn("row", lambda o: (o.trial.choice or o.trial).label),
         *(TableColumn(name, attrgetter(f"trial.{name}"))
           for name in ("group", "method", "views", "binning", "window", "frames")),
-        *(TableColumn(name, partial(_setting, name)) for name in settings),
+        *(TableColumn(name, partial(_item, "settings", name)) for name in settings),
         *(TableColumn(name, partial(_dose, each)) for name, each in doses.items()),
-        *(TableColumn(name, partial(_fact, name), name, name, 11, "{:.4g}".format) for name in facts),
+        *(TableColumn(name, partial(_item, "facts", name), name, name, 11, "{:.4g}".format) for name in facts),
         TableColumn("status", attrgetter("status")),
         TableColumn("seconds_asked", attrgetter("trial.seconds_asked"), "s asked" * (timed and not layout.front),
                     "s asked", words="{:g}".format),
@@ -180,12 +180,8 @@ def columns(table: TrialTable, layout: TableLayout) -> list[TableColumn]:
     ]  # fmt: skip
 
 
-def _setting(name: str, outcome: Outcome) -> Any:
-    return outcome.trial.settings.get(name)
-
-
-def _fact(name: str, outcome: Outcome) -> float:
-    return outcome.trial.facts.get(name, math.nan)
+def _item(of: str, name: str, outcome: Outcome) -> Any:
+    return getattr(outcome.trial, of).get(name)
 
 
 def _dose(of_a_frame: float, outcome: Outcome) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -202,24 +203,16 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
         ValueError: for a method that there is not.
     """
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
-    first: list[Trial] = []
-    rest: list[Trial] = []
-    for method in methods:
-        base, *others = trials_of(method, n_views, gaussians, depth)
-        first.append(replace(base, halves=True))
-        rest += [replace(base, group="views", views=n) for n in counts]
-        rest += others
-    return tuple(dict.fromkeys([*first, *rest]))
+    tried = [trials_of(method, n_views, gaussians, depth) for method in methods]
+    fewer = [[replace(base, group="views", views=n) for n in counts] + others for base, *others in tried]
+    return tuple(dict.fromkeys([*(replace(base, halves=True) for base, *_ in tried), *chain(*fewer)]))
 
 
 def quick_first(trials: Sequence[Trial], expected: Expected) -> tuple[Trial, ...]:
     """The trials with baselines first, then those that take least time, and those whose time is not known."""
-
-    def order(trial: Trial) -> tuple[bool, float]:
-        varied = trial.group != "method"
-        return varied, (expected(trial) or math.inf) if varied else 0.0
-
-    return tuple(sorted(trials, key=order))
+    baselines = [trial for trial in trials if trial.group == "method"]
+    varied = [trial for trial in trials if trial.group != "method"]
+    return *baselines, *sorted(varied, key=lambda trial: expected(trial) or math.inf)
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
@@ -233,9 +226,8 @@ def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     These take two more reconstructions each, and say less than one of another method.
     """
     once = [replace(trial, halves=False) for trial in trials]
-    alone = [trial for trial in once if trial.group == "method"]
-    direct = [trial for trial in alone if by_name(trial.method).traits.direct]
-    return tuple(dict.fromkeys([*direct, *alone, *once]))
+    alone = sorted((t for t in once if t.group == "method"), key=lambda t: not by_name(t.method).traits.direct)
+    return tuple(dict.fromkeys([*alone, *once]))
 
 
 def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
