@@ -102,17 +102,11 @@ def fourier_shell_correlation(
         mask: weights [z, y, x], such as `soft_cylinder`; None: all 1.
 
     Raises:
-        ValueError: for shapes that differ, fewer than 4 voxels along the longest axis, values that are not finite, or
-            spacings that are not positive. Also for a volume that is constant under the mask.
+        ValueError: for fewer than 4 voxels along the longest axis, values that are not finite, or a volume that is
+            constant under the mask.
     """
-    if first.shape != second.shape or first.ndim != 3:
-        raise ValueError(f"two volumes [z, y, x] of one shape are needed, got {first.shape} and {second.shape}")
-    if mask is not None and mask.shape != first.shape:
-        raise ValueError(f"the mask has shape {mask.shape}, the volumes {first.shape}")
     shape: tuple[int, int, int] = first.shape
     edges = np.broadcast_to(np.asarray(spacing, np.float64), (3,))
-    if not (np.isfinite(edges) & (edges > 0)).all():
-        raise ValueError(f"voxel edges must be positive lengths, got {spacing}")
     if max(shape) < 4:
         raise ValueError(f"volumes of {shape} voxels have no shells to compare")
     width = 1 / float(max(n * edge for n, edge in zip(shape, edges, strict=True)))
