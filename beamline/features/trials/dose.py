@@ -17,8 +17,7 @@ from beamline.config.load import load, plan_of, scene_mapping
 from beamline.core.errors import ConfigError
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan, table_of
+from beamline.features.trials.launch import ComparedScan, TrialData, table_of
 from beamline.features.trials.trial import TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, ViewChoice
 from beamline.instrument.connect import connect

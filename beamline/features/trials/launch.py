@@ -17,14 +17,23 @@ from pydantic import TypeAdapter
 from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
-from beamline.core.files import named_on_failure
+from beamline.core.files import named_on_failure, refuse_existing, refuse_not_utf8
+from beamline.core.machine import machine
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.core.sinks import Warn
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.view_choices import ViewChoice
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.scan_statistics import Light, LightAsked, light_in
+from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.outcome import facts_of
+from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 from recon.base.method import Energies
+from recon.base.volume import Grid
 from recon.prep.correct import Projections
 from recon.prep.counts import Emission, weighted_lines
 
@@ -115,6 +124,61 @@ class TrialData:
             **of("prepared"),
         )
         return cls(prepared, **{"truth": None, **of("data")}, references=of("reference"))
+
+
+@dataclass(frozen=True)
+class ComparedScan:
+    """The scan of a trade-off or a study, and what holds for all of its reconstructions.
+
+    Attributes:
+        folder: for the results; must not exist.
+        methods: names in `recon.methods`; none: those that suit the comparison.
+        truth: FILE or FILE:first:end to compare with.
+        light: what the user knows of it; None: the dose is counted in frames.
+        seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
+        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
+            what is left is not begun, a running one is ended. None: no limit.
+        command: that repeats this, for the record.
+    """
+
+    source: SourceOptions
+    selection: Selection
+    folder: Path
+    methods: Sequence[str] = ()
+    truth: str | None = None
+    light: LightAsked | None = None
+    seconds: float | None = None
+    max_seconds: float | None = None
+    seed: int = 0
+    command: str = ""
+
+
+def opened_scan(asked: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable]:
+    """Read and correct the views, after all inputs were checked; the table has no trials yet.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    refuse_not_utf8(asked.source.path)
+    refuse_existing(asked.folder)
+    truth_given = None if asked.truth is None else read_truth(asked.truth)
+    with asked.source.open() as source:
+        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
+        prepared = prepare_projections(source, asked.selection, warn).without_warnings
+    grid, truth = Grid.matching(prepared.geometry), None
+    if truth_given is not None:
+        truth = fit_truth(truth_given, grid, asked.selection.binning).data
+    if light is not None:
+        facts["light"] = "; ".join(light.in_words())
+    return TrialData(prepared, truth), table_of(asked, facts, prepared, light)
+
+
+def table_of(
+    scan: ComparedScan, facts: Mapping[str, str], prepared: PreparedProjections, light: Light | None = None
+) -> TrialTable:
+    """A table without trials; `facts` are of the scan, by name, `light` of a view."""
+    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
+    return TrialTable((), "psnr", prepared.length_unit, machine(), known, scan.command, light=light)
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:

@@ -15,8 +15,8 @@ from beamline.core.files import REPORT
 from beamline.core.sinks import Warn
 from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.front import colour_of, scale
+from beamline.features.trials.launch import ComparedScan, opened_scan
 from beamline.features.trials.layout import Figure, Planned, TableLayout, known
-from beamline.features.trials.runner import ComparedScan, opened_scan
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewChoice, ViewSet
 from beamline.projections.prepared import PreparedProjections

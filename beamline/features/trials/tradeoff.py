@@ -19,11 +19,10 @@ from beamline.core.events import TradeoffStarted
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
 from beamline.energies import EnergyScans, prepare_energies, views_of
-from beamline.features.trials.forecast import Expected, expected_seconds
 from beamline.features.trials.front import TRADEOFF
-from beamline.features.trials.launch import TrialData
+from beamline.features.trials.launch import ComparedScan, TrialData, opened_scan, table_of
 from beamline.features.trials.layout import Planned
-from beamline.features.trials.runner import ComparedScan, opened_scan, table_of
+from beamline.features.trials.runner import Expected, expected_seconds
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.prepared import PreparedProjections, hold_out, with_views_held_out
 from beamline.reconstruct.outcome import facts_of

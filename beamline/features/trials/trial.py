@@ -11,7 +11,7 @@ import numpy as np
 
 from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
-from beamline.projections.scan_statistics import Light, dose_scale
+from beamline.projections.scan_statistics import Light
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
 
@@ -269,9 +269,12 @@ class TrialTable:
     @property
     def dose(self) -> TrialCost:
         """The dose as a cost. Each frame of the scan that several views share is counted once."""
-        a_frame, axis = dose_scale(self.light)
-        unit = "frames" if self.light is None else "photons" if self.light.gray is None else "Gy"
-        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.frames), unit)
+        light, scale, axis, unit = self.light, 1.0, "dose: frames that were exposed", "frames"
+        if light is not None and light.gray is None:
+            scale, axis, unit = light.photons, "photons a pixel in the open beam", "photons"
+        elif light is not None and light.gray is not None:
+            scale, axis, unit = light.gray, f"dose in {light.material} (Gy)", "Gy"
+        return TrialCost("dose", "dose", axis, scale, lambda outcome: float(outcome.trial.frames), unit)
 
     @property
     def compared(self) -> tuple[Outcome, ...]:

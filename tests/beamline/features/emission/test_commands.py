@@ -14,8 +14,8 @@ import pytest
 import recon
 from beamline.core.errors import DataError
 from beamline.core.quantities import VoxelKind
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan, run_comparison
+from beamline.features.trials.launch import ComparedScan, TrialData
+from beamline.features.trials.runner import run_comparison
 from beamline.features.trials.tradeoff import planned_tradeoff, split
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice

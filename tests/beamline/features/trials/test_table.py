@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.machine import machine
-from beamline.features.trials.forecast import Timed, trials_left
 from beamline.features.trials.front import conclusions
+from beamline.features.trials.runner import Timed, trials_left
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time, quick_first
 from beamline.features.trials.trial import LEAST_GAIN, MEMORY, TIME, Outcome, Trial, TrialTable, front, rounded
 from recon.base.method import BoundedMethod

@@ -15,8 +15,7 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.energies import EnergyScans, read_spectra
 from beamline.features.trials import runner
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan
+from beamline.features.trials.launch import ComparedScan, TrialData
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.selection import Selection
