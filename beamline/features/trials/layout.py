@@ -6,8 +6,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -60,26 +58,20 @@ class Figure:
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column of a table.
+    """How a value is shown on the page and in the text.
 
     Attributes:
-        name: in CSV and JSON.
-        value: plain, or None where it is not known.
-        heading: on the page; empty: neither there nor in the text.
-        short: in the text, `width` characters wide; 0: the last column, as wide as it needs.
+        short: heading in the text, `width` characters wide; 0: the last column, as wide as it needs.
         words: a value that is known, of a trial that is done, as text.
     """
 
-    name: str
-    value: Callable[[Outcome], Any]
-    heading: str = ""
-    short: str = ""
+    heading: str
+    short: str
     width: int = 8
     words: Callable[[Any], str] = str
 
-    def shown(self, outcome: Outcome) -> str:
+    def cell(self, value: Any) -> str:
         """The value as text."""
-        value = self.value(outcome)
         return "–" if value is None else self.words(value)
 
 
@@ -151,41 +143,47 @@ def known(table: TrialTable, figures: Mapping[str, Figure]) -> dict[str, Figure]
     return {name: each for name, each in figures.items() if each.metric in metrics}
 
 
-def columns(table: TrialTable, layout: TableLayout) -> list[TableColumn]:
-    """What is known of every row, the settings that any trial has and the facts of any choice of views among it."""
-    settings = dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings)
-    facts = dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.facts)
-    timed, light = table.timed, table.light
-    doses = {} if light is None else light.of(1)
-    return [
-        TableColumn("row", lambda o: (o.trial.choice or o.trial).label),
-        *(TableColumn(name, attrgetter(f"trial.{name}"))
-          for name in ("group", "method", "views", "binning", "window", "frames")),
-        *(TableColumn(name, partial(_item, "settings", name)) for name in settings),
-        *(TableColumn(name, partial(_dose, each)) for name, each in doses.items()),
-        *(TableColumn(name, partial(_item, "facts", name), name, name, 11, "{:.4g}".format) for name in facts),
-        TableColumn("status", attrgetter("status")),
-        TableColumn("seconds_asked", attrgetter("trial.seconds_asked"), "s asked" * (timed and not layout.front),
-                    "s asked", words="{:g}".format),
-        TableColumn("seconds", attrgetter("seconds"), "s" * (timed or layout.front), "s", words=time_text),
-        TableColumn("cpu_seconds", attrgetter("cpu_seconds"), "CPU s", "CPU s", words=time_text),
-        TableColumn("reached", attrgetter("reached"), "reached" * timed, "reached", 0),
-        TableColumn("peak_bytes", attrgetter("peak_bytes"), "MB" * layout.front, "MB", 6, lambda n: f"{n / 1e6:.0f}"),
-        TableColumn("gaussians_end", attrgetter("gaussians")),
-        *(TableColumn(name, each.of, (each.heading or each.short).format(table.length_unit), each.short,
-                      max(9, len(each.short) + 2), each.words)
-          for name, each in known(table, layout.figures).items()),
-        TableColumn("quality_db", lambda o: o.quality(table.by)),
-        TableColumn("message", attrgetter("message")),
-    ]  # fmt: skip
+def columns(table: TrialTable, layout: TableLayout) -> dict[str, TableColumn]:
+    """What is shown of every row, by name as in `values_of`."""
+    facts, timed = dict.fromkeys(name for o in table.outcomes for name in o.trial.facts), table.timed
+    shown = {
+        **{name: TableColumn(name, name, 11, "{:.4g}".format) for name in facts},
+        "seconds_asked": TableColumn("s asked" * (timed and not layout.front), "s asked", words="{:g}".format),
+        "seconds": TableColumn("s" * (timed or layout.front), "s", words=time_text),
+        "cpu_seconds": TableColumn("CPU s", "CPU s", words=time_text),
+        "peak_bytes": TableColumn("MB" * layout.front, "MB", 6, lambda n: f"{n / 1e6:.0f}"),
+        **{name: TableColumn((each.heading or each.short).format(table.length_unit), each.short,
+                             max(9, len(each.short) + 2), each.words)
+           for name, each in known(table, layout.figures).items()},
+        "reached": TableColumn("reached" * timed, "reached", 0),
+    }  # fmt: skip
+    return {name: column for name, column in shown.items() if column.heading}
 
 
-def _item(of: str, name: str, outcome: Outcome) -> Any:
-    return getattr(outcome.trial, of).get(name)
+def values_of(table: TrialTable, layout: TableLayout, outcome: Outcome) -> dict[str, Any]:
+    """All that is known of a row, by name; None where it is not known of this one, but of another."""
+    trial, light = outcome.trial, table.light
+    every = [each.trial for each in table.outcomes]
+    return {
+        "row": (trial.choice or trial).label,
+        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "window", "frames")},
+        **{name: trial.settings.get(name) for each in every for name in each.settings},
+        **({} if light is None else light.of(trial.frames)),
+        **{name: trial.facts.get(name) for each in every for name in each.facts},
+        "status": outcome.status,
+        "seconds_asked": trial.seconds_asked,
+        **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "reached", "peak_bytes")},
+        "gaussians_end": outcome.gaussians,
+        **{name: each.of(outcome) for name, each in known(table, layout.figures).items()},
+        "quality_db": outcome.quality(table.by),
+        "message": outcome.message,
+    }
 
 
-def _dose(of_a_frame: float, outcome: Outcome) -> float:
-    return of_a_frame * outcome.trial.frames
+def cells(table: TrialTable, layout: TableLayout, outcome: Outcome) -> list[str]:
+    """What is shown of a row, as text."""
+    values = values_of(table, layout, outcome)
+    return [column.cell(values[name]) for name, column in columns(table, layout).items()]
 
 
 def time_text(seconds: float) -> str:
@@ -205,7 +203,7 @@ def status_text(outcome: Outcome) -> str:
 
 def text(table: TrialTable, layout: TableLayout) -> str:
     """The table for people; * marks the rows that stand out."""
-    shown = sorted((each for each in columns(table, layout) if each.heading), key=lambda each: not each.width)
+    shown = columns(table, layout).values()
     width, marked = max(len(outcome.trial.label) for outcome in table.outcomes), layout.marked(table)
 
     def row(mark: str, label: str, cells: Sequence[str]) -> str:
@@ -217,7 +215,7 @@ def text(table: TrialTable, layout: TableLayout) -> str:
     for outcome in table.outcomes:
         if outcome.status == "done":
             mark = "*" if outcome in marked else " "
-            lines.append(row(mark, outcome.trial.label, [each.shown(outcome) for each in shown]))
+            lines.append(row(mark, outcome.trial.label, cells(table, layout, outcome)))
         else:
             lines.append(f"  {outcome.trial.label}  {status_text(outcome)}")
     legends = [f"{each.short}: {each.legend}" for each in known(table, layout.figures).values() if each.legend]
@@ -250,8 +248,7 @@ def write_table(folder: Path, table: TrialTable, layout: TableLayout) -> None:
 
 def records(table: TrialTable, layout: TableLayout) -> list[dict[str, Any]]:
     """The values of each row by the names of its columns; None where they are not known."""
-    every = columns(table, layout)
-    return [finite({each.name: each.value(outcome) for each in every}) for outcome in table.outcomes]
+    return [finite(values_of(table, layout, outcome)) for outcome in table.outcomes]
 
 
 def to_csv(table: TrialTable, layout: TableLayout) -> str:
@@ -270,7 +267,7 @@ def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: Sli
 
 def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture]) -> str:
     """The table and its pictures as an HTML page."""
-    shown, marked = [each for each in columns(table, layout) if each.heading], layout.marked(table)
+    marked = layout.marked(table)
     counts = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(
         "trials.html",
@@ -278,12 +275,12 @@ def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture])
         summary=f"{layout.question} {counts}".strip(),
         sentences=layout.sentences(table),
         pictures=pictures,
-        columns=[each.heading for each in shown],
+        columns=[each.heading for each in columns(table, layout).values()],
         rows=[
             {
                 "label": outcome.trial.label,
                 "marked": outcome in marked,
-                "cells": [each.shown(outcome) for each in shown] if outcome.status == "done" else [],
+                "cells": cells(table, layout, outcome) if outcome.status == "done" else [],
                 "reason": status_text(outcome),
             }
             for outcome in table.outcomes
