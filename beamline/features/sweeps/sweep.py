@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
@@ -296,9 +297,9 @@ def _changes_most(images: Sequence[NDArray[np.float32]]) -> tuple[slice, slice]:
     shape = images[0].shape
     if max(shape) <= _CROP or any(image.shape != shape for image in images):
         return slice(None), slice(None)
-    spread = np.ptp(np.stack(images), axis=0)
-    total = np.pad(spread.cumsum(axis=0, dtype=np.float64).cumsum(axis=1), ((1, 0), (1, 0)))
-    rows, cols = (min(_CROP, n) for n in shape)
-    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
-    y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
-    return slice(int(y), int(y) + rows), slice(int(x), int(x) + cols)
+    size = tuple(min(_CROP, n) for n in shape)
+    sums = ndimage.uniform_filter(np.ptp(np.stack(images), axis=0), size, mode="constant")
+    whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]  # squares in the slice
+    at = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
+    rows, cols = (slice(int(first), int(first) + n) for first, n in zip(at, size, strict=True))
+    return rows, cols

@@ -10,6 +10,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
+from pydantic_core import to_jsonable_python
+
 from beamline.core.events import Event, TrialDone
 from beamline.core.files import write_whole
 from beamline.core.installed import version
@@ -241,14 +243,15 @@ def write_table(folder: Path, table: TrialTable, layout: TableLayout) -> None:
         "trials": [outcome.as_record() for outcome in table.outcomes],
         **{f"front_{cost.name}": [table.compared[i].trial.label for i in table.front(cost)] for cost in (TIME, MEMORY)},
     }
-    words = json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False)
+    words = json.dumps(to_jsonable_python(record, inf_nan_mode="null"), indent=1, ensure_ascii=False)
     write_whole(folder / f"{layout.name}.json", words, replace=True)
     write_whole(folder / f"{layout.name}.csv", to_csv(table, layout), replace=True)
 
 
 def records(table: TrialTable, layout: TableLayout) -> list[dict[str, Any]]:
     """The values of each row by the names of its columns; None where they are not known."""
-    return [finite(values_of(table, layout, outcome)) for outcome in table.outcomes]
+    values = [values_of(table, layout, outcome) for outcome in table.outcomes]
+    return list(to_jsonable_python(values, inf_nan_mode="null"))
 
 
 def to_csv(table: TrialTable, layout: TableLayout) -> str:
@@ -299,12 +302,3 @@ def event_of(table: TrialTable, layout: TableLayout, n: int, of: int, outcome: O
     return TrialDone(
         n, of, label, outcome.status, outcome.seconds, outcome.message, quality, outcome.peak_bytes, figures
     )
-
-
-def finite(value: Any) -> Any:
-    """Plain values for JSON and CSV; numbers that are not finite become None."""
-    if isinstance(value, Mapping):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
