@@ -24,13 +24,14 @@ from beamline.core.sinks import Warn
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.scan_statistics import Light, LightAsked, light_in
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.outcome import facts_of
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32, F64, I64
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 from recon.base.method import Energies
 from recon.base.volume import Grid
@@ -39,6 +40,7 @@ from recon.prep.counts import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
+_HELD_OUT_VIEWS = 16  # at most
 _SMALL = 4096  # bytes of a file that is read at once
 
 
@@ -153,8 +155,12 @@ class ComparedScan:
     command: str = ""
 
 
-def opened_scan(asked: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable]:
+def opened_scan(asked: ComparedScan, warn: Warn, without_truth: str = "") -> tuple[TrialData, TrialTable]:
     """Read and correct the views, after all inputs were checked; the table has no trials yet.
+
+    Args:
+        without_truth: advice how to do without views held out, which judge all trials where there is no truth; empty:
+            none are held out.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -165,6 +171,8 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable]
     with asked.source.open() as source:
         light, facts = light_in(source, asked.light), dict(facts_of(source).table)
         prepared = prepare_projections(source, asked.selection, warn).without_warnings
+    if without_truth and truth_given is None:
+        prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice=without_truth)
     grid, truth = Grid.matching(prepared.geometry), None
     if truth_given is not None:
         truth = fit_truth(truth_given, grid, asked.selection.binning).data
@@ -194,19 +202,15 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
     angles = prepared.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
     geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
-    if prepared.emission is not None:
-        emission = prepared.emission.summed(groups, geometry)
+    emission = None if prepared.emission is None else prepared.emission.summed(groups, geometry)
+    weights: F32 | None = whole.weights
+    if emission is not None:
         lines, weights = weighted_lines(emission)
-        return replace(
-            middle,
-            projections=replace(middle.projections, data=lines, weights=weights),
-            geometry=geometry,
-            emission=emission,
-        )
-    counted = whole.weights
-    least = None if counted is None else np.stack([counted[group].min(axis=0) for group in groups])
-    means = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
-    return replace(middle, projections=replace(middle.projections, data=means, weights=least), geometry=geometry)
+    else:
+        lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
+        weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
+    means = replace(middle.projections, data=lines, weights=weights)
+    return replace(middle, projections=means, geometry=geometry, emission=emission)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:

@@ -24,10 +24,10 @@ from beamline.features.trials.launch import ComparedScan, TrialData, opened_scan
 from beamline.features.trials.layout import Planned
 from beamline.features.trials.runner import Expected, expected_seconds
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
-from beamline.projections.prepared import PreparedProjections, hold_out, with_views_held_out
+from beamline.projections.prepared import with_views_held_out
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.plan import times_of
-from recon.base.arrays import F32
+from recon.base.empirical import ONE_IN
 from recon.base.kernel import Kernel
 from recon.base.method import Plain
 from recon.features.joint.methods import EnergySeries
@@ -39,8 +39,6 @@ from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
 
-_HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
-_HELD_OUT_VIEWS = 16  # at most
 _WITH_JOINT = ("fbp", "fista-tv", "r2")  # beside joint fits, where no methods are named
 _LEAST_OF_PART = 6  # views
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
@@ -85,8 +83,7 @@ Comparison = tuple[TrialData, TrialTable, Sequence[Trial]]
 
 
 def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
-    data, table = opened_scan(scan, warn)
-    data = split(data.prepared, data.truth)
+    data, table = opened_scan(scan, warn, "give --truth")
     n, start = data.geometry.n_views, default_count(data.geometry, data.geometry.sample_pitch)
     methods = scan.methods or names_compared(data.prepared.emission is not None)
     trials = (
@@ -97,21 +94,9 @@ def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
     return data, replace(table, scan={**table.scan, "views used": str(n)}), trials
 
 
-def split(prepared: PreparedProjections, truth: F32 | None) -> TrialData:
-    """The views that trials use, and the views held out that judge all trials if there is no truth.
-
-    Raises:
-        ConfigError: too few views to hold some out.
-    """
-    if truth is None:
-        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
-    return TrialData(prepared, truth)
-
-
 def _in_time(scan: ComparedScan, volumes: int, warn: Warn) -> Comparison:
-    data, table = opened_scan(scan, warn)
-    held = hold_out(data.prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="leave out --time")
-    n = held.geometry.n_views
+    data, table = opened_scan(scan, warn, "leave out --time")
+    held, n = data.prepared, data.geometry.n_views
     if held.emission is not None:
         raise ConfigError(f"--time: {scan.source.path} is of an emission. Leave it out. Nothing was written.")
     try:
@@ -140,7 +125,7 @@ def _of_energies(scan: ComparedScan, scans: EnergyScans, states: Sequence[str], 
     weighted = replace(prepared.projections, weights=views.weight)  # also of the views held out
     prepared = replace(prepared, projections=weighted, shares=None)
     energies = len(views.cross_sections)
-    unseen = np.flatnonzero(views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2)
+    unseen = np.flatnonzero(views.parted(ONE_IN) == ONE_IN // 2)
     data = TrialData(with_views_held_out(prepared, unseen), None, views.energy[unseen].astype(np.float64))
     geometry, used = data.geometry, data.geometry.n_views
     start = default_count(geometry, geometry.sample_pitch)
