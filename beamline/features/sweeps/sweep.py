@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -154,9 +155,8 @@ def sweep_slices(
     progress(0, len(trials))
     for n, (values, options) in enumerate(trials, 1):
         asked, source_words = options.selection, repr(options.source)
-        wanted = asked
-        if of_axes or (asked.axis_col is None and source_words == first):
-            wanted = replace(asked, axis_col=axis)
+        its_own = not of_axes and (asked.axis_col is not None or source_words != first)
+        wanted = asked if its_own else replace(asked, axis_col=axis)
         if selected != (source_words, wanted):
             with options.source.open() as source:
                 views = prepare_projections(source, wanted, warn)
@@ -213,9 +213,7 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
     compared with them as every value corrects them, and the mean counts.
     """
     shapes = {each.projected.shape[1:] for each in slices}
-    common = slices[0].ids
-    for each in slices[1:]:
-        common = np.intersect1d(common, each.ids)
+    common = reduce(np.intersect1d, (each.ids for each in slices))
     if len(shapes) > 1 or not common.size:
         return None
     judges = {id(each.views): each for each in reversed(slices)}.values()  # one resolution for all geometries
