@@ -183,15 +183,6 @@ class Light:
         return out
 
 
-def dose_scale(light: Light | None) -> tuple[float, str]:
-    """The dose per frame in gray, photons or frames, and the label of such an axis in a picture."""
-    if light is None:
-        return 1.0, "dose: frames that were exposed"
-    if light.gray is None:
-        return light.photons, "photons a pixel in the open beam"
-    return light.gray, f"dose in {light.material} (Gy)"
-
-
 def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightAsked) -> Light:
     """Light and dose of a view, from the statistics of flats and darks.
 

@@ -102,23 +102,18 @@ def fourier_shell_correlation(
         mask: weights [z, y, x], such as `soft_cylinder`; None: all 1.
 
     Raises:
-        ValueError: for shapes that differ, fewer than 4 voxels along the longest axis, values that are not finite, or
-            spacings that are not positive. Also for a volume that is constant under the mask.
+        ValueError: for fewer than 4 voxels along the longest axis, values that are not finite, or a volume that is
+            constant under the mask.
     """
-    if first.shape != second.shape or first.ndim != 3:
-        raise ValueError(f"two volumes [z, y, x] of one shape are needed, got {first.shape} and {second.shape}")
-    if mask is not None and mask.shape != first.shape:
-        raise ValueError(f"the mask has shape {mask.shape}, the volumes {first.shape}")
     shape: tuple[int, int, int] = first.shape
     edges = np.broadcast_to(np.asarray(spacing, np.float64), (3,))
-    if not (np.isfinite(edges) & (edges > 0)).all():
-        raise ValueError(f"voxel edges must be positive lengths, got {spacing}")
     if max(shape) < 4:
         raise ValueError(f"volumes of {shape} voxels have no shells to compare")
     width = 1 / float(max(n * edge for n, edge in zip(shape, edges, strict=True)))
     nyquist = float(min(0.5 / edge for n, edge in zip(shape, edges, strict=True) if n > 1))
     shells = max(1, int(np.floor(nyquist / width + 1e-9)))
-    spectra = _spectrum(first, mask), _spectrum(second, mask)
+    weights = np.ones(shape) if mask is None else mask
+    spectra = _spectrum(first, weights), _spectrum(second, weights)
     cross, one, other, voxels = _sums_of_shells(*spectra, shape, edges, width, shells)
     power = np.sqrt(one * other)
     correlation = np.divide(cross, power, out=np.full(shells + 1, np.nan), where=power > 0)
@@ -127,7 +122,7 @@ def fourier_shell_correlation(
     return ShellCorrelation(
         frequency=np.float64(width) * np.arange(shells + 1, dtype=np.float64)[used],
         correlation=np.clip(correlation[used], -1, 1),
-        independent=np.maximum(1.0, voxels[used] * _independent_share(mask)),
+        independent=np.maximum(1.0, voxels[used] * _independent_share(weights)),
         nyquist=nyquist,
     )
 
@@ -161,14 +156,12 @@ def _sums_of_shells(
     return sums
 
 
-def _spectrum(volume: NDArray[np.floating], mask: NDArray[np.floating] | None) -> NDArray[np.complex64]:
+def _spectrum(volume: NDArray[np.floating], mask: NDArray[np.floating]) -> NDArray[np.complex64]:
     """Fourier transform [z, y, x // 2 + 1] of the masked volume, without its mean, scaled to a maximum of 1."""
     data = np.asarray(volume, np.float64)
     if not np.isfinite(data).all():
         raise ValueError(f"{int((~np.isfinite(data)).sum())} of {data.size} voxels are not finite")
-    data = data - (data.mean() if mask is None else np.average(data, weights=mask))
-    if mask is not None:
-        data = data * mask
+    data = (data - np.average(data, weights=mask)) * mask
     scale = float(np.abs(data).max())
     # A constant without its mean is rounding noise, which has no meaningful correlation.
     if scale <= 1e-12 * max(float(np.abs(volume).max()), 1e-300):
@@ -176,13 +169,11 @@ def _spectrum(volume: NDArray[np.floating], mask: NDArray[np.floating] | None) -
     return np.asarray(fft.rfftn((data / scale).astype(np.float32), workers=-1), np.complex64)
 
 
-def _independent_share(mask: NDArray[np.floating] | None) -> float:
+def _independent_share(mask: NDArray[np.floating]) -> float:
     """Fraction of the Fourier values of masked noise that are independent: (Σ w²)² / (N Σ w⁴).
 
     By Parseval the cross term of two noises over all frequencies scatters as sqrt(Σ w⁴), against a bound of Σ w².
     Within one thin shell slightly more are independent, so thresholds are a little too strict, never too lax.
     """
-    if mask is None:
-        return 1.0
     square = np.asarray(mask, np.float64) ** 2
     return float(square.sum() ** 2 / (square.size * (square**2).sum()))

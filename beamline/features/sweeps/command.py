@@ -169,20 +169,20 @@ def _run(
         except KeyboardInterrupt:
             if not slices:
                 raise
-        rows, direct = cut[0].selection.rows, cut[0].method.traits.direct
+        slab, direct = cut[0].selection.rows, cut[0].method.traits.direct
         scores = scores_of(slices, direct=direct)
         for sentence in _remarks(slices, scores, options, direct=direct):
             answer.warn(sentence)
-        where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
+        where = "" if slab is None else f", row {sum(slab) // 2}"
         title = f"{Path(cut[0].source.path).name}{where}, {slices[0].views.geometry.n_views} views"
-        table = _rows(slices, scores, ("residual_held_out", "verdict", "seconds"), (".6g", "", ".3g"))
-        write_whole(path.with_suffix(".csv"), csv_text(table))
+        rows, names = _rows(slices, scores), [*slices[0].values]
+        write_whole(path.with_suffix(".csv"), csv_text([[*names, "residual_held_out", "verdict", "seconds"], *rows]))
         write_whole(path, sweep_sheet(slices, scores, options, title))
         best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
         means = None if scores is None else scores.shares.tolist()
         facts = {"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means}
-        lines = _rows(slices, scores, (METRICS["residual_held_out"].label, "", "s"), (".5g", "-", ".2g"))
-        answer.done(facts, aligned(lines, ">"), f"sheet     {path}", f"table     {facts['table']}")
+        lines = aligned([[*names, METRICS["residual_held_out"].label, "", "s"], *rows], ">")
+        answer.done(facts, lines, f"sheet     {path}", f"table     {facts['table']}")
     return slices, scores
 
 
@@ -216,27 +216,13 @@ def _remarks(
     return remarks
 
 
-def _verdict(scores: Scores | None, n: int) -> str:
-    if scores is None or not scores.alike[n]:
-        return ""
-    return "best" if n == scores.best else "alike"
-
-
-def _rows(
-    slices: Sequence[SweptSlice], scores: Scores | None, heading: tuple[str, str, str], digits: tuple[str, str, str]
-) -> list[list[str]]:
-    """A heading, then of each slice: values, residual of views held out, whether it is the best or not significantly
-    different from it, and seconds.
-
-    Args:
-        digits: of the residual, what stands for an unknown one, digits of the seconds.
-    """
-    residual, unknown, seconds = digits
-    known = [unknown] * len(slices) if scores is None else [f"{share:{residual}}" for share in scores.shares]
-    return [[*slices[0].values, *heading]] + [
-        [*each.values.values(), known[n], _verdict(scores, n), f"{each.seconds:{seconds}}"]
-        for n, each in enumerate(slices)
-    ]
+def _rows(slices: Sequence[SweptSlice], scores: Scores | None) -> list[list[str]]:
+    """Of each slice: values, residual of views held out, whether it is the best or not significantly different from
+    it, and seconds."""
+    judged = [("", "")] * len(slices)
+    if scores is not None:
+        judged = [(f"{share:.6g}", verdict) for share, verdict in zip(scores.shares, scores.verdicts, strict=True)]
+    return [[*each.values.values(), *words, f"{each.seconds:.3g}"] for each, words in zip(slices, judged, strict=True)]
 
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:

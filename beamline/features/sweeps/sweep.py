@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
@@ -98,12 +100,13 @@ class Scores:
         return None if flat else int(np.argmin(self.shares))
 
     @property
-    def alike(self) -> list[bool]:
-        """Which slices do not differ significantly from the best; the best is one of them."""
+    def verdicts(self) -> list[str]:
+        """[slice] "best"; "alike": it does not differ significantly from the best one; or empty."""
         if self.best is None:
-            return [False] * len(self.residuals)
-        best = self.residuals[self.best]
-        return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
+            return [""] * len(self.residuals)
+        more = self.residuals - self.residuals[self.best]
+        words = ["" if beyond_chance(each, 1.0) else "alike" for each in more]
+        return [*words[: self.best], "best", *words[self.best + 1 :]]
 
 
 def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
@@ -152,9 +155,8 @@ def sweep_slices(
     progress(0, len(trials))
     for n, (values, options) in enumerate(trials, 1):
         asked, source_words = options.selection, repr(options.source)
-        wanted = asked
-        if of_axes or (asked.axis_col is None and source_words == first):
-            wanted = replace(asked, axis_col=axis)
+        its_own = not of_axes and (asked.axis_col is not None or source_words != first)
+        wanted = asked if its_own else replace(asked, axis_col=axis)
         if selected != (source_words, wanted):
             with options.source.open() as source:
                 views = prepare_projections(source, wanted, warn)
@@ -211,9 +213,7 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
     compared with them as every value corrects them, and the mean counts.
     """
     shapes = {each.projected.shape[1:] for each in slices}
-    common = slices[0].ids
-    for each in slices[1:]:
-        common = np.intersect1d(common, each.ids)
+    common = reduce(np.intersect1d, (each.ids for each in slices))
     if len(shapes) > 1 or not common.size:
         return None
     judges = {id(each.views): each for each in reversed(slices)}.values()  # one resolution for all geometries
@@ -234,6 +234,7 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
 
 
 _COLUMNS, _CURVE = 4, 2.2  # pictures in a row; inches
+_COLOURS = {"best": "tab:red", "alike": "tab:orange", "": "black"}  # of frames and points, by verdict
 _CROP = 200  # pixels a side: of larger slices the part is shown that changes most, in proportion to its values
 
 
@@ -257,36 +258,30 @@ def sweep_sheet(
     panels = figure.add_gridspec(1 + down, across, height_ratios=[max(curve, 0.01), *[height] * down])
     if scores is not None and curve:
         _draw_curve(figure.add_subplot(panels[0, :]), slices, scores, options[0])
+    verdicts = [""] * len(slices) if scores is None else scores.verdicts
     for n, (each, image) in enumerate(zip(slices, images, strict=True)):
         axes = figure.add_subplot(panels[1 + n // across, n % across])
         show_grey(axes, image, window)
         axes.set(xticks=[], yticks=[])
         if n == 0:
             axes.set(xlabel="x →", ylabel="← y")
-        colour = _colour(scores, n)
+        colour = _COLOURS[verdicts[n]]
         words = ", ".join(f"{name} {value}" for name, value in each.values.items())
-        words = words if scores is None else f"{words}\n{scores.shares[n]:.5g}"
-        axes.set_title(words, fontsize=7, color=colour)
+        score = "" if scores is None else f"\n{scores.shares[n]:.5g}"
+        axes.set_title(words + score, fontsize=7, color=colour)
         for side in axes.spines.values():
             side.set(color=colour, linewidth=0.8 if colour == "black" else 2.5)
     return png(figure)
 
 
-def _colour(scores: Scores | None, n: int) -> str:
-    if scores is None or not scores.alike[n]:
-        return "black"
-    return "tab:red" if n == scores.best else "tab:orange"
-
-
 def _draw_curve(axes: Axes, slices: Sequence[SweptSlice], scores: Scores, option: SweptOption) -> None:
     numbers = option.numbers[: len(slices)]
     at = numbers or range(len(slices))
-    spread = min(numbers) > 0 and max(numbers) / min(numbers) > 30 if numbers else False
     axes.plot(at, scores.shares, "o-", ms=3, lw=1, color="tab:blue")
-    for n, place in enumerate(at):
-        if scores.alike[n]:
-            axes.plot([place], [scores.shares[n]], "o", color=_colour(scores, n), ms=7)
-    if numbers and spread:
+    for place, share, verdict in zip(at, scores.shares, scores.verdicts, strict=True):
+        if verdict:
+            axes.plot([place], [share], "o", color=_COLOURS[verdict], ms=7)
+    if numbers and min(numbers) > 0 and max(numbers) / min(numbers) > 30:
         axes.set_xscale("log")
     if not numbers:
         axes.set_xticks(range(len(slices)), option.values[: len(slices)])
@@ -300,9 +295,9 @@ def _changes_most(images: Sequence[NDArray[np.float32]]) -> tuple[slice, slice]:
     shape = images[0].shape
     if max(shape) <= _CROP or any(image.shape != shape for image in images):
         return slice(None), slice(None)
-    spread = np.ptp(np.stack(images), axis=0)
-    total = np.pad(spread.cumsum(axis=0, dtype=np.float64).cumsum(axis=1), ((1, 0), (1, 0)))
-    rows, cols = (min(_CROP, n) for n in shape)
-    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
-    y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
-    return slice(int(y), int(y) + rows), slice(int(x), int(x) + cols)
+    size = tuple(min(_CROP, n) for n in shape)
+    sums = ndimage.uniform_filter(np.ptp(np.stack(images), axis=0), size, mode="constant")
+    whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]  # squares in the slice
+    at = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
+    rows, cols = (slice(int(first), int(first) + n) for first, n in zip(at, size, strict=True))
+    return rows, cols

@@ -40,8 +40,8 @@ from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 
 if TYPE_CHECKING:
+    from beamline.features.trials.launch import ComparedScan
     from beamline.features.trials.layout import Plan, TableLayout
-    from beamline.features.trials.runner import ComparedScan
     from beamline.projections.scan_statistics import LightAsked
 
 
@@ -149,7 +149,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     from beamline.core.sinks import Warnings
     from beamline.energies import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
-    from beamline.features.trials.runner import ComparedScan
+    from beamline.features.trials.launch import ComparedScan
     from beamline.features.trials.tradeoff import planned_tradeoff
     from beamline.scan.energies import scans_of
 
@@ -189,9 +189,8 @@ def _compare(
 ) -> None:
     """Run a comparison and print its table, or print what it will take."""
     from beamline.core.durations import MachineSpeed
-    from beamline.features.trials.forecast import dry_run
     from beamline.features.trials.layout import text
-    from beamline.features.trials.runner import run_comparison
+    from beamline.features.trials.runner import dry_run, run_comparison
 
     with answering(as_json) as answer:
         if dry:
@@ -270,8 +269,8 @@ def study(request: StudyRequest) -> None:
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.study import StudyOptions, layout_of, planned_study
+    from beamline.features.trials.launch import ComparedScan
+    from beamline.features.trials.study import layout_of, planned_study
 
     methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
@@ -283,6 +282,6 @@ def study(request: StudyRequest) -> None:
         source, selection, folder, methods, request.truth, _light(request), request.seconds, seed=request.seed,
         command=repeating(context, request.file, folder),
     )  # fmt: skip
-    options = StudyOptions(scan, STUDIES[request.which], settings, request.ramp, request.draws)
-    plan = partial(planned_study, options)
-    _compare(scan, layout_of(options.study), plan, dry=request.dry, as_json=request.as_json)
+    asked = STUDIES[request.which]
+    plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
+    _compare(scan, layout_of(asked), plan, dry=request.dry, as_json=request.as_json)

@@ -17,9 +17,8 @@ from beamline.config.load import load, plan_of, scene_mapping
 from beamline.core.errors import ConfigError
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan, table_of
-from beamline.features.trials.table import TrialTable
+from beamline.features.trials.launch import ComparedScan, TrialData, table_of
+from beamline.features.trials.trial import TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, ViewChoice
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import axis_col_of, scene_of
@@ -57,6 +56,11 @@ class DosePlan:
     frames_per_view: int = 1
     start: float = 0.0  # offset of the first view, in steps between views
 
+    @property
+    def label(self) -> str:
+        """Of its row."""
+        return f"{self.kind}: {self.views} views of {self.exposure:.3g} s"
+
 
 def plans_of(views: int, exposure: float, period: float) -> list[DosePlan]:
     """Plans with falling numbers of views and equal light in all of them; step scans as fast as the stage can."""
@@ -70,14 +74,6 @@ def plans_of(views: int, exposure: float, period: float) -> list[DosePlan]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Taken:
-    plan: DosePlan
-    prepared: PreparedProjections
-    seconds: float
-    truth: F32
-
-
-@dataclass(frozen=True, eq=False)
 class _Instrument:
     """The simulated instrument: its scene, in which motion blurs, and the first angle and the range in degrees."""
 
@@ -87,8 +83,12 @@ class _Instrument:
     span: float
     axis_col: float
 
-    def take(self, plan: DosePlan, warn: Warn) -> _Taken:
-        """Raises ConfigError where the instrument cannot take such a scan."""
+    def take(self, plan: DosePlan, warn: Warn, begun: int = 0) -> tuple[PreparedProjections, ViewChoice, F32]:
+        """The views, those of its row, the first of which has the number `begun`, and the truth [z, y, x].
+
+        Raises:
+            ConfigError: the instrument cannot take such a scan.
+        """
         start = self.start + plan.start * self.span / plan.views
         beam = {**self.scene["beam"], "photons_per_s": self.scene["beam"]["photons_per_s"] * plan.light}
         overrides = {
@@ -113,7 +113,13 @@ class _Instrument:
                 z, y, x = grid.centre
                 pitch = grid.spacing[0] / selection.binning
                 grid = replace(grid, centre=(z + (first + last - rows) / 2 * pitch, y, x))
-            return _Taken(plan, prepared, seconds, instrument.truth(grid).data)
+            truth = instrument.truth(grid).data
+        turning = math.radians(self.span) / plan.views / plan.period if plan.kind.startswith("fly") else 0.0
+        blur = abs(turning) * plan.exposure * prepared.geometry.reach / prepared.geometry.sample_pitch
+        photons = plan.views * plan.exposure * plan.light * self.scene["beam"]["photons_per_s"]
+        facts = {"exposure": plan.exposure, "light": plan.light, SCAN_TIME: seconds, DOSE: photons, "blur": blur}
+        views = [[begun + view] for view in range(prepared.geometry.n_views)]
+        return prepared, ViewChoice(plan.label, views, facts=facts, arc=prepared.geometry.width.arc), truth
 
 
 def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, Sequence[ViewChoice]]:
@@ -141,41 +147,31 @@ def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, 
     judges = DosePlan(
         "step", _JUDGES, planned.exposure, planned.period, 1.0, _JUDGES, start=0.382
     )  # of the golden ratio: no fraction
-    judge, taken, choices = instrument.take(judges, warn), list[_Taken](), list[ViewChoice]()
+    judge, _, truth = instrument.take(judges, warn)
+    taken, choices = list[tuple[DosePlan, PreparedProjections, ViewChoice]](), list[ViewChoice]()
 
     def take(plan: DosePlan) -> None:
-        label = f"{plan.kind}: {plan.views} views of {plan.exposure:.3g} s"
         try:
-            taken.append(instrument.take(plan, warn))
+            prepared, choice, _ = instrument.take(plan, warn, sum(each.n_views for _, _, each in taken))
         except ConfigError as error:
-            choices.append(ViewChoice(label, None, reason=str(error)))
-            return
-        begun = sum(each.prepared.geometry.n_views for each in taken[:-1])
-        choices.append(_choice(label, taken[-1], instrument, begun))
+            choices.append(ViewChoice(plan.label, None, reason=str(error)))
+        else:
+            taken.append((plan, prepared, choice))
+            choices.append(choice)
 
     for plan in plans_of(planned.n_views // planned.frames_per_view, planned.exposure, planned.period):
         take(plan)
-    flown = next((each.seconds for each in taken if each.plan.kind == "fly"), math.inf)
-    for each in [each for each in taken if each.plan.kind == "step"]:
-        exposure = each.plan.exposure - (each.seconds - flown) / each.plan.views
-        if _LEAST * each.plan.exposure <= exposure < each.plan.exposure:
-            take(replace(each.plan, kind="step, in the time of fly", exposure=exposure, period=exposure))
+    flown = next((choice.facts[SCAN_TIME] for plan, _, choice in taken if plan.kind == "fly"), math.inf)
+    for plan, _, choice in [each for each in taken if each[0].kind == "step"]:
+        exposure = plan.exposure - (choice.facts[SCAN_TIME] - flown) / plan.views
+        if _LEAST * plan.exposure <= exposure < plan.exposure:
+            take(replace(plan, kind="step, in the time of fly", exposure=exposure, period=exposure))
     if not taken:
         raise ConfigError(f"{scan.source.path}: no plan can be taken. {choices[-1].reason}")
-    prepared = joined([each.prepared for each in taken])
-    unseen = judge.prepared.projections.data, judge.prepared.geometry.seen_with(NO_WIDTH)
-    data = TrialData(replace(prepared, held_out=unseen), judge.truth)
+    prepared = joined([each for _, each, _ in taken])
+    unseen = judge.projections.data, judge.geometry.seen_with(NO_WIDTH)
+    data = TrialData(replace(prepared, held_out=unseen), truth)
     return data, table_of(scan, {"configuration": str(scan.source.path)}, prepared), choices
-
-
-def _choice(label: str, taken: _Taken, instrument: _Instrument, begun: int) -> ViewChoice:
-    plan, geometry = taken.plan, taken.prepared.geometry
-    turning = math.radians(instrument.span) / plan.views / plan.period if plan.kind.startswith("fly") else 0.0
-    blur = abs(turning) * plan.exposure * geometry.reach / geometry.sample_pitch
-    photons = plan.views * plan.exposure * plan.light * instrument.scene["beam"]["photons_per_s"]
-    facts = {"exposure": plan.exposure, "light": plan.light, SCAN_TIME: taken.seconds, DOSE: photons, "blur": blur}
-    views = [[begun + view] for view in range(geometry.n_views)]
-    return ViewChoice(label, views, facts=facts, arc=geometry.width.arc)
 
 
 def joined(parts: Sequence[PreparedProjections]) -> PreparedProjections:

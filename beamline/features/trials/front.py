@@ -1,119 +1,58 @@
-"""Front: how a trade-off is written: its columns, the Pareto front of quality and cost, and what follows from it."""
+"""Front: what follows from a trade-off: the Pareto front of quality and cost, as pictures and in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING
 
-from beamline.features.trials.figures import cost_curves, pareto_plot
-from beamline.features.trials.layout import TableColumn, TableLayout, in_digits
-from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
-from beamline.features.trials.trial import Outcome
-from beamline.projections.scan_statistics import Light
+import numpy as np
+
+from beamline.features.trials.layout import Figure, TableLayout
+from beamline.features.trials.trial import (
+    HELD_OUT,
+    LEAST_GAIN,
+    MEMORY,
+    QUALITIES,
+    TIME,
+    Outcome,
+    Trial,
+    TrialCost,
+    TrialTable,
+)
+from beamline.report.figures import one_panel, png
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.assess.time_model import duration_text
+from recon.methods import names
 
-
-@dataclass(frozen=True)
-class _Figure:
-    """How the tables name a metric. `{}` in `heading` and `legend` is the unit of length."""
-
-    short: str
-    heading: str
-    legend: str
-    shown: Callable[[float], str]
-
+if TYPE_CHECKING:
+    from matplotlib import figure as drawing
+    from matplotlib.axes import Axes
 
 _FIGURES = {
-    "psnr": _Figure("PSNR", "PSNR (dB)", "dB against the truth", partial(in_digits, "psnr")),
-    "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", partial(in_digits, "ssim3d")),
-    "rmse": _Figure("RMSE", "RMSE", "of the activity", partial(in_digits, "rmse")),
-    "signal_to_background": _Figure(
-        "S/B", "signal/background", "hot regions over the body", partial(in_digits, "recovery")
-    ),
-    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", partial(in_digits, "sbr_error")),
-    "recovery": _Figure(
-        "hot", "contrast recovery", "contrast of hot regions over the truth's", partial(in_digits, "recovery")
-    ),
-    "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", partial(in_digits, "spillover")),
-    "variation": _Figure(
-        "noise", "noise", "standard deviation of the body over its level", partial(in_digits, "variation")
-    ),
-    "residual_held_out": _Figure(
-        "held out", "held-out res.", METRICS["residual_held_out"].label, partial(in_digits, "residual_held_out")
-    ),
-    "resolution": _Figure(
-        "FSC",
-        "FSC ({})",
-        "period in {} to which two halves of the views agree",
-        lambda value: f"{value:.3g}" if math.isfinite(value) else "none",
-    ),
+    each.metric: each
+    for each in (
+        Figure("psnr", "PSNR", "PSNR (dB)", "dB against the truth"),
+        Figure("ssim3d", "SSIM", "SSIM 3D", "mean over the slices of three directions"),
+        Figure("rmse", "RMSE", "RMSE", "of the activity"),
+        Figure("signal_to_background", "S/B", "signal/background", "hot regions over the body"),
+        Figure("sbr_error", "S/B err", "its largest error", "of a hot region, relative"),
+        Figure("recovery", "hot", "contrast recovery", "contrast of hot regions over the truth's"),
+        Figure("spillover", "cold", "spillover", "level of cold regions over the body's"),
+        Figure("variation", "noise", "noise", "standard deviation of the body over its level"),
+        Figure("residual_held_out", "held out", "held-out res.", METRICS["residual_held_out"].label),
+        Figure("resolution", "FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
+    )
 }
-
 _NEAR = 1.0  # dB below the best figure: a tenth more error
 _FSC = (
     "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
     "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
     "at the slices."
 )
-
-
-def _columns(table: TrialTable) -> Sequence[TableColumn]:
-    settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
-    return [
-        *(TableColumn(name, attrgetter(f"trial.{name}")) for name in ("group", "method", "views", "binning")),
-        *(TableColumn(name, partial(_setting, name)) for name in settings),
-        TableColumn("status", lambda o: o.status),
-        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
-        TableColumn("seconds", lambda o: o.seconds, "s", "s", words=_time),
-        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", words=_time),
-        TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0),
-        TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, lambda n: f"{n / 1e6:.0f}"),
-        TableColumn("gaussians_end", lambda o: o.gaussians),
-        *dose_columns(table),
-        *(
-            TableColumn(
-                name,
-                partial(_metric, name),
-                figure.heading.format(table.length_unit),
-                figure.short,
-                9,
-                figure.shown,
-                metric=True,
-            )
-            for name, figure in _figures(table).items()
-        ),
-        TableColumn("quality_db", lambda o: o.quality(table.by)),
-        TableColumn("message", lambda o: o.message),
-    ]
-
-
-def _marked(table: TrialTable) -> set[int]:
-    best = {id(table.compared[i]) for i in table.front(TIME)}
-    return {n for n, outcome in enumerate(table.outcomes) if id(outcome) in best}
-
-
-def _legend(table: TrialTable) -> Sequence[str]:
-    figures = _figures(table).values()
-    words = "; ".join(f"{each.short}: {each.legend.format(table.length_unit)}" for each in figures)
-    return [*([f"{words}."] if words else []), "*: on the front of time and quality."]
-
-
-def _record(table: TrialTable) -> Mapping[str, Any]:
-    return {
-        "quality": table.by,
-        "length_unit": table.length_unit,
-        "trials": [outcome.as_record() for outcome in table.outcomes],
-        "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
-        "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
-    }
 
 
 def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
@@ -123,7 +62,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
     for cost in (TIME, MEMORY, *doses):
         if table.front(cost):
             caption = (
-                f"{table.quality.words} of every trial against its {cost.words}. The line is the best quality "
+                f"{QUALITIES[table.by][0]} of every trial against its {cost.words}. The line is the best quality "
                 "at each cost; its corners are the trials that no other beats in both."
             )
             picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
@@ -145,40 +84,6 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
     return pictures
 
 
-def dose_columns(table: TrialTable) -> list[TableColumn]:
-    """The dose of each trial, where the light is known."""
-    if (light := table.light) is None:
-        return []
-    return [TableColumn(name, partial(_dose, light, name)) for name in light.of(1)]
-
-
-def _dose(light: Light, name: str, outcome: Outcome) -> float:
-    return light.of(outcome.trial.frames)[name]
-
-
-def _setting(name: str, outcome: Outcome) -> Any:
-    return outcome.trial.settings.get(name)
-
-
-def _metric(name: str, outcome: Outcome) -> float | None:
-    return outcome.metrics.get(name)
-
-
-def _figures(table: TrialTable) -> dict[str, _Figure]:
-    """Of the metrics that any trial has."""
-    return {name: figure for name, figure in _FIGURES.items() if any(name in o.metrics for o in table.outcomes)}
-
-
-def _time(seconds: float) -> str:
-    """s to three significant digits in at most seven characters; whole ones from a hundred on."""
-    if not math.isfinite(seconds):
-        return "n/a"
-    if 0 < seconds < 1e-3:
-        return f"{seconds:.2e}".replace("e-0", "e-")
-    digits = 2 - math.floor(math.log10(seconds)) if seconds > 0 else 0
-    return f"{seconds:.{max(0, digits)}f}"
-
-
 def _duration(seconds: float) -> str:
     """A time to three significant digits, in µs, ms, or the units of `duration_text`."""
     for unit, name in ((1e-3, "µs"), (1.0, "ms")):
@@ -191,7 +96,7 @@ def conclusions(table: TrialTable) -> list[str]:
     """Sentences: the time of each further dB along the front."""
     compared, qualities, seconds = table.compared, table.qualities, table.costs(TIME)
     kept = table.front(TIME)
-    out = [f"Quality: {table.quality.words}, dB."]
+    out = [f"Quality: {QUALITIES[table.by][0]}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
     first, best, pick = compared[kept[0]], compared[kept[-1]], kept[worth_its_time(table) or 0]
@@ -203,7 +108,7 @@ def conclusions(table: TrialTable) -> list[str]:
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for i, j in pairwise(kept):
         rise, cost = qualities[j] - qualities[i], seconds[j] - seconds[i]
-        chance = f" ± {table.chance(j, i):.2f}" * table.quality.of_views
+        chance = f" ± {table.chance(j, i):.2f}" * (table.by == HELD_OUT)
         price = f"{_duration(cost)} more ({_duration(cost / rise)} a dB)"
         out.append(f"+{rise:.2f}{chance} dB for {price}: {compared[j].trial.label}.")
     out += _level(table, kept[-1])
@@ -239,14 +144,157 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
         [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],
         table.front(cost),
         cost.axis,
-        table.quality.axis,
+        QUALITIES[table.by][1],
         cost.unit,
         worth_its_time(table) if cost is TIME else None,
     )
 
 
 TRADEOFF = TableLayout(
-    "tradeoff", "tradeoff.html", "trials", "What accuracy costs", lambda outcome: (outcome.trial.label,), _columns,
-    conclusions, _record, _pictures, marked=_marked, legend=_legend,
-)  # fmt: skip
+    "tradeoff", "tradeoff.html", "trials", "What accuracy costs", _FIGURES, conclusions, _pictures, front=True
+)
 """The table of a trade-off, whose rows on the front of time and quality stand out."""
+
+
+_SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
+_APART = 16.0  # pixels between two numbers on the same side of their points, at least
+_MARKERS = {
+    "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
+    "loss": "X", "start": "*", "rectification": "h",
+    "parts": "s", "one fit": "D",
+}  # fmt: skip
+
+
+def pareto_plot(
+    points: Sequence[tuple[Trial, float, float]],
+    front: Sequence[int],
+    cost_label: str,
+    quality_label: str,
+    unit: str = "",
+    pick: int | None = None,
+) -> bytes:
+    """Quality against cost; the line is the best quality at each cost.
+
+    Args:
+        points: (trial, cost, dB); points that are not finite are left out.
+        front: positions of the points on the front, by rising cost.
+        cost_label, quality_label: with units.
+        unit: of the cost.
+        pick: number in `front` of the trial that is worth its cost, which gets a ring; None: of none.
+    """
+    figure, axes = one_panel(5.2 + 0.18 * len(front))
+    shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
+    kept = [points[i] for i in front]
+    for trial, cost, quality in shown:
+        # The trials that numbers name lie above those at the same place.
+        axes.scatter(
+            cost, quality, s=_size(trial.group), marker=_MARKERS.get(trial.group, "o"),
+            color=colour_of(trial.method), edgecolors="white", linewidths=0.6,
+            zorder=4 if (trial, cost, quality) in kept else 3,
+        )  # fmt: skip
+    axes.step([p[1] for p in kept], [p[2] for p in kept], where="post", color="black", lw=1.1, alpha=0.5, zorder=2)
+    scale(axes, [c for _, c, _ in shown])
+    axes.margins(x=0.08, y=0.1)
+    best = max((q for _, _, q in shown), default=0.0)
+    lowest = min([best - _SHOWN_DB, *(q - 0.5 for _, _, q in kept)])  # the front is drawn whole
+    below = [q for _, _, q in shown if q < lowest]
+    if below:
+        axes.set_ylim(bottom=lowest)
+        note = f"{len(below)} more below {lowest:.1f} dB"
+        axes.text(0.99, 0.02, note, transform=axes.transAxes, ha="right", fontsize=8, color="0.4")
+    _number(axes, [(cost, quality) for _, cost, quality in kept])
+    if pick is not None:
+        _, cost, quality = kept[pick]
+        axes.scatter(cost, quality, s=220, facecolors="none", edgecolors="black", linewidths=1.4, zorder=5)
+    axes.set(xlabel=cost_label, ylabel=quality_label)
+    axes.grid(alpha=0.25)
+    _legend(figure, axes, shown)
+    lines = [f"{n + 1}  {t.label}: {quality:.2f} dB, {cost:.3g} {unit}" for n, (t, cost, quality) in enumerate(kept)]
+    if pick is not None:
+        lines[pick] += "   (ring: best for its time)"
+    figure.supxlabel("\n".join(lines), fontsize=8, x=0.06, ha="left", linespacing=1.5)
+    return png(figure)
+
+
+def _number(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
+    """Number points from 1 on, to the left of each; to the right where that would hit the number before."""
+    before = None
+    for number, place in enumerate(places, start=1):
+        pixel = axes.transData.transform(place)
+        beside = before is not None and float(np.hypot(*(pixel - before))) < _APART
+        axes.annotate(
+            str(number), place, xytext=(7, -9) if beside else (-6, 5), textcoords="offset points",
+            ha="left" if beside else "right", fontsize=9, fontweight="bold",
+        )  # fmt: skip
+        before = None if beside else pixel
+
+
+def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
+    """The residual of each trial during its run, dB against s: solid for views held out, dashed for views used."""
+    figure, axes = one_panel(4.0)
+    for outcome in outcomes:
+        seconds, quality = np.array(outcome.curve).T
+        axes.plot(
+            seconds, quality, lw=1.4, color=colour_of(outcome.trial.method),
+            ls="-" if outcome.curve_of == "views held out" else "--",
+            label=f"{outcome.trial.method} ({outcome.curve_of})",
+        )  # fmt: skip
+    scale(axes, [seconds for outcome in outcomes for seconds, _ in outcome.curve])
+    axes.set(xlabel="time (s)", ylabel="residual (dB below the data)")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+    axes.grid(alpha=0.25)
+    return png(figure)
+
+
+def _size(group: str) -> float:
+    """Area of a marker, points²: a star looks smaller than other markers."""
+    return 90 if _MARKERS.get(group) == "*" else 46
+
+
+def scale(axes: Axes, costs: Sequence[float]) -> None:
+    """Make the axis of costs logarithmic if they differ by more than a factor of four."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    if not costs or min(costs) <= 0 or max(costs) < 4 * min(costs):
+        return
+    axes.set_xscale("log")
+    wide = max(costs) > 100 * min(costs)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0), numticks=20))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _legend(figure: drawing.Figure, axes: Axes, shown: Sequence[tuple[Trial, float, float]]) -> None:
+    methods = dict.fromkeys(t.method for t, _, _ in shown)
+    groups = dict.fromkeys("steps" if t.group == "iterations" else t.group for t, _, _ in shown)
+    handles = [
+        axes.scatter([], [], color=colour_of(m), s=40, label=m) for m in methods
+    ] + [
+        axes.scatter(
+            [], [], color="white", edgecolors="0.2", marker=_MARKERS.get(g, "o"), s=_size(g), label=_WORDS.get(g, g)
+        )
+        for g in groups
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside right upper", fontsize=8, frameon=False, title="method, varied setting")
+
+
+_WORDS = {
+    "method": "baseline", "steps": "steps, iterations", "views": "fewer views", "gaussians": "number of Gaussians",
+    "parts": "parts of the views", "one fit": "one fit of all views",
+}  # fmt: skip
+
+
+def colour_of(method: str) -> str:
+    """Of a method in pictures, as matplotlib takes it; a method without a line in `COLOURS` has one that is left."""
+    others = [name for name in names() if name not in COLOURS]
+    return COLOURS[method] if method in COLOURS else _SPARE[others.index(method) % len(_SPARE)]
+
+
+COLOURS: Mapping[str, str] = {
+    "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
+    "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
+    "pnp-dct": "maroon",
+    "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
+    "series": "darkgreen", "materials": "slateblue",
+}  # fmt: skip
+_SPARE = ("tab:pink", "black", "sienna", "steelblue", "olivedrab", "orchid")

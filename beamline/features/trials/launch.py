@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -18,20 +17,30 @@ from pydantic import TypeAdapter
 from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
-from beamline.core.files import named_on_failure
+from beamline.core.files import named_on_failure, refuse_existing, refuse_not_utf8
+from beamline.core.machine import machine
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.core.sinks import Warn
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.view_choices import ViewChoice
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.scan_statistics import Light, LightAsked, light_in
+from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.outcome import facts_of
+from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32, F64, I64
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 from recon.base.method import Energies
+from recon.base.volume import Grid
 from recon.prep.correct import Projections
 from recon.prep.counts import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
-_VALUES = "values.json"
+_HELD_OUT_VIEWS = 16  # at most
 _SMALL = 4096  # bytes of a file that is read at once
 
 
@@ -66,15 +75,8 @@ class TrialData:
             return energies.of_view.astype(np.float64)
         return np.zeros(self.geometry.n_views) if self.prepared.times is None else self.prepared.times
 
-    @property
-    def rays_held_out(self) -> F32 | None:
-        """Weights of the rays of the views held out; None: all alike."""
-        held_out = self.prepared.held_out
-        rays = None if held_out is None else self.prepared.ray_weights(held_out[1].n_views)
-        return None if rays is None else rays[self.geometry.n_views :]
-
     def save(self, folder: Path) -> None:
-        """Into a new folder: each array in a .npy file, numbers and words in one of JSON, without how it was prepared.
+        """Into a new folder: each array, number and word in a .npy file, without how the views were prepared.
 
         Files `reference.METHOD.npy` and `data.regions.npy` may follow.
 
@@ -91,37 +93,100 @@ class TrialData:
         }
         values |= {f"geometry.{name}": value for name, value in arrays_of(self.geometry).items()}
         if views.held_out is not None:
-            unseen = {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
-            values |= {"held_out.lines": views.held_out[0], **unseen}
-        plain = {name: value for name, value in values.items() if isinstance(value, str | float | int | np.generic)}
+            values["held_out.lines"] = views.held_out[0]
+            values |= {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
         with named_on_failure(folder):
             folder.mkdir()
-            (folder / _VALUES).write_text(json.dumps(plain, default=np.generic.item), encoding="utf-8")
         for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                write_array(folder / f"{name}.npy", value)
+            if isinstance(value, np.ndarray | np.generic | str | float | int):
+                write_array(folder / f"{name}.npy", np.asarray(value))
 
     @classmethod
     def load(cls, folder: Path) -> TrialData:
         """What `save` of the same program wrote; large arrays stay in their files until they are used."""
-        values = json.loads((folder / _VALUES).read_text(encoding="utf-8")) | {
-            path.stem: np.load(path, "r" if path.stat().st_size > _SMALL else None) for path in folder.glob("*.npy")
-        }
+
+        def arrays(part: str) -> dict[str, Any]:
+            files = folder.glob(f"{part}.*.npy")
+            return {
+                path.stem.partition(".")[2]: np.load(path, "r" if path.stat().st_size > _SMALL else None)
+                for path in files
+            }
 
         def of(part: str) -> dict[str, Any]:
-            return {name.removeprefix(f"{part}."): v for name, v in values.items() if name.startswith(f"{part}.")}
+            return {name: each if each.ndim else each.item() for name, each in arrays(part).items()}
 
-        geometry = geometry_of_arrays(of("geometry"))
+        geometry = geometry_of_arrays(arrays("geometry"))
         prepared = PreparedProjections(
             Projections(**of("projections")),
             geometry,
             axis=None,
-            held_out=(held["lines"], geometry_of_arrays(of("unseen"))) if (held := of("held_out")) else None,
+            held_out=(held["lines"], geometry_of_arrays(arrays("unseen"))) if (held := of("held_out")) else None,
             emission=Emission(geometry=geometry, **counted) if (counted := of("emission")) else None,
             energies=Energies(**energies) if (energies := of("energies")) else None,
             **of("prepared"),
         )
         return cls(prepared, **{"truth": None, **of("data")}, references=of("reference"))
+
+
+@dataclass(frozen=True)
+class ComparedScan:
+    """The scan of a trade-off or a study, and what holds for all of its reconstructions.
+
+    Attributes:
+        folder: for the results; must not exist.
+        methods: names in `recon.methods`; none: those that suit the comparison.
+        truth: FILE or FILE:first:end to compare with.
+        light: what the user knows of it; None: the dose is counted in frames.
+        seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
+        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
+            what is left is not begun, a running one is ended. None: no limit.
+        command: that repeats this, for the record.
+    """
+
+    source: SourceOptions
+    selection: Selection
+    folder: Path
+    methods: Sequence[str] = ()
+    truth: str | None = None
+    light: LightAsked | None = None
+    seconds: float | None = None
+    max_seconds: float | None = None
+    seed: int = 0
+    command: str = ""
+
+
+def opened_scan(asked: ComparedScan, warn: Warn, without_truth: str = "") -> tuple[TrialData, TrialTable]:
+    """Read and correct the views, after all inputs were checked; the table has no trials yet.
+
+    Args:
+        without_truth: advice how to do without views held out, which judge all trials where there is no truth; empty:
+            none are held out.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    refuse_not_utf8(asked.source.path)
+    refuse_existing(asked.folder)
+    truth_given = None if asked.truth is None else read_truth(asked.truth)
+    with asked.source.open() as source:
+        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
+        prepared = prepare_projections(source, asked.selection, warn).without_warnings
+    if without_truth and truth_given is None:
+        prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice=without_truth)
+    grid, truth = Grid.matching(prepared.geometry), None
+    if truth_given is not None:
+        truth = fit_truth(truth_given, grid, asked.selection.binning).data
+    if light is not None:
+        facts["light"] = "; ".join(light.in_words())
+    return TrialData(prepared, truth), table_of(asked, facts, prepared, light)
+
+
+def table_of(
+    scan: ComparedScan, facts: Mapping[str, str], prepared: PreparedProjections, light: Light | None = None
+) -> TrialTable:
+    """A table without trials; `facts` are of the scan, by name, `light` of a view."""
+    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
+    return TrialTable((), "psnr", prepared.length_unit, machine(), known, scan.command, light=light)
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
@@ -137,19 +202,15 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
     angles = prepared.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
     geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
-    if prepared.emission is not None:
-        emission = prepared.emission.summed(groups, geometry)
+    emission = None if prepared.emission is None else prepared.emission.summed(groups, geometry)
+    weights: F32 | None = whole.weights
+    if emission is not None:
         lines, weights = weighted_lines(emission)
-        return replace(
-            middle,
-            projections=replace(middle.projections, data=lines, weights=weights),
-            geometry=geometry,
-            emission=emission,
-        )
-    counted = whole.weights
-    least = None if counted is None else np.stack([counted[group].min(axis=0) for group in groups])
-    means = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
-    return replace(middle, projections=replace(middle.projections, data=means, weights=least), geometry=geometry)
+    else:
+        lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
+        weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
+    means = replace(middle.projections, data=lines, weights=weights)
+    return replace(middle, projections=means, geometry=geometry, emission=emission)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
@@ -208,12 +269,12 @@ JOB = TypeAdapter(TrialJob)
 COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 
 
-def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | None = None) -> None:
+def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float = math.inf) -> None:
     """Fill the cache of compiled kernels for these trials, so that no trial's memory includes the compiler's.
 
     Args:
         work: a folder with the data, `DATA`.
-        max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
+        max_seconds: after which it is ended; what is missing is compiled by the trials.
     """
     # a method and its settings that are words decide which kernels are compiled
     kinds = {
@@ -224,14 +285,12 @@ def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | No
     _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
 
 
-def run_trial(
-    trial: Trial, work: Path, seed: int, max_seconds: float | None = None, keep: Path | None = None
-) -> Outcome:
+def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, keep: Path | None = None) -> Outcome:
     """Run one trial in a process of its own, which has ended when this returns or raises.
 
     Args:
         work: a folder with the data, `DATA`.
-        max_seconds: after which the process is killed; None: no limit.
+        max_seconds: after which the process is killed.
         keep: a .npy file for its volume [z, y, x]; None: the volume is forgotten.
 
     Raises:
@@ -248,9 +307,7 @@ def run_trial(
     return Outcome(trial, "failed", message=message)
 
 
-def _run(
-    job: TrialJob, work: Path, max_seconds: float | None
-) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
+def _run(job: TrialJob, work: Path, max_seconds: float) -> tuple[dict[str, Any], tuple[ProcessEnd, int | None, str]]:
     """The last event of a process that does the job, and how it ended, see `run_to_end`."""
     path, last = work / "job.json", dict[str, Any]()
     with named_on_failure(path):
@@ -260,6 +317,5 @@ def _run(
         nonlocal last
         last = json_object(line) or last
 
-    limit = math.inf if max_seconds is None else max_seconds
-    ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=limit)
+    ended = run_to_end([*COMMAND, str(path)], work / "stderr.txt", on_line, seconds=max_seconds)
     return last, ended

@@ -1,99 +1,124 @@
-"""Runner: opens the scan, runs each trial in a process of its own within the time there is, and writes the table."""
+"""Runner: runs each trial in a process of its own within the time there is, and writes the table; a dry run says how
+long that takes, by those that are done or by the work of each."""
 
 from __future__ import annotations
 
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import psutil
 
 from beamline.core.durations import MachineSpeed
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
-from beamline.core.files import refuse_existing, refuse_not_utf8
-from beamline.core.machine import machine
+from beamline.core.machine import Need, free_memory
 from beamline.core.sinks import Warn, Warnings
-from beamline.features.trials.forecast import Expected, Timed, expected_seconds, trials_left
-from beamline.features.trials.launch import DATA, TrialData, compile_kernels, run_trial, write_array
+from beamline.core.text import count, size
+from beamline.features.trials.launch import DATA, ComparedScan, compile_kernels, run_trial, write_array
 from beamline.features.trials.layout import Plan, TableLayout, event_of, write_page, write_table
-from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome, Trial
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
-from beamline.projections.scan_statistics import Light, LightAsked, light_in
-from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import fit_truth, read_truth
-from beamline.reconstruct.outcome import facts_of
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.report.sheets import SliceSheet
-from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
 from recon.assess import metrics
+from recon.assess.time_model import duration_text
 from recon.base.arrays import F32
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.base.work import Rates, costs_of, seconds_of
+from recon.methods import by_name
 
 _PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 _COMPILING = 0.5  # of the time left, at most: what is missing then is compiled by the trials, cheap ones first
 _SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the page shows
 
 
+Expected = Callable[[Trial], float | None]
+"""s of a trial; None: not known."""
+
+_WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
+
+
 @dataclass(frozen=True)
-class ComparedScan:
-    """The scan of a trade-off or a study, and what holds for all of its reconstructions.
+class Timed:
+    """A finished trial, and how its time was spent.
 
     Attributes:
-        folder: for the results; must not exist.
-        methods: names in `recon.methods`; none: those that suit the comparison.
-        truth: FILE or FILE:first:end to compare with.
-        light: what the user knows of it; None: the dose is counted in frames.
-        seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
-        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
-            what is left is not begun, a running one is ended. None: no limit.
-        command: that repeats this, for the record.
+        wall: s, from before its process began to after its end.
+        working: s of these that it reconstructed, which grow with the work; the rest is the same for all.
     """
 
-    source: SourceOptions
-    selection: Selection
-    folder: Path
-    methods: Sequence[str] = ()
-    truth: str | None = None
-    light: LightAsked | None = None
-    seconds: float | None = None
-    max_seconds: float | None = None
-    seed: int = 0
-    command: str = ""
+    trial: Trial
+    wall: float
+    working: float
+
+    @classmethod
+    def of(cls, outcome: Outcome, wall: float) -> Timed:
+        """One without figures has 0 s of work."""
+        seconds = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
+        return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
-def opened_scan(asked: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable]:
-    """Read and correct the views, after all inputs were checked; the table has no trials yet.
+def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
+    """s that a trial on some of these views reconstructs, at most.
 
-    Raises:
-        ConfigError, DataError: nothing was written.
+    None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
     """
-    refuse_not_utf8(asked.source.path)
-    refuse_existing(asked.folder)
-    truth_given = None if asked.truth is None else read_truth(asked.truth)
-    with asked.source.open() as source:
-        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
-        prepared = prepare_projections(source, asked.selection, warn).without_warnings
-    grid, truth = Grid.matching(prepared.geometry), None
-    if truth_given is not None:
-        truth = fit_truth(truth_given, grid, asked.selection.binning).data
-    if light is not None:
-        facts["light"] = "; ".join(light.in_words())
-    return TrialData(prepared, truth), table_of(asked, facts, prepared, light)
+
+    @cache
+    def of_trial(trial: Trial) -> float | None:
+        limit, views = trial.seconds_asked, np.arange(trial.views)
+        if limit is not None and not by_name(trial.method).traits.own_length:
+            return limit
+        with suppress(ValueError):
+            method, coarse = (
+                trial.build(),
+                geometry.select(views * geometry.n_views // views.size).binned(trial.binning),
+            )
+            parts = [coarse.select(part) for part in np.array_split(views, trial.parts)]
+            if trial.halves:
+                parts += [coarse.select(slice(first, None, 2)) for first in (0, 1)]
+            costs = [costs_of(method, [(part, Grid.matching(part))]) for part in parts]
+            seconds = [seconds_of(each, rates).most for each in costs if each is not None]
+            return min(sum(seconds), limit or math.inf) if seconds else None
+        return None
+
+    return of_trial
 
 
-def table_of(
-    scan: ComparedScan, facts: Mapping[str, str], prepared: PreparedProjections, light: Light | None = None
-) -> TrialTable:
-    """A table without trials; `facts` are of the scan, by name, `light` of a view."""
-    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
-    return TrialTable((), "psnr", prepared.length_unit, machine(), known, scan.command, light=light)
+def trials_left(done: Sequence[Timed], trials: Sequence[Trial], expected: Expected) -> float | None:
+    """s that the trials to come will take, from those done; None before the first.
+
+    Each takes the same time to start and measure, and what is expected of it, at the pace of its method's trials that
+    are done, or of all. One of which nothing is expected takes what those of its method did, or all.
+    """
+    if not done:
+        return None
+    total = len(trials) * sum(each.wall - each.working for each in done) / len(done)
+    # a direct method is over too soon to tell how fast this machine is
+    pace = _pace([each for each in done if not by_name(each.trial.method).traits.direct], expected) or 1.0
+    for trial in trials:
+        same = [each for each in done if each.trial.method == trial.method and each.working > 0]
+        if trial.seconds_asked is not None:
+            total += trial.seconds_asked
+        elif (seconds := expected(trial)) is not None:
+            total += seconds * (_pace(same, expected) or pace)
+        else:
+            total += sum(each.working for each in same or done) / len(same or done)
+    return total
+
+
+def _pace(done: Sequence[Timed], expected: Expected) -> float | None:
+    """What trials took over what was expected of them; None where nothing was."""
+    told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
+    return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None
 
 
 @dataclass(frozen=True)
@@ -103,6 +128,7 @@ class _Rig:
     Attributes:
         work: folder with the data.
         end: by `now`, when the last trial must be done; inf: no limit.
+        slices: gets those that the page shows.
     """
 
     work: Path
@@ -111,20 +137,22 @@ class _Rig:
     now: Callable[[], float]
     emit: Callable[[Event], None]
     expected: Expected
+    slices: SliceSheet
 
     @property
-    def seconds(self) -> float | None:
-        """That are left; None: no limit."""
-        return None if self.end == math.inf else self.end - self.now()
+    def seconds(self) -> float:
+        """That are left; inf: no limit."""
+        return self.end - self.now()
 
-    def run(self, trial: Trial, seconds: float | None, keep: bool) -> tuple[Outcome, F32 | None]:
-        """The outcome within so many seconds, and the volume [z, y, x] if it is kept and there is one."""
-        path = self.work / "volume.npy"
-        outcome = run_trial(trial, self.work, self.seed, seconds, keep=path if keep else None)
-        if not (keep and path.exists()):
+    def run(self, trial: Trial, seconds: float, title: str = "") -> tuple[Outcome, F32 | None]:
+        """The outcome within so many seconds, and the volume [z, y, x] if its slice has a title and there is one."""
+        path, choice = self.work / "volume.npy", trial.choice
+        outcome = run_trial(trial, self.work, self.seed, seconds, keep=path if title else None)
+        if not (title and path.exists()):
             return outcome, None
         volume = np.load(path)
         path.unlink()
+        self.slices.add(title, volume, *(() if choice is None else (choice.family, trial.method)))
         return outcome, volume
 
 
@@ -164,44 +192,32 @@ def run_comparison(
     with _result_folder(scan.folder) as work:
         planned.data.save(work / DATA)
         del planned
-        rig = _Rig(work, scan.seed, end, now, emit, expected)
-        for n, reference in enumerate(references):
-            volume = _add_reference(rig, reference, slices)
-            if n == 0:
-                with suppress(ValueError):  # no contrast
-                    dense = metrics.kmeans_mask(metrics.sampled(volume if truth is None else truth), rig.seed)
-                    write_array(work / DATA / "data.regions.npy", dense)
+        rig = _Rig(work, scan.seed, end, now, emit, expected, slices)
+        contrast = truth
+        for reference in references:
+            outcome, volume = rig.run(reference, rig.seconds, reference.title)
+            if volume is None:
+                raise DataError(f"{reference.title}, to compare with, failed: {outcome.message}. Nothing was written.")
+            write_array(work / DATA / f"reference.{reference.method}.npy", volume)
+            contrast = volume if contrast is None else contrast
+        if contrast is not None and "snr" in layout.figures:
+            with suppress(ValueError):  # it has no dense and empty regions
+                dense = metrics.kmeans_mask(metrics.sampled(contrast), rig.seed)
+                write_array(work / DATA / "data.regions.npy", dense)
         if truth is not None:
             slices.add("truth", truth)
         emit(StateEntered("compiling", "Compiling kernels that are not in the cache"))
-        trials, seconds = [table.outcomes[n].trial for n in table.todo], rig.seconds
-        compile_kernels(trials, work, None if seconds is None else max(seconds, 0.0) * _COMPILING)
-        table = _run_all(table, layout, rig, slices, scan.folder)
+        trials = [table.outcomes[n].trial for n in table.todo]
+        compile_kernels(trials, work, max(rig.seconds, 0.0) * _COMPILING)
+        table = _run_all(table, layout, rig, scan.folder)
     write_page(scan.folder, table, layout, slices)
     summary = {"output": scan.folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
 
-def _add_reference(rig: _Rig, trial: Trial, slices: SliceSheet) -> F32:
-    """Make a volume that trials of its method are compared with.
-
-    Raises:
-        DataError: it failed.
-    """
-    outcome, volume = rig.run(trial, rig.seconds, keep=True)
-    if volume is None:
-        raise DataError(f"{trial.title}, to compare with, failed: {outcome.message}. Nothing was written.")
-    write_array(rig.work / DATA / f"reference.{trial.method}.npy", volume)
-    slices.add(f"{trial.choice.label if trial.choice else trial.title}: {trial.method}", volume)
-    return volume
-
-
-def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet, folder: Path) -> TrialTable:
+def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) -> TrialTable:
     """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
-
-    Args:
-        slices: gets those that the page shows.
 
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
@@ -214,15 +230,12 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceShe
                 table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
                 continue
             eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.expected)
-            eta = eta if eta is None or seconds is None else min(eta, seconds)
             rate = 60 * n / max(rig.now() - begin, 1e-9)
-            rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta, rate))
+            rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta and min(eta, seconds), rate))
             started, whole = rig.now(), table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
-            outcome, volume = rig.run(trial, seconds, keep=trial.group in _SHOWN)
+            outcome, _ = rig.run(trial, seconds, trial.title * (trial.group in _SHOWN))
             table = whole.with_outcome(index, outcome)
-            if volume is not None:
-                slices.add(trial.title, volume, *(() if trial.choice is None else (trial.choice.family, trial.method)))
             timed.append(Timed.of(outcome, rig.now() - started))
             if table.n_done:
                 write_table(folder, table, layout)
@@ -235,12 +248,10 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceShe
     return table
 
 
-def _no_time(needed: float, remaining: float | None) -> str:
-    """Why a trial of so many seconds is not begun; empty: there is time. None: no limit."""
-    if remaining is None or needed < remaining:
-        return ""
+def _no_time(needed: float, remaining: float) -> str:
+    """Why a trial of so many seconds is not begun; empty: there is time."""
     about = f"it would take about {needed:.0f} s, and only {remaining:.0f} s were left"
-    return f"not begun: {about if remaining > 0 else 'no time was left'}"
+    return "" if needed < remaining else f"not begun: {about if remaining > 0 else 'no time was left'}"
 
 
 @contextmanager
@@ -250,11 +261,83 @@ def _result_folder(folder: Path) -> Iterator[Path]:
     An empty result folder is removed, too, because the next run would refuse it.
     """
     folder.mkdir()
-    work = folder / "work"
-    work.mkdir()
     try:
-        yield work
+        with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as work:
+            yield Path(work)
     finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):
+        with suppress(OSError):  # it has results
             folder.rmdir()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedTrial(Need):
+    """What a trial will take, with the start of its process."""
+
+    label: str
+
+
+@dataclass(frozen=True)
+class ExpectedRun:
+    """What a comparison will take.
+
+    Attributes:
+        folder: that it would write.
+        disk, free: bytes for the views while it runs, and bytes on that disk.
+        allowed: bytes of memory that are free.
+    """
+
+    stage: str
+    folder: Path
+    trials: tuple[ExpectedTrial, ...]
+    disk: int
+    free: int
+    allowed: int
+
+    def lines(self) -> list[str]:
+        """For people."""
+        rows = [("trial", "s", "MB")]
+        for trial in self.trials:
+            seconds = "–" if trial.seconds is None else f"{trial.seconds:.3g}"
+            rows.append((trial.label, seconds, "–" if trial.memory is None else f"{trial.memory / 1e6:.0f}"))
+        width = max(len(label) for label, *_ in rows)
+        need, unknown = Need.in_turn(self.trials), sum(trial.seconds is None for trial in self.trials)
+        beside = f", beside {count(unknown, 'trial')} whose time is not known" if unknown else ""
+        return [
+            *(f"{label:<{width}}{seconds:>8}{memory:>8}" for label, seconds, memory in rows),
+            "",
+            f"{'trials':<10}{len(self.trials)}",
+            f"{'time':<10}about {duration_text(need.seconds or 0.0)}, with starts of processes{beside}",
+            f"{'memory':<10}{size(need.memory or 0)} in the largest process; {size(self.allowed)} are free",
+            f"{'disk':<10}{size(self.disk)} for the views meanwhile; {size(self.free)} free",
+            f"{'output':<10}{self.folder}: {self.stage}.csv, {self.stage}.json, page and pictures (not written now)",
+        ]
+
+
+def dry_run(plan: Plan, folder: Path, warn: Warn, rates: Rates) -> ExpectedRun:
+    """Plan a comparison; nothing is written, and nothing is run.
+
+    Args:
+        rates: of this machine.
+
+    Raises:
+        ConfigError, DataError: the comparison would be refused.
+    """
+    start, own_bytes = time.process_time(), int(psutil.Process().memory_info().rss)  # of a process that has begun
+    planned = plan(warn)
+    data, prepared = planned.data, planned.data.prepared
+    at_most = expected_seconds(data.geometry, rates)
+    arrays = (
+        prepared.projections.data, prepared.projections.weights, prepared.shares, data.truth,
+        prepared.held_out and prepared.held_out[0],
+    )  # fmt: skip
+    disk, weighted = sum(array.nbytes for array in arrays if array is not None), prepared.ray_factors() is not None
+
+    def expected(trial: Trial) -> ExpectedTrial:
+        coarse, works = data.geometry.binned(trial.binning), at_most(trial)
+        # of a process that has loaded the libraries, the views twice (in their file and those used), the rest
+        memory = own_bytes + 2 * disk + trial.build().memory(coarse, Grid.matching(coarse), weighted)
+        return ExpectedTrial(label=trial.label, seconds=None if works is None else start + works, memory=memory)
+
+    trials = [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]
+    free = shutil.disk_usage(folder.absolute().parent).free
+    return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), disk, free, free_memory())

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -18,17 +19,15 @@ from beamline.core.events import TradeoffStarted
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
 from beamline.energies import EnergyScans, prepare_energies, views_of
-from beamline.features.trials.forecast import Expected, expected_seconds
 from beamline.features.trials.front import TRADEOFF
-from beamline.features.trials.launch import TrialData
+from beamline.features.trials.launch import ComparedScan, TrialData, opened_scan, table_of
 from beamline.features.trials.layout import Planned
-from beamline.features.trials.runner import ComparedScan, opened_scan, table_of
-from beamline.features.trials.table import TrialTable
-from beamline.features.trials.trial import Outcome, Trial
-from beamline.projections.prepared import PreparedProjections, hold_out, with_views_held_out
+from beamline.features.trials.runner import Expected, expected_seconds
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
+from beamline.projections.prepared import with_views_held_out
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.plan import times_of
-from recon.base.arrays import F32
+from recon.base.empirical import ONE_IN
 from recon.base.kernel import Kernel
 from recon.base.method import Plain
 from recon.features.joint.methods import EnergySeries
@@ -40,8 +39,6 @@ from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
 
-_HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
-_HELD_OUT_VIEWS = 16  # at most
 _WITH_JOINT = ("fbp", "fista-tv", "r2")  # beside joint fits, where no methods are named
 _LEAST_OF_PART = 6  # views
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
@@ -86,8 +83,7 @@ Comparison = tuple[TrialData, TrialTable, Sequence[Trial]]
 
 
 def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
-    data, table = opened_scan(scan, warn)
-    data = split(data.prepared, data.truth)
+    data, table = opened_scan(scan, warn, "give --truth")
     n, start = data.geometry.n_views, default_count(data.geometry, data.geometry.sample_pitch)
     methods = scan.methods or names_compared(data.prepared.emission is not None)
     trials = (
@@ -95,24 +91,12 @@ def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
         if scan.seconds is None
         else plan_in_equal_time(methods, n, start, scan.seconds)
     )
-    return data, table.with_fact("views used", str(n)), trials
-
-
-def split(prepared: PreparedProjections, truth: F32 | None) -> TrialData:
-    """The views that trials use, and the views held out that judge all trials if there is no truth.
-
-    Raises:
-        ConfigError: too few views to hold some out.
-    """
-    if truth is None:
-        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
-    return TrialData(prepared, truth)
+    return data, replace(table, scan={**table.scan, "views used": str(n)}), trials
 
 
 def _in_time(scan: ComparedScan, volumes: int, warn: Warn) -> Comparison:
-    data, table = opened_scan(scan, warn)
-    held = hold_out(data.prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="leave out --time")
-    n = held.geometry.n_views
+    data, table = opened_scan(scan, warn, "leave out --time")
+    held, n = data.prepared, data.geometry.n_views
     if held.emission is not None:
         raise ConfigError(f"--time: {scan.source.path} is of an emission. Leave it out. Nothing was written.")
     try:
@@ -125,7 +109,7 @@ def _in_time(scan: ComparedScan, volumes: int, warn: Warn) -> Comparison:
     begun = seconds - seconds.min()
     start = default_count(held.geometry, held.geometry.sample_pitch)
     trials = plan_in_time(scan.methods or _WITH_JOINT, n, start, volumes)
-    table = table.with_fact("views used", f"{n}, over {np.ptp(seconds):.4g} s")
+    table = replace(table, scan={**table.scan, "views used": f"{n}, over {np.ptp(seconds):.4g} s"})
     return TrialData(replace(held, times=begun[:n]), None, begun[n:]), table, trials
 
 
@@ -141,7 +125,7 @@ def _of_energies(scan: ComparedScan, scans: EnergyScans, states: Sequence[str], 
     weighted = replace(prepared.projections, weights=views.weight)  # also of the views held out
     prepared = replace(prepared, projections=weighted, shares=None)
     energies = len(views.cross_sections)
-    unseen = np.flatnonzero(views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2)
+    unseen = np.flatnonzero(views.parted(ONE_IN) == ONE_IN // 2)
     data = TrialData(with_views_held_out(prepared, unseen), None, views.energy[unseen].astype(np.float64))
     geometry, used = data.geometry, data.geometry.n_views
     start = default_count(geometry, geometry.sample_pitch)
@@ -203,24 +187,16 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
         ValueError: for a method that there is not.
     """
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
-    first: list[Trial] = []
-    rest: list[Trial] = []
-    for method in methods:
-        base, *others = trials_of(method, n_views, gaussians, depth)
-        first.append(replace(base, halves=True))
-        rest += [replace(base, group="views", views=n) for n in counts]
-        rest += others
-    return tuple(dict.fromkeys([*first, *rest]))
+    tried = [trials_of(method, n_views, gaussians, depth) for method in methods]
+    fewer = [[replace(base, group="views", views=n) for n in counts] + others for base, *others in tried]
+    return tuple(dict.fromkeys([*(replace(base, halves=True) for base, *_ in tried), *chain(*fewer)]))
 
 
 def quick_first(trials: Sequence[Trial], expected: Expected) -> tuple[Trial, ...]:
     """The trials with baselines first, then those that take least time, and those whose time is not known."""
-
-    def order(trial: Trial) -> tuple[bool, float]:
-        varied = trial.group != "method"
-        return varied, (expected(trial) or math.inf) if varied else 0.0
-
-    return tuple(sorted(trials, key=order))
+    baselines = [trial for trial in trials if trial.group == "method"]
+    varied = [trial for trial in trials if trial.group != "method"]
+    return *baselines, *sorted(varied, key=lambda trial: expected(trial) or math.inf)
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
@@ -234,9 +210,8 @@ def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     These take two more reconstructions each, and say less than one of another method.
     """
     once = [replace(trial, halves=False) for trial in trials]
-    alone = [trial for trial in once if trial.group == "method"]
-    direct = [trial for trial in alone if by_name(trial.method).traits.direct]
-    return tuple(dict.fromkeys([*direct, *alone, *once]))
+    alone = sorted((t for t in once if t.group == "method"), key=lambda t: not by_name(t.method).traits.direct)
+    return tuple(dict.fromkeys([*alone, *once]))
 
 
 def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:

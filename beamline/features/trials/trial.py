@@ -1,4 +1,4 @@
-"""Trial: one reconstruction to make, of which views, how and how long, and what became of it; pure values."""
+"""Trial: one reconstruction to make, and what became of it; the table of all trials, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
+from beamline.projections.scan_statistics import Light
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
 _NAMES = ("materials", "states")  # settings that are several names
+LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
+_ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
 _ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
@@ -58,6 +63,16 @@ class Trial:
     def frames(self) -> int:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
+
+    @property
+    def window(self) -> int:
+        """Views of the scan that are averaged into each of its views."""
+        return 1 if self.choice is None else self.choice.window
+
+    @property
+    def facts(self) -> Mapping[str, float]:
+        """On how its views were taken, by heading."""
+        return {} if self.choice is None else self.choice.facts
 
     def build(self) -> Method:
         """The method with the settings of the trial.
@@ -119,7 +134,7 @@ def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
 
 _WORDS: Mapping[str, Callable[[Any], str]] = {
     "steps": lambda n: f"{n} steps",
-    "gaussians": lambda n: thousands(n) if isinstance(n, int) else f"gaussians {n}",
+    "gaussians": lambda n: f"{n / 1000:.3g}k Gaussians" if isinstance(n, int) and n >= 1000 else f"{n} Gaussians",
     "volumes": lambda n: f"{n} volumes",
     "moves": lambda moves: f"motion {'chosen' if moves is None else 'learnt' if moves else 'none'}",
     "states": lambda names: "smooth share",
@@ -133,6 +148,15 @@ _WORDS: Mapping[str, Callable[[Any], str]] = {
 
 def _in_words(name: str, value: Plain | None) -> str:
     return _WORDS[name](value) if name in _WORDS else f"{name.rsplit('.', 1)[-1]} {value}"
+
+
+HELD_OUT = "residual_held_out"
+QUALITIES = {
+    "psnr": ("PSNR", "PSNR (dB)"),
+    "psnr_all": ("PSNR", "PSNR (dB)"),
+    HELD_OUT: ("−20 log₁₀ of the held-out residual", "held-out residual (dB below the data)"),
+}
+"""The measures that trials are compared by, in words and as the label of an axis, by the name of the metric."""
 
 
 @dataclass(frozen=True)
@@ -167,8 +191,11 @@ class Outcome:
     reached: str = ""
 
     def quality(self, by: str) -> float:
-        """dB by a metric in `QUALITIES`; NaN where it is not known."""
-        return QUALITIES[by].decibels(self.metrics.get(by, math.nan))
+        """dB, more is better, by the metric of this name, of `QUALITIES`; NaN where it is not known."""
+        value = self.metrics.get(by, math.nan)
+        if by != HELD_OUT:
+            return value
+        return -20 * math.log10(value) if value > 0 else math.nan
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table or JSON."""
@@ -176,35 +203,148 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Quality:
-    """A metric that trials are compared by, in dB; more is better.
+class TrialCost:
+    """A cost of a trial, and how a picture shows it.
 
     Attributes:
-        words: in sentences.
-        axis: label in pictures.
-        decibels: of a value of the metric; NaN where there are none.
-        of_views: views held out are measured, each for itself.
+        name: in file names; `words`: in titles and captions.
+        axis: label with its unit; `scale`: from the value to that unit; `unit`: alone.
+        of: the cost of an outcome; NaN where it is not known.
     """
 
+    name: str
     words: str
     axis: str
-    decibels: Callable[[float], float]
-    of_views: bool = False
+    scale: float
+    of: Callable[[Outcome], float]
+    unit: str
 
 
-QUALITIES: Mapping[str, Quality] = {
-    "psnr": Quality("PSNR", "PSNR (dB)", lambda value: value),
-    "psnr_all": Quality("PSNR", "PSNR (dB)", lambda value: value),
-    "residual_held_out": Quality(
-        "−20 log₁₀ of the held-out residual",
-        "held-out residual (dB below the data)",
-        lambda value: -20 * math.log10(value) if value > 0 else math.nan,
-        of_views=True,
-    ),
-}
-"""By the name of the metric."""
+TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds, "s")
+MEMORY = TrialCost(
+    "memory", "memory", "peak memory of the process (MB)", 1e-6,
+    lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
+    "MB",
+)  # fmt: skip
 
 
-def thousands(n: int) -> str:
-    """A number of Gaussians in words, in thousands from 1000 on."""
-    return f"{n / 1000:.3g}k Gaussians" if n >= 1000 else f"{n} Gaussians"
+@dataclass(frozen=True)
+class TrialTable:
+    """All trials of a scan, with the scan and the machine that they ran on.
+
+    Attributes:
+        outcomes: in the order of the plan, also of trials that are left out.
+        by: the measure of quality, of `QUALITIES`.
+        length_unit: of the resolution, "mm" or "px".
+        scan: facts for people, by name.
+        stopped: it was interrupted before all trials were done.
+        light: of a frame; None: the dose is counted in frames.
+        notes: sentences on what the figures mean.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    by: str
+    length_unit: str
+    machine: Mapping[str, str | int]
+    scan: Mapping[str, str]
+    command: str
+    stopped: bool = False
+    light: Light | None = None
+    notes: Sequence[str] = ()
+
+    def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
+        """The table with this outcome in place of the one of this number."""
+        return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
+
+    @property
+    def n_done(self) -> int:
+        """Trials that have a volume."""
+        return sum(outcome.status == "done" for outcome in self.outcomes)
+
+    @property
+    def timed(self) -> bool:
+        """Trials end when their time is over."""
+        return any(outcome.trial.seconds_asked is not None for outcome in self.outcomes)
+
+    @property
+    def dose(self) -> TrialCost:
+        """The dose as a cost. Each frame of the scan that several views share is counted once."""
+        light, scale, axis, unit = self.light, 1.0, "dose: frames that were exposed", "frames"
+        if light is not None and light.gray is None:
+            scale, axis, unit = light.photons, "photons a pixel in the open beam", "photons"
+        elif light is not None and light.gray is not None:
+            scale, axis, unit = light.gray, f"dose in {light.material} (Gy)", "Gy"
+        return TrialCost("dose", "dose", axis, scale, lambda outcome: float(outcome.trial.frames), unit)
+
+    @property
+    def compared(self) -> tuple[Outcome, ...]:
+        """The trials that reconstructed the scan successfully."""
+        return tuple(o for o in self.outcomes if o.status == "done")
+
+    @property
+    def qualities(self) -> list[float]:
+        """dB of each trial in `compared`."""
+        return [outcome.quality(self.by) for outcome in self.compared]
+
+    @property
+    def todo(self) -> list[int]:
+        """Numbers of the trials that are not left out."""
+        return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
+
+    def costs(self, cost: TrialCost) -> list[float]:
+        """The cost of each trial in `compared`."""
+        return [cost.of(outcome) for outcome in self.compared]
+
+    def front(self, cost: TrialCost) -> list[int]:
+        """Positions in `compared` of the trials on the front of quality and `cost`.
+
+        Costs are compared to 1 %: smaller differences between two trials are chance. A trial that costs more is on the
+        front where its gain is above `chance`.
+        """
+        qualities = self.qualities
+
+        def better(i: int, j: int) -> bool:
+            return qualities[i] - qualities[j] > self.chance(i, j)
+
+        return front([rounded(value) for value in self.costs(cost)], qualities, better)
+
+    def chance(self, i: int, j: int) -> float:
+        """dB between two trials in `compared` that chance may reach.
+
+        Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
+        noise of a view is in both of its residuals, and so not in their difference.
+        """
+        squared = [np.asarray(self.compared[k].squared_residuals) for k in (i, j)]
+        if self.by != HELD_OUT or min(each.size for each in squared) < 2 or squared[0].size != squared[1].size:
+            return LEAST_GAIN
+        apart, level = squared[0] - squared[1], (squared[0].mean() + squared[1].mean()) / 2
+        error = apart.std(ddof=1) / math.sqrt(apart.size)
+        return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
+
+
+def rounded(cost: float) -> float:
+    """The cost rounded to steps of 1 %, so that smaller differences count as equal."""
+    if not cost > 0 or math.isinf(cost):
+        return cost
+    step = math.log(1.01)
+    return math.exp(round(math.log(cost) / step) * step)
+
+
+def front(
+    costs: Sequence[float], qualities: Sequence[float], better: Callable[[int, int], bool] | None = None
+) -> list[int]:
+    """Positions of the points that no other point beats, by rising cost (and so by rising quality).
+
+    A point is beaten by one with at most its cost and at least its quality, and better in one of the two. Of equal
+    points the first stays. Points with a value that is not finite are left out.
+
+    Args:
+        better: whether the quality of the first point is clearly above that of the second, which costs less. Where it
+            is not, the second one beats the first. None: by any difference.
+    """
+    finite = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
+    kept: list[int] = []
+    for i in sorted(finite, key=lambda i: (costs[i], -qualities[i], i)):
+        if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
+            kept.append(i)
+    return kept

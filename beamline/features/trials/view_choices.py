@@ -110,16 +110,15 @@ def sector(views: ViewSet) -> list[ViewChoice]:
 
 def random(views: ViewSet) -> list[ViewChoice]:
     """Falling numbers of views, evenly spread and drawn at random."""
-    rows = []
-    for n in COUNTS:
-        rows.append(_fixed(views, n))
-        family = f"random, {n} views"
-        if n == views.angles.size:
-            rows.append(ViewChoice(family, None, family, "these are all views of the scan: nothing to draw"))
-            continue
-        for k in range(views.draws if n < views.angles.size else 1):
-            rows.append(_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family))
-    return rows
+    return [row for n in COUNTS for row in (_fixed(views, n), *_draws(views, n))]
+
+
+def _draws(views: ViewSet, n: int) -> list[ViewChoice]:
+    family = f"random, {n} views"
+    if n == views.angles.size:
+        return [ViewChoice(family, None, family, "these are all views of the scan: nothing to draw")]
+    draws = range(views.draws if n < views.angles.size else 1)
+    return [_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family) for k in draws]
 
 
 def window_average(views: ViewSet) -> list[ViewChoice]:

@@ -78,10 +78,9 @@ def run(
     if trial.parts > 1:
         volume_at = by_parts(trial.parts, data, lambda part: _alone(trial, part, grid, seed))
     else:
-        control = ended_in_time(trial, now)
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
-            result = reconstruct(trial, prepared, grid, seed, control)
+            result = reconstruct(trial, prepared, grid, seed, now)
         one = on_grid(result.volume, grid).data
         volume_at = result.at or (lambda view: one)
         judged = residual_curve(history_arrays(result.history))
@@ -123,13 +122,13 @@ def measured(
         figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
     if data.prepared.held_out is not None:
         unseen, geometry = data.prepared.held_out
-        rays = data.rays_held_out
+        rays = data.prepared.ray_weights(geometry.n_views)
         of_view = np.zeros(geometry.n_views) if data.shown_held_out is None else data.shown_held_out
         left, own = squares_left(
             shown(volume_at, of_view, geometry, grid),
             unseen,
             ViewResolution.of(geometry, grid),
-            None if rays is None else np.asarray(rays > 0),
+            None if rays is None else np.asarray(rays[n:] > 0),
         )
         if not own.any():
             raise ValueError("all held-out views are zero, so no residual can be computed")
@@ -140,7 +139,7 @@ def measured(
 
 def _alone(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> F32:
     """The volume [z, y, x] of these views alone, with no view held out."""
-    result = reconstruct(trial, replace(prepared, held_out=None), grid, seed, ended_in_time(trial))
+    result = reconstruct(trial, replace(prepared, held_out=None), grid, seed)
     return on_grid(result.volume, grid).data
 
 
@@ -162,21 +161,21 @@ def half_set_resolution(trial: Trial, prepared: PreparedProjections, grid: Grid,
 
 
 def reconstruct(
-    trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int, control: RunControl
+    trial: Trial,
+    prepared: PreparedProjections,
+    grid: Grid,
+    seed: int,
+    now: Callable[[], float] = time.perf_counter,
 ) -> Reconstruction:
-    """The volume of a trial, as every command makes one.
+    """The volume of a trial, as every command makes one; it ends when the trial's seconds, if any, are over.
 
     A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel.
     """
     method, views = trial.build(), binned(prepared, trial.binning)
     target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(views.geometry)
-    return run_on(method, views, target, seed, control)
-
-
-def ended_in_time(trial: Trial, now: Callable[[], float] = time.perf_counter) -> RunControl:
-    """The control of a reconstruction that begins now, and ends when the trial's seconds, if any, are over."""
     control = RunControl(now=now)
-    return control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
+    in_time = control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
+    return run_on(method, views, target, seed, in_time)
 
 
 def reached(result: Reconstruction) -> str:

@@ -225,12 +225,11 @@ def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: in
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
     """The longest exposure among flats with few saturated pixels; else the shortest."""
-    exposures = sorted({frame.exposure for frame in flats}, reverse=True)
-    for exposure in exposures:
-        each = [(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure]
-        if np.mean(each) <= limits.saturated:
-            return exposure
-    return exposures[-1]
+    shares = {
+        exposure: np.mean([(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure])
+        for exposure in sorted({frame.exposure for frame in flats}, reverse=True)
+    }
+    return next((exposure for exposure, share in shares.items() if share <= limits.saturated), min(shares))
 
 
 def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:

@@ -43,7 +43,7 @@ _MODULES = {
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
     "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",
-    "study": "features.trials.command features.trials.study features.trials.figures",
+    "study": "features.trials.command features.trials.study",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 

@@ -149,5 +149,5 @@ def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
         )
 
     flat, clear = (sweep.scores_of([leaving(0.1), leaving(worse)], direct=True) for worse in (0.103, 0.12))
-    assert flat is not None and flat.best is None and not any(flat.alike)
+    assert flat is not None and flat.best is None and not any(flat.verdicts)
     assert clear is not None and clear.best == 0

@@ -14,9 +14,9 @@ import pytest
 import recon
 from beamline.core.errors import DataError
 from beamline.core.quantities import VoxelKind
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan, run_comparison
-from beamline.features.trials.tradeoff import planned_tradeoff, split
+from beamline.features.trials.launch import ComparedScan, TrialData
+from beamline.features.trials.runner import run_comparison
+from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.features.trials.worker import run
@@ -139,7 +139,8 @@ def test_a_trial_gives_what_the_function_gives_of_the_same_counts(pet: Path, tmp
     assert prepared.emission is not None
     truth = np.asarray(h5py.File(pet.with_name("truth.h5"))["entry/data/data"][()])
     for given, views in ((truth, 24), (truth, 12), (None, 21)):
-        data = split(prepared, given)
+        unseen = prepared if given is not None else hold_out(prepared, 8, most=16, advice="")
+        data = TrialData(unseen, given)
         data.save(tmp_path / f"views{views}")
         loaded = TrialData.load(tmp_path / f"views{views}")
         trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3}, halves=True)

@@ -14,13 +14,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from beamline.core.machine import machine
-from beamline.features.trials import figures as tradeoff_figures
-from beamline.features.trials.figures import colour_of, cost_curves, pareto_plot
-from beamline.features.trials.front import TRADEOFF, conclusions
-from beamline.features.trials.layout import finite, text, to_csv, to_html, write_page, write_table
-from beamline.features.trials.table import TrialTable
+from beamline.features.trials import front as tradeoff_figures
+from beamline.features.trials.front import TRADEOFF, colour_of, conclusions, cost_curves, pareto_plot
+from beamline.features.trials.layout import text, to_csv, to_html, write_page, write_table
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.report.html import Picture
 from beamline.report.sheets import SliceSheet
 from recon import methods
@@ -134,10 +132,6 @@ def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
         SliceSheet(),
     )
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html", "quality_seconds.png", "curves.png"}
-
-
-def test_what_is_not_finite_is_nothing() -> None:
-    assert finite({"a": [1, math.nan, (math.inf, "x")], 2: None}) == {"a": [1, None, [None, "x"]], "2": None}
 
 
 FBP, FIGURES_FIT = Trial("method", "fbp", 10), Trial("method", "r2", 10, settings={"steps": 100})

@@ -20,11 +20,11 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.features.trials import runner, tradeoff
 from beamline.features.trials.front import TRADEOFF
+from beamline.features.trials.launch import ComparedScan
 from beamline.features.trials.layout import text
-from beamline.features.trials.runner import ComparedScan, run_comparison
-from beamline.features.trials.table import TrialTable
+from beamline.features.trials.runner import run_comparison
 from beamline.features.trials.tradeoff import planned_tradeoff
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions

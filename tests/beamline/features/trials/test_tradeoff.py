@@ -15,11 +15,9 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.energies import EnergyScans, read_spectra
 from beamline.features.trials import runner
-from beamline.features.trials.launch import TrialData
-from beamline.features.trials.runner import ComparedScan
-from beamline.features.trials.table import TrialTable
+from beamline.features.trials.launch import ComparedScan, TrialData
 from beamline.features.trials.tradeoff import planned_tradeoff
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
