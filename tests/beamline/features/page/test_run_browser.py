@@ -185,7 +185,7 @@ def test_a_line_a_run_newest_first(tmp_path: Path) -> None:
     done = json.loads(line)
     assert done["event"] == "done"
     assert [(run["sample"], run["frames"], run["state"]) for run in done["runs"]] == [
-        ("cathode-3", 19, "done"), ("\x1b[31mred", None, "died"),
+        ("cathode-3", 19, "done"), ("\x1b[31mred", None, "not known"),
     ]  # fmt: skip
 
 
