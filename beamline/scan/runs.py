@@ -7,7 +7,6 @@ import os
 import time
 from calendar import timegm
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -97,7 +96,7 @@ def describe(run: Path) -> Run:
         planned=records[0].planned,
         flags=flags,
         state=state,
-        bytes=sum(_sizes(run)),
+        bytes=sum(_size(Path(at, name)) for at, _, names in os.walk(run) for name in names),
         parts=len(parts),
         next_step=next_step(run / SCAN) if state in (DIED, NOT_KNOWN) else "",
     )
@@ -190,11 +189,8 @@ def _numbered(run: Path) -> tuple[int, str]:
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
 
 
-def _sizes(folder: Path) -> Iterator[int]:
-    with suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            with suppress(OSError):
-                if entry.is_dir(follow_symlinks=False):
-                    yield from _sizes(Path(entry.path))
-                else:
-                    yield entry.stat(follow_symlinks=False).st_size
+def _size(path: Path) -> int:
+    """Bytes of a file; 0 of one that has gone meanwhile."""
+    with suppress(OSError):
+        return path.lstat().st_size
+    return 0

@@ -15,12 +15,11 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from beamline.core.files import CONFIG, EVENTS, RECORD, bytes_below, parts_of
+from beamline.core.files import CONFIG, RECORD, SETTINGS, bytes_below
 from beamline.storage.writer_lock import WriterLock, held
 
 DIED = "died"  # State of a part whose process has ended without writing another
 EVERY = 1.0  # real s between two writes of the record while only its number of frames grows
-_LARGEST = 2**20  # bytes of a record
 _TRIES, _PAUSE = 20, 0.01  # real s between tries to write the last record: Windows replaces no file that is being read
 
 FlagCounts = dict[str, dict[str, int]]
@@ -60,7 +59,7 @@ def read_record(part: Path) -> RunRecord | None:
     """
     lives = alive(part)  # asked first: the last record is written before the lock goes
     with suppress(OSError, ValueError):
-        record = _RECORDS.validate_json(bytes_below(part, RECORD, _LARGEST), strict=True)
+        record = _RECORDS.validate_json(bytes_below(part, RECORD, SETTINGS), strict=True)
         return record if record.over or lives is not False else replace(record, state=DIED)
     return None
 
@@ -76,11 +75,6 @@ def write_record(part: Path, record: RunRecord) -> None:
 def alive(part: Path) -> bool | None:
     """Whether the process of a part lives; None: its file system has no locks."""
     return held(part / CONFIG, exclusively=True)
-
-
-def in_work(run: Path) -> bool:
-    """Whether a process takes, recovers or goes on with a run, as far as locks tell."""
-    return bool(alive(parts_of(run)[-1]) or held(run / EVENTS, exclusively=True))
 
 
 class RecordFile:

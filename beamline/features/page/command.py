@@ -67,8 +67,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
         held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
         raise ConfigError(f"there is no file or folder {path}; {held_runs}.")
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
-    lives = held(what.scan) if what.folder is None else alive(what.folder)
-    if not lives and (advice := next_step(what.scan)):
+    if not (held(what.scan) if what.folder is None else alive(what.folder)) and (advice := next_step(what.scan)):
         click.echo(advice, err=True)
     reader = Reader(what)
     try:

@@ -5,6 +5,7 @@ process wrote. In every third life the kill comes while the record is written.
 """
 
 import json
+import math
 import multiprocessing
 import os
 import signal
@@ -34,7 +35,7 @@ from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import small
 
 VIEWS, SECONDS = 40, 0.006  # s a frame, of real time
-LIFE = 1.1  # s of a scan with its last fit
+WITHIN = {"preparing": 1.0, "darks": 0.1, "acquiring": 0.3, "finishing": 0.5}  # s: a kill comes so soon after a state
 IN_WORK = {state.value for state in State if not state.ended}
 FIT = """
 import json, sys, time
@@ -118,14 +119,17 @@ def _listed(runs: Path) -> Run | None:
     return describe(folders[0]) if folders else None
 
 
-def _live(runs: Path, run: Path | None, kill_at: float, die: tuple[int, float] | None, counted: Counter[str]) -> bool:
-    """A life of a process that takes a run, and its end; whether it was killed."""
+def _live(
+    runs: Path, run: Path | None, kill: tuple[str, float], die: tuple[int, float] | None, counted: Counter[str]
+) -> bool:
+    """A life of a process that takes a run, and its end, so many seconds after it was in a state; whether it was
+    killed."""
     ours, theirs = multiprocessing.Pipe(duplex=False)
     process = multiprocessing.get_context("fork").Process(target=_take, args=(runs, run, theirs, die))
     process.start()
     theirs.close()
     assert process.pid is not None
-    deadline, seen, asked = time.monotonic() + kill_at, list[Run](), False
+    deadline, seen, asked = math.inf, list[Run](), False
     with suppress(EOFError):
         ours.recv_bytes()
     while time.monotonic() < deadline and process.is_alive():
@@ -137,6 +141,8 @@ def _live(runs: Path, run: Path | None, kill_at: float, die: tuple[int, float] |
             continue
         seen.append(now)
         counted["looks"] += 1
+        if now.state == kill[0]:
+            deadline = min(deadline, time.monotonic() + kill[1])
         if now.state == State.ACQUIRING and not asked:
             asked = True
             with pytest.raises(ConfigError, match="Nothing was changed"):
@@ -171,8 +177,9 @@ def kills(folder: Path, n: int, seed: int) -> Counter[str]:
         runs, run = folder / str(number), None
         for life in range(4):
             die = (int(rng.integers(0, 9)), float(rng.choice([0.0, 0.5, 1.0, 2.0]))) if rng.random() < 0.34 else None
-            at = 60.0 if die is not None or life == 3 else rng.uniform(0.05, LIFE)
-            killed = _live(runs, run, at, None if life == 3 else die, counted)
+            state = str(rng.choice([*WITHIN])) if die is None and life < 3 else "never"
+            kill = state, rng.uniform(0, WITHIN.get(state, 0.0))
+            killed = _live(runs, run, kill, None if life == 3 else die, counted)
             counted["kills"] += killed
             counted["kills in the record"] += killed and die is not None
             if (now := _listed(runs)) is None:
