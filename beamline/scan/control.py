@@ -23,7 +23,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.core.files import CONTROL, parts_of, same_file
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.storage.run_record import alive, read_record
+from beamline.storage.run_record import DIED, alive, read_record
 
 
 class State(StrEnum):
@@ -275,9 +275,9 @@ def tell(run: Path, verb: Verb) -> State:
 
 
 def state_of(part: Path) -> State:
-    """The state of the scan in this folder, by its record."""
-    record = read_record(part)
-    return State(record.state) if record is not None and record.state in [*State] else State.IDLE
+    """The state of the scan in this folder, by its record; `failed` where its process has died."""
+    record, states = read_record(part), {DIED: State.FAILED, **{state.value: state for state in State}}
+    return State.IDLE if record is None else states.get(record.state, State.IDLE)
 
 
 def _done(state: State, verb: Verb) -> bool:

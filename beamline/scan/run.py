@@ -112,13 +112,12 @@ def run_scan(
         remarks = [*_settings_before(ready), *([] if series else other_devices(place, ready))]
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
-            events, log, record = _logs(config, ready, folder, stack)
+            record, *logs = _logs(config, ready, folder, stack)
             if series is not None:
-                stack.callback(series.lock.release)  # before the part is let go, which a list then takes for its end
-            # In a thread of its own: a terminal that takes no event does not hold it up.
-            recorded = stack.enter_context(Announcer([record], instrument.clock))
-            announced = stack.enter_context(Announcer([events, log, *sinks], instrument.clock))
-            sink = fan_out(recorded, announced)
+                series.lock.release()  # that of the part keeps others away from here on
+            # The record in a thread of its own: a terminal that takes no event does not hold it up.
+            announcers = [Announcer(each, instrument.clock) for each in ([record], [*logs, *sinks])]
+            sink = fan_out(*map(stack.enter_context, announcers))
             for sentence in remarks:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
@@ -139,7 +138,7 @@ def _settings_before(ready: ReadyScan) -> Iterator[str]:
 
 
 def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
-    """The run's events.jsonl, user.log and record, open until the stack closes; the configuration is written beside
+    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written beside
     them. The events come last: with them the folder is a run."""
     try:
         (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -151,7 +150,7 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
         raise DataError(
             f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
         ) from error
-    return JsonLines(events), UserLog(log), record_sink(record)
+    return record_sink(record), JsonLines(events), UserLog(log)
 
 
 def _named(config: Config) -> str:

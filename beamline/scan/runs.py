@@ -76,6 +76,7 @@ def newest(folder: Path) -> Path:
 
 def describe(run: Path) -> Run:
     """What the records of a run's parts say of it. Reads no pixel."""
+    taken_up = held(run / EVENTS, exclusively=True)  # asked first, as a new part is there before this lock goes
     parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # which comes after its record
     records = [record_of(part) for part in parts]
     frames: int | None = 0
@@ -85,9 +86,7 @@ def describe(run: Path) -> Run:
         frames = None if record.frames is None or before is None else before + record.frames
         for check, levels in record.flags.items():
             flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
-    state = records[-1].state
-    if alive(parts[-1]) is False and held(run / EVENTS, exclusively=True):  # in this order, as its process lets go
-        state = State.PREPARING
+    state = State.PREPARING if taken_up and alive(parts[-1]) is False else records[-1].state
     return Run(
         folder=run,
         sample=records[0].sample or run.name.partition("_")[2] or run.name,
