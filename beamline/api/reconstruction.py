@@ -28,7 +28,6 @@ from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.scan.control import State
 from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
 from beamline.storage.interrupted import scan_file
@@ -209,7 +208,7 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     folder, shown = Path(run), None
     watch = watched(folder)
     while True:
-        over = describe(folder).state in _OVER  # asked before the volume, so that none is missed
+        over = describe(folder).over  # asked before the volume, so that none is missed
         newest_volume = newest(watch.volumes)
         if newest_volume is not None and newest_volume != shown:
             with (
@@ -223,9 +222,6 @@ def volumes(run: str | Path) -> Iterator[Volume]:
         if over:
             return
         time.sleep(_POLL)
-
-
-_OVER = frozenset({"died", *(state.value for state in State if state.ended)})
 
 
 def _opened(path: Path, follow: bool) -> ScanSource:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, ClassVar, dataclass_transform, get_type_hints
+from typing import Any, ClassVar, dataclass_transform, get_type_hints
 
 import numpy as np
 
@@ -162,16 +162,6 @@ def _of_json(value: Any, kind: Any) -> bool | None:
 
 def _is_plain(value: Any, kind: Any) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
-    """The complete lines in the first bytes of a log; a line too long for an event is empty."""
-    within = False
-    while most > 0 and (line := file.readline(min(LONGEST, most))):
-        most -= len(line)
-        if line.endswith(b"\n"):
-            yield b"" if within else line
-        within = not line.endswith(b"\n")
 
 
 def _values_of(value: Any) -> dict[str, Any]:

@@ -27,6 +27,7 @@ RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
 CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
+RECORD = "state.json"  # The state of a run, or of a later part of it, in its folder
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
 STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, before "_"

@@ -19,8 +19,9 @@ from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched
 from beamline.scan.control import State
-from beamline.scan.runs import DIED, newest
+from beamline.scan.runs import newest
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.run_record import DIED
 
 Event = Mapping[str, Any]
 PERIOD = 0.5  # s between two looks at the run

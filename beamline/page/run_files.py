@@ -18,10 +18,10 @@ from beamline.core.events import LARGEST_LOG, event_in
 from beamline.core.files import EVENTS, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
-from beamline.scan.runs import DIED
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
+from beamline.storage.run_record import DIED, read_record
 from beamline.storage.structure import require_inside
 from beamline.storage.writer_lock import abandoned
 
@@ -146,7 +146,8 @@ class Reader:
                 self._seen = frames, now
             age = now - self._seen[1]
         volume = newest(self.what.volumes)
-        died = status == "running" and abandoned(self.what.scan)
+        record = None if self.what.folder is None else read_record(self.what.folder)
+        died = record.state == DIED if record is not None else status == "running" and abandoned(self.what.scan)
         return {
             "frames": frames,
             "status": DIED if died else status,

@@ -20,10 +20,10 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Sink, StateEntered, Warned, event_in, whole_lines
-from beamline.core.files import CONTROL, EVENTS, SCAN, open_below, parts_of, same_file
+from beamline.core.events import Sink, StateEntered, Warned
+from beamline.core.files import CONTROL, parts_of, same_file
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.storage.writer_lock import held
+from beamline.storage.run_record import DIED, alive, read_record
 
 
 class State(StrEnum):
@@ -209,8 +209,7 @@ def _taken(request: Path) -> bool:
 
 def running(runs: Path) -> list[Path]:
     """The runs in a folder whose scan is in progress, oldest first."""
-    newest = ((run, parts_of(run)[-1]) for run in runs.glob("*/"))
-    return sorted(run for run, part in newest if (part / CONTROL).is_dir() and held(part / SCAN))
+    return sorted(run for run in runs.glob("*/") if alive(parts_of(run)[-1]))
 
 
 @dataclass(frozen=True)
@@ -275,15 +274,10 @@ def tell(run: Path, verb: Verb) -> State:
     return state
 
 
-def state_of(run: Path) -> State:
-    """The state of the scan in this folder, from the last entry in its log of events."""
-    state = State.IDLE
-    with suppress(OSError), open_below(run, EVENTS) as file:
-        for line in whole_lines(file):
-            event = event_in(line) if line.startswith(b'{"event": "state"') else None
-            if event is not None and "source" not in event and event.get("state") in [*State]:
-                state = State(event["state"])  # without those of the live reconstruction
-    return state
+def state_of(part: Path) -> State:
+    """The state of the scan in this folder, by its record; `failed` where its process has died."""
+    record, states = read_record(part), {DIED: State.FAILED, **{state.value: state for state in State}}
+    return State.IDLE if record is None else states.get(record.state, State.IDLE)
 
 
 def _done(state: State, verb: Verb) -> bool:

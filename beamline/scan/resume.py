@@ -17,9 +17,10 @@ import h5py
 
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import CONFIG, EVENTS, SCAN, create_part, parts_of
+from beamline.core.files import CONFIG, EVENTS, RECORD, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
+from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
 from beamline.storage.parts import (
     JOINED,
@@ -31,7 +32,8 @@ from beamline.storage.parts import (
     views_planned,
 )
 from beamline.storage.recover import Recovered, recover
-from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.run_record import alive
+from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
@@ -48,6 +50,7 @@ class ResumableRun:
 
     Attributes:
         run: its folder.
+        lock: keeps other processes from recovering the run or going on with it.
         config: its configuration.
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files.
@@ -58,6 +61,7 @@ class ResumableRun:
     """
 
     run: Path
+    lock: WriterLock
     config: Config
     parts: tuple[Path, ...]
     views: frozenset[int]
@@ -122,30 +126,40 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must be the run's.
 
     Raises:
-        ConfigError: it is no run, it goes on already, or its configuration differs. NothingMissing, NoFrame, and
+        ConfigError: it is no run, a process has it in work, or its configuration differs. NothingMissing, NoFrame, and
             NotJoined where `recover_run` is all that it lacks.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
-    if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
-        raise ConfigError(f"{run} is not the folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
+    if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
+        raise ConfigError(f"{run} is not the folder of a run: it has no {' and no '.join(absent)}. {_UNTOUCHED}")
+    with _alone(run) as lock:
+        yield _series(run, given, lock)
+
+
+@contextmanager
+def _alone(run: Path) -> Iterator[WriterLock]:
+    """A context in which no other process recovers the run or goes on with it.
+
+    Raises:
+        ConfigError: a process takes it, recovers it or goes on with it; or it cannot be written to.
+    """
     try:
-        lock = WriterLock(run / CONFIG, exclusive=True)
+        lock = WriterLock(run / EVENTS, exclusive=True)
     except OSError as error:
         raise ConfigError(
-            f"{run} cannot be held ({error.strerror}): another process goes on with it, or it cannot be written to. "
-            f"{_UNTOUCHED}"
+            f"{run} cannot be held ({error.strerror}): another process goes on with it or recovers it, or it cannot be "
+            f"written to. {_UNTOUCHED}"
         ) from None
     try:
-        yield _series(run, given)
+        if alive(parts_of(run)[-1]):
+            raise ConfigError(f"The scan of {run} still runs: wait for its end, or stop it. {_UNTOUCHED}")
+        yield lock
     finally:
         lock.release()
 
 
-def _series(run: Path, given: Config | None) -> ResumableRun:
+def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     files, left_out = _files(run)
-    for part in files:
-        if held(part):
-            raise ConfigError(f"{part} is open in another process: a scan that still runs, or a reader. {_UNTOUCHED}")
     config = load(run / CONFIG, environment={})
     views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
     for part in files:
@@ -176,7 +190,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
             raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
     return ResumableRun(
-        run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
+        run, lock, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
     )
 
 
@@ -190,7 +204,7 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
         if part == run or may_hold_frames(part / SCAN):
             files.append(part / SCAN)
         else:
-            left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {EVENTS} names none.")
+            left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {RECORD} has none.")
     return files, left_out
 
 
@@ -251,7 +265,8 @@ def _words(identity: Mapping[str, str]) -> str:
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
-    """Recover every part of a run, and join several parts; the joined file comes last.
+    """Recover every part of a run, and join several parts; the joined file comes last. The record of a run that died
+    then has the state of its newest file.
 
     Args:
         say: is told the room that each needs, before anything is written to it.
@@ -260,17 +275,20 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
         the result for each file, and a sentence on each part that was left out.
 
     Raises:
+        ConfigError: a process takes it, recovers it or goes on with it.
         DataError: no run, or a part that cannot be recovered; those before it are recovered.
     """
-    files, left_out = _files(run)
-    if not files:
-        raise DataError(f"{run} is not the folder of a run: it has no {SCAN}. {_UNTOUCHED}")
-    done = [recover(part, say) for part in files]
-    if len(parts := [one.path for one in done if one.frames]) > 1:
-        changed = not is_joined(run / JOINED)
-        if changed:
-            join(parts, run / JOINED)
-        with hdf5.open_hdf5(run / JOINED) as file:
-            frames, missing = int(file[layout.COMMITTED][()]), (views_planned(file) or 0) - len(views_in(file))
-            done.append(Recovered(run / JOINED, changed, frames, 0, missing))
+    with _alone(run):
+        files, left_out = _files(run)
+        if not files:
+            raise DataError(f"{run} is not the folder of a run: it has no {SCAN}. {_UNTOUCHED}")
+        done = [recover(part, say) for part in files]
+        if len(parts := [one.path for one in done if one.frames]) > 1:
+            changed = not is_joined(run / JOINED)
+            if changed:
+                join(parts, run / JOINED)
+            with hdf5.open_hdf5(run / JOINED) as file:
+                frames, missing = int(file[layout.COMMITTED][()]), (views_planned(file) or 0) - len(views_in(file))
+                done.append(Recovered(run / JOINED, changed, frames, 0, missing))
+        end_record(parts_of(run)[-1])
     return done, left_out

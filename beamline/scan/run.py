@@ -26,7 +26,7 @@ from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, St
 from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.core.machine import free_memory
 from beamline.core.run_result import RunResult
-from beamline.core.sinks import Announcer, JsonLines, UserLog
+from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
@@ -40,10 +40,12 @@ from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
 from beamline.scan.resume import ResumableRun, other_devices
+from beamline.scan.runs import record_sink
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
 from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan
+from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
 from drivers.in_beam import Ask
@@ -110,7 +112,12 @@ def run_scan(
         remarks = [*_settings_before(ready), *([] if series else other_devices(place, ready))]
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
-            sink = stack.enter_context(Announcer([*_logs(config, folder, stack), *sinks], instrument.clock))
+            record, *logs = _logs(config, ready, folder, stack)
+            if series is not None:
+                series.lock.release()  # that of the part keeps others away from here on
+            # The record in a thread of its own: a terminal that takes no event does not hold it up.
+            announcers = [Announcer(each, instrument.clock) for each in ([record], [*logs, *sinks])]
+            sink = fan_out(*map(stack.enter_context, announcers))
             for sentence in remarks:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
@@ -130,17 +137,20 @@ def _settings_before(ready: ReadyScan) -> Iterator[str]:
             yield f"{device}: before it was opened: {settings}."
 
 
-def _logs(config: Config, folder: Path, stack: ExitStack) -> tuple[Sink, Sink]:
-    """The run's events.jsonl and user.log, open until the stack closes; the configuration is written beside them."""
+def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
+    """The run's record, events.jsonl and user.log, open until the stack closes; the configuration is written beside
+    them. The events come last: with them the folder is a run."""
     try:
         (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
-        events = stack.enter_context(new_log(folder / EVENTS))
+        first = RunRecord(State.PREPARING, sample=config.sample.name, planned=ready.timeline.n_frames)
+        stack.callback((record := RecordFile(folder, first)).close)
         log = stack.enter_context(new_log(folder / USER_LOG))
+        events = stack.enter_context(new_log(folder / EVENTS))
     except OSError as error:
         raise DataError(
             f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
         ) from error
-    return JsonLines(events), UserLog(log)
+    return record_sink(record), JsonLines(events), UserLog(log)
 
 
 def _named(config: Config) -> str:

@@ -1,4 +1,5 @@
-"""Runs of a folder: sample and outcome of each, by its log of events, or by its file if the log ends early."""
+"""Runs of a folder: sample and state of each, by the records of its parts, or by its files where an earlier version
+made it."""
 
 from __future__ import annotations
 
@@ -6,26 +7,22 @@ import os
 import time
 from calendar import timegm
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import event_in, whole_lines
-from beamline.core.files import CONFIG, CONTROL, EVENTS, SCAN, STAMP, is_below, open_below, parts_of
+from beamline.core.events import Event, FrameStored, ScanDone, Sink, StateEntered
+from beamline.core.files import CONFIG, EVENTS, SCAN, STAMP, is_below, parts_of
 from beamline.core.text import one_line, size
-from beamline.scan.control import State, running, state_of
+from beamline.scan.control import State, running
 from beamline.storage.interrupted import next_step
+from beamline.storage.run_record import DIED, FlagCounts, RecordFile, RunRecord, alive, read_record, write_record
+from beamline.storage.writer_lock import held
 
-DIED = "died"  # State of a run whose process has ended without a final event
+NOT_KNOWN = "not known"  # State of a run of an earlier version whose file is not closed
 
-_HEAD, _TAIL = 2**20, 2**17  # bytes of a log that are read: the sample is at its head, the outcome at its end
-_ENDING = 600.0  # real s since the last line of a log, within which a complete scan may still be ending
 _OF_STATUS = {"complete": State.DONE, "stopped": State.STOPPED, "failed": State.FAILED}
-
-FlagCounts = Mapping[str, Mapping[str, int]]
 
 
 @dataclass(frozen=True)
@@ -39,10 +36,10 @@ class Run:
         frames: in its files; None: not known.
         planned: frames that the first part was to have; None: not known.
         flags: frames that the monitor flagged: their number by check, then by level.
-        state: of its newest part, see docs/states.md; `died` if its process ended without a final event.
+        state: of its newest part, see docs/states.md; `died` if its process ended without writing another.
         bytes: of all files in the folder.
         parts: 1, and one for each time that it was resumed.
-        next_step: what can be done with one that died; "" for others.
+        next_step: what can be done with one that died, or whose state is not known; "" for others.
     """
 
     folder: Path
@@ -59,7 +56,7 @@ class Run:
     @property
     def over(self) -> bool:
         """Whether the run has ended; it may be resumed."""
-        return self.state == DIED or self.state in _ENDED
+        return self.state not in [state for state in State if not state.ended]
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -78,28 +75,29 @@ def newest(folder: Path) -> Path:
 
 
 def describe(run: Path) -> Run:
-    """Read the metadata of a run from its log, or from its files if the log is incomplete. Reads no pixel."""
-    parts = parts_of(run)
-    heads = [_head(part) for part in parts]
+    """What the records of a run's parts say of it. Reads no pixel."""
+    taken_up = held(run / EVENTS, exclusively=True)  # asked first, as a new part is there before this lock goes
+    parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # which comes after its record
+    records = [record_of(part) for part in parts]
     frames: int | None = 0
     flags: dict[str, dict[str, int]] = {}
-    state = ""
-    for part in parts:
-        state, n, joined, run_flags = _part(part)
-        frames = n if joined or frames is None or n is None else frames + n
-        for check, levels in run_flags.items():
+    for record in records:
+        before = 0 if record.joined else frames
+        frames = None if record.frames is None or before is None else before + record.frames
+        for check, levels in record.flags.items():
             flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
+    state = State.PREPARING if taken_up and alive(parts[-1]) is False else records[-1].state
     return Run(
         folder=run,
-        sample=str(heads[0].get("sample") or run.name.partition("_")[2] or run.name),
+        sample=records[0].sample or run.name.partition("_")[2] or run.name,
         time=_began(run),
         frames=frames,
-        planned=_whole(heads[0].get("n_frames")),
+        planned=records[0].planned,
         flags=flags,
         state=state,
-        bytes=sum(_sizes(run)),
+        bytes=sum(_size(Path(at, name)) for at, _, names in os.walk(run) for name in names),
         parts=len(parts),
-        next_step=next_step(run / SCAN) if state == DIED else "",
+        next_step=next_step(run / SCAN) if state in (DIED, NOT_KNOWN) else "",
     )
 
 
@@ -122,11 +120,66 @@ def cells(run: Run) -> tuple[str, ...]:
     return tuple(map(one_line, row))
 
 
+def record_sink(file: RecordFile) -> Sink:
+    """A sink that keeps the record of a part, by the events of its scan."""
+
+    def keep(event: Event) -> None:
+        record = file.record
+        match event:
+            case Event(source="recon"):
+                pass
+            case StateEntered(state=state) if state in [*State]:
+                record = replace(record, state=state, over=State(state).ended)
+            case FrameStored(n=n):
+                record = replace(record, frames=n)
+            case ScanDone(result=scan):
+                flags = {check: dict(levels) for check, levels in scan.flags.items()}
+                record = replace(record, frames=scan.n_frames, joined=scan.path.name != SCAN, flags=flags)
+        file.put(record, at_once=isinstance(event, StateEntered | ScanDone))
+
+    return keep
+
+
+def record_of(part: Path) -> RunRecord:
+    """The record of a part; frames and flags of one that died, and all of a part without a record, by its file."""
+    record = read_record(part)
+    if record is not None and record.state != DIED:
+        return record
+    by_file = _by_file(part / SCAN)
+    if record is None:
+        return by_file
+    frames = by_file.frames if (part / SCAN).exists() else record.frames
+    return replace(record, frames=frames, flags=by_file.flags, joined=False)
+
+
+def end_record(part: Path) -> None:
+    """Give the record of a part that died the state that its closed file has."""
+    if (record := record_of(part)).state == DIED and (state := _by_file(part / SCAN).state) != NOT_KNOWN:
+        write_record(part, replace(record, state=state, over=True))
+
+
+def _by_file(scan: Path) -> RunRecord:
+    """What the head of a scan file tells."""
+    from beamline.storage import hdf5
+    from beamline.storage.flag_legend import read_flags
+    from beamline.storage.writers import layout
+    from beamline.storage.writers.rows import ending_in
+
+    with suppress(DataError, OSError), hdf5.open_hdf5(scan, follow=True) as file, hdf5.readable(scan):
+        n, state = int(file[layout.COMMITTED][()]), NOT_KNOWN
+        if file[layout.FINISHED][()]:
+            state = _OF_STATUS.get(ending_in(file).status, State.FAILED)
+        return RunRecord(state, frames=n, flags=read_flags(file, n).counts() if n else {})
+    return RunRecord(NOT_KNOWN, frames=None)
+
+
 def _began(run: Path) -> float:
-    """When the run began: by the folder's name, which a simulated clock does not change, or else by its log."""
+    """When the run began: by the folder's name, which a simulated clock does not change, or else by its first file."""
     with suppress(ValueError):
         return timegm(time.strptime(run.name.partition("_")[0], STAMP))
-    return float(_head(run).get("time") or 0.0)
+    with suppress(OSError):
+        return (run / CONFIG).stat().st_mtime
+    return 0.0
 
 
 def _numbered(run: Path) -> tuple[int, str]:
@@ -135,99 +188,8 @@ def _numbered(run: Path) -> tuple[int, str]:
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
 
 
-def _part(part: Path) -> tuple[str, int | None, bool, FlagCounts]:
-    """State, frames, whether these are of all parts so far, and flags."""
-    last_events = _last_events(part)
-    done = last_events.get("done") or last_events.get("scan_done") or {}
-    state = str(last_events.get("state", {}).get("state", ""))
-    if not (state in _ENDED or "failed" in last_events):
-        state = _unended(part, done)
-    if (frames := _whole(done.get("n_frames"))) is not None:
-        flags = done.get("flags")
-        return state, frames, Path(str(done.get("path"))).name != SCAN, _flags(flags)
-    if state != DIED and state not in _ENDED:  # it runs
-        return state, _whole(last_events.get("frame", {}).get("n")) or 0, False, {}
-    frames, flags = _of_file(part / SCAN)
-    return state, frames, False, flags
-
-
-_ENDED = frozenset(state for state in State if state.ended)
-
-
-def _unended(part: Path, done: Mapping[str, Any]) -> str:
-    """The state of a part whose log has no end: it runs, or its process has died."""
-    from beamline.storage.writer_lock import held
-
-    if not (part / CONTROL).is_dir():
-        return DIED
-    if held(part / SCAN):
-        return state_of(part)
-    if not done:
-        return DIED
-    with suppress(OSError):  # the volume is finished after the scan's file was closed
-        if time.time() - (part / EVENTS).stat().st_mtime < _ENDING:
-            return State.FINISHING
-    return _OF_STATUS.get(str(done.get("status")), State.FAILED)
-
-
-def _of_file(scan: Path) -> tuple[int | None, FlagCounts]:
-    """Frames and flags by the head of a scan file; None where it does not open."""
-    from beamline.storage import hdf5
-    from beamline.storage.flag_legend import read_flags
-    from beamline.storage.writers import layout
-
-    with suppress(DataError, OSError), hdf5.open_hdf5(scan, follow=True) as file, hdf5.readable(scan):
-        n = int(file[layout.COMMITTED][()])
-        return n, read_flags(file, n).counts() if n else {}
-    return None, {}
-
-
-def _head(part: Path) -> Mapping[str, Any]:
-    """The first event of a run; empty without one."""
-    with suppress(OSError), open_below(part, EVENTS) as file:
-        for line in whole_lines(file, _HEAD):
-            if (event := _event(line, ("run_started",))) is not None:
-                return event
-    return {}
-
-
-def _last_events(part: Path) -> Mapping[str, Mapping[str, Any]]:
-    """The last event of each kind that tells the outcome of a part, from the end of its log."""
-    last_events: dict[str, Mapping[str, Any]] = {}
-    with suppress(OSError), open_below(part, EVENTS) as file:
-        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
-        for line in reversed(file.read(_TAIL).splitlines()):
-            kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in last_events)
-            if (event := _event(line, kinds)) is not None and "source" not in event:  # an event of the live volume
-                last_events[event["event"]] = event
-            if last_events.keys() & {"done", "scan_done"} and "state" in last_events:
-                break
-    return last_events
-
-
-def _event(line: bytes, kinds: Iterable[str]) -> dict[str, Any] | None:
-    """The event in a line, if it is of one of these kinds; keys have the order of `Event.to_json`."""
-    return event_in(line) if any(line.startswith(f'{{"event": "{kind}"'.encode()) for kind in kinds) else None
-
-
-def _whole(value: object) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) else None
-
-
-def _flags(value: object) -> FlagCounts:
-    flags = value if isinstance(value, dict) else {}
-    return {
-        str(check): {str(level): n for level, n in levels.items() if isinstance(n, int)}
-        for check, levels in flags.items()
-        if isinstance(levels, dict)
-    }
-
-
-def _sizes(folder: Path) -> Iterator[int]:
-    with suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            with suppress(OSError):
-                if entry.is_dir(follow_symlinks=False):
-                    yield from _sizes(Path(entry.path))
-                else:
-                    yield entry.stat(follow_symlinks=False).st_size
+def _size(path: Path) -> int:
+    """Bytes of a file; 0 of one that has gone meanwhile."""
+    with suppress(OSError):
+        return path.lstat().st_size
+    return 0

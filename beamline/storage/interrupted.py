@@ -5,13 +5,13 @@ Every command that meets such a run says the same, by `next_step`.
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
 from beamline.storage.parts import JOINED, may_hold_frames, to_join, views_in, views_planned
+from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
 
@@ -68,15 +68,20 @@ def next_step(scan: Path) -> str:
         scan = parts[-1] if parts else scan
     head = superblock(scan) if scan.is_file() else None
     resume = f"`beamline scan --resume {run}` takes what is missing"
-    if head is None or not head.open_for_writing:
-        return f"It ended early: {resume}." if run is not None and head and _lacks_views(run) else ""
-    if held(scan):
+    growing = head is not None and head.open_for_writing
+    lives = None if run is None else alive(parts_of(run)[-1])
+    if lives or (run is not None and held(run / EVENTS, exclusively=True)) or (growing and held(scan)):
         watch = "" if run is None else f"`beamline watch {run}` shows it, "
         return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
-    died = "Its scan has died"
-    if not abandoned(scan):  # where the disk has no locks, its program may run
-        age = time.time() - scan.stat().st_mtime
-        died += f", unless the program that wrote to it {age:.0f} s ago still runs"
+    if not growing:
+        if run is not None and head is not None and _lacks_views(run):
+            return f"It ended early: {resume}."
+        record = None if run is None else read_record(parts_of(run)[-1])
+        ended = f"after its scan file was closed: `beamline recover {run}` ends the run"
+        how = ended if head is not None else "before its first frame: start the scan anew"
+        return f"Its process died {how}." if record is not None and record.state == DIED else ""
+    sure = lives is False or abandoned(scan)  # where the disk has no locks, its program may run
+    died = "Its scan has died" + ("" if sure else ", unless a program still writes to it")
     what = scan if run is None else run
     recover = f"`beamline recover {what}` makes an ordinary file of the frames that are there"
     return f"{died}: {recover if run is None else f'{resume}, {recover}'}."

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LARGEST_LOG, LONGEST
-from beamline.core.files import EVENTS, open_below, parts_of, run_of, whole_file
+from beamline.core.files import parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
+from beamline.storage.run_record import read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import (
@@ -163,18 +163,16 @@ def other_parts(part: Path) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """Whether a part may have frames: its file has one, or is unreadable and its events (perhaps not all) name one.
+    """Whether a part may have frames: its file has one, or is unreadable and its record does not say that it has none.
 
     A part that ended before its first frame does not count.
     """
     if not part.is_file():
         return False
     with suppress(DataError), hdf5.open_hdf5(part) as file, hdf5.readable(part):
-        if file[layout.COMMITTED][()]:
-            return True
-    with suppress(OSError), open_below(part.parent, EVENTS, LARGEST_LOG) as log:
-        return any(b'"event": "frame"' in line for line in iter(lambda: log.readline(LONGEST), b""))
-    return True
+        return bool(file[layout.COMMITTED][()])
+    record = read_record(part.parent)
+    return record is None or record.frames != 0
 
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:

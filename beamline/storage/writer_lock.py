@@ -28,7 +28,7 @@ QUIET = 10.0  # s without a change, after which no program is taken to write the
 PATIENCE = 120.0  # s without a new frame, after which a growing file without the lock of its writer is given up
 _LOOK = 1.0  # s between looks whether the writer still holds its lock
 
-_TRIES, _PAUSE = 20, 0.005  # real s between tries for a shared lock
+_TRIES, _PAUSE = 20, 0.005  # real s between tries for a lock
 
 if sys.platform == "win32":
     import msvcrt
@@ -134,27 +134,34 @@ class WriterLock:
                 _lock(file, exclusive=exclusive)
                 return
             except (BlockingIOError, PermissionError):
-                if exclusive:
-                    self.release()
-                    raise
                 if left:
                     time.sleep(_PAUSE)  # `held` has the lock for a moment
+                elif exclusive:
+                    self.release()
+                    raise
             except OSError:  # no locks on this disk
                 return
 
 
-def held(path: Path) -> bool:
-    """Whether a running program has the file open, as far as locks tell; False if the file cannot be opened."""
+def held(path: Path, *, exclusively: bool = False) -> bool | None:
+    """Whether a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
+    its file system has no locks.
+
+    Args:
+        exclusively: those who hold this file lock it exclusively. Then those who ask do not hinder one another (but on
+            Windows).
+    """
+    writable = not exclusively and os.access(path, os.W_OK)
     try:
-        file = os.open(path, os.O_RDWR if os.access(path, os.W_OK) else os.O_RDONLY)
+        file = os.open(path, (os.O_RDWR if writable else os.O_RDONLY) | getattr(os, "O_NONBLOCK", 0))
     except OSError:
         return False
     try:
-        _lock(file, exclusive=True)
+        _lock(file, exclusive=not exclusively)
     except (BlockingIOError, PermissionError):
         return True
     except OSError:  # no locks on this disk
-        return False
+        return None
     finally:
         os.close(file)
     return False

@@ -16,6 +16,7 @@ from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
+from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from tests.beamline.fakes import FakeInstrument, assert_true
@@ -105,8 +106,13 @@ class Ran:
 
 @contextmanager
 def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a scan in the block writes is left as kill -9 would have, a while ago: marked as being written."""
-    died, close = list[Path](), NXtomoWriter.close
+    """What a scan in the block writes is left as kill -9 would have, a while ago: marked as being written, and without
+    a last state."""
+    died, close, put = list[Path](), NXtomoWriter.close, RecordFile.put
+
+    def put_none_of_an_end(file: RecordFile, record: RunRecord) -> None:
+        if not record.over:
+            put(file, record)
 
     def die(writer: NXtomoWriter, *_: object) -> None:
         died.append(writer.path)
@@ -115,6 +121,7 @@ def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
 
     with patch.context() as within:
         within.setattr(NXtomoWriter, "close", die)
+        within.setattr(RecordFile, "put", put_none_of_an_end)
         yield
     for path in died:
         path.with_name("died.h5").replace(path)

@@ -58,6 +58,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     from beamline.page.run_files import Reader, watched
     from beamline.scan.runs import newest, runs_in
     from beamline.storage.interrupted import next_step
+    from beamline.storage.run_record import alive
     from beamline.storage.writer_lock import held
 
     folder = path or Path(RUNS)
@@ -66,7 +67,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
         held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
         raise ConfigError(f"there is no file or folder {path}; {held_runs}.")
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
-    if not held(what.scan) and (advice := next_step(what.scan)):
+    if not (held(what.scan) if what.folder is None else alive(what.folder)) and (advice := next_step(what.scan)):
         click.echo(advice, err=True)
     reader = Reader(what)
     try:

@@ -27,10 +27,10 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import EVENTS, is_link, parts_of
+from beamline.core.files import is_link
 from beamline.features.page.app import Access, Strangers, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
-from beamline.scan.runs import HEAD, Run, cells, describe, runs_in
+from beamline.scan.runs import HEAD, cells, describe, runs_in
 
 OPEN_RUNS = 8
 """Runs whose files stay open without anybody who watches."""
@@ -50,7 +50,6 @@ class RunBrowser:
         self._folder, self._lock = folder, threading.Lock()
         self._access = Access(())
         self._numbers: dict[Path, int] = {}
-        self._known: dict[Path, tuple[tuple[int, ...], Run]] = {}
         self._opened: dict[int, _Opened] = {}
 
     def close(self) -> None:
@@ -67,7 +66,7 @@ class RunBrowser:
         """Head and rows, newest first, each with the number of its page."""
         with self._lock:
             rows = [
-                {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(self._described(run))}
+                {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(describe(run))}
                 for run in runs_in(self._folder)
                 if not _by_a_stranger(self._folder, run)
             ]
@@ -95,13 +94,6 @@ class RunBrowser:
             self._opened[number] = _Opened(reader, begins_with("index.html", routes))
         return self._opened[number]
 
-    def _described(self, run: Path) -> Run:
-        """Its facts, looked up again when its folder or log has changed."""
-        changed = tuple(_changed(path) for part in parts_of(run) for path in (part, part / EVENTS))
-        if run not in self._known or self._known[run][0] != changed or not self._known[run][1].over:
-            self._known[run] = changed, describe(run)
-        return self._known[run][1]
-
 
 def _by_a_stranger(folder: Path, run: Path) -> bool:
     """Whether another user made a link on the way to a run, which could lead to any run that this program can read."""
@@ -110,13 +102,6 @@ def _by_a_stranger(folder: Path, run: Path) -> bool:
     way = [run, *run.parents]
     links = [place for place in way[: way.index(folder)] if is_link(place)]
     return any(link.lstat().st_uid not in (0, os.geteuid()) for link in links)
-
-
-def _changed(path: Path) -> int:
-    try:
-        return path.stat().st_mtime_ns
-    except OSError:
-        return 0
 
 
 TOKEN_WITHIN = 5.0  # s in which a connection shows a token

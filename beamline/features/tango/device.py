@@ -20,8 +20,9 @@ from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity,
 from beamline.page.recording import Recording
 from beamline.page.tiles import MOST, TileRegion
 from beamline.scan.control import Asked, State, Verb, ask
-from beamline.scan.runs import DIED, newest
+from beamline.scan.runs import newest
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.run_record import DIED
 
 Picture = NDArray[np.float32]
 SHOWN = [each for each in fields(RunValues) if each.name not in ("data_rate", "residual", "skipped")]

@@ -17,6 +17,7 @@ import pytest
 import recon
 from beamline import api
 from beamline.core.events import Event
+from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers import layout
 from beamline.storage.writers.recon_file import ReconRecord
@@ -98,10 +99,7 @@ def _volume(value: float) -> ReconRecord:
 
 
 def test_the_live_volume_each_time_that_it_is_new_then_the_finished_one(run: Path) -> None:
-    events = (run / "events.jsonl").read_text()
-    cut = events[: events.index('{"event": "scan_done"')]
-    (run / "events.jsonl").write_text(cut + '{"event": "scan_done", "status": "complete", "n_frames": 19}\n')
-    (run / "control").mkdir()  # so the volume is being finished
+    record = RecordFile(run, RunRecord("finishing"))
     write_volume(run / "recon.snapshot.h5", _volume(1.0))
     grown = api.volumes(run)
     assert next(grown).data.max() == 1
@@ -110,7 +108,7 @@ def test_the_live_volume_each_time_that_it_is_new_then_the_finished_one(run: Pat
     assert next(grown).data.max() == 2
     write_volume(run / "recon.h5", _volume(3.0))
     (run / "recon.snapshot.h5").unlink()
-    (run / "events.jsonl").write_text(events)
+    record.close()
     (last,) = grown
     assert last.data.max() == 3 and last.grid.voxel_size == pytest.approx(0.1)
     assert len(list(api.volumes(run))) == 1

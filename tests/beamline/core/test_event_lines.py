@@ -1,13 +1,12 @@
 """JSON lines of events keep their names and values: lines recorded from commands before events were classes."""
 
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from beamline.core.events import KINDS, LONGEST, event_in, event_of, whole_lines
+from beamline.core.events import KINDS, LONGEST, event_in, event_of
 from beamline.page.followed_run import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
@@ -84,9 +83,3 @@ def test_a_line_that_is_no_event(line: str | bytes) -> None:
 def test_lines_of_another_version_are_events() -> None:
     assert event_in('{"event": "not known yet", "a": [1]}') == {"event": "not known yet", "a": [1]}
     assert event_in('{"event": "frame", "time": 1.0, "new": "x"}') is not None
-
-
-def test_lines_without_end_are_passed_over() -> None:
-    content = b"a\n" + b"x" * (3 * LONGEST) + b"\nb\nincomplete"
-    assert [*whole_lines(io.BytesIO(content))] == [b"a\n", b"", b"b\n"]
-    assert [*whole_lines(io.BytesIO(content), LONGEST)] == [b"a\n"]

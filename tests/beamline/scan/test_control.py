@@ -1,6 +1,5 @@
 """Verbs from another terminal reach a running scan, and nobody waits for one that is dead."""
 
-import json
 import os
 import stat
 from pathlib import Path
@@ -15,7 +14,7 @@ from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
-from beamline.storage.writer_lock import WriterLock
+from beamline.storage.run_record import RecordFile, RunRecord
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
 from tests.clock import wait_until
@@ -89,24 +88,24 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     runs = [tmp_path / "runs" / name for name in ("a", "b")]
     for run in runs:
         run.mkdir(parents=True)
-        (run / "scan.h5").touch()
+        (run / "config.resolved.yaml").touch()
     assert "no scan is running in runs" in CliRunner().invoke(main, ["pause"]).stderr
     stop = StopRequest()
-    (runs[0] / "events.jsonl").write_text('{"event": "frame"}\n{"event": "state", "state": "acquiring"}\n{"event": "st')
-    locks = [WriterLock(runs[0] / "scan.h5")]
+    files = [RecordFile(runs[0], RunRecord(State.ACQUIRING))]
     with verbs_taken(runs[0], stop, PauseRequest()):
         assert running(Path("runs")) == [Path("runs/a")]
         result = CliRunner().invoke(main, ["stop"])
         assert result.exit_code == 0 and result.stdout == f"{Path('runs/a')}: acquiring\n"
         assert stop.stopping and not stop.aborting
-        locks.append(WriterLock(runs[1] / "scan.h5"))
+        files.append(RecordFile(runs[1], RunRecord(State.PREPARING)))
         with verbs_taken(runs[1], stop, PauseRequest()):
             result = CliRunner().invoke(main, ["abort"])
             assert result.exit_code == 2 and "2 scans run in runs: a, b" in result.stderr
             assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0
             assert stop.aborting
-    for lock in locks:
-        lock.release()
+    for file in files:
+        file.close()
+    assert running(Path("runs")) == []
 
 
 def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
@@ -165,12 +164,3 @@ def test_a_request_that_is_a_link_or_somebody_elses_is_taken_away_and_not_done(t
         (tmp_path / "control" / "abort").symlink_to(tmp_path)
         wait_until(lambda: not any((tmp_path / "control").iterdir()))
     assert not stop.stopping
-
-
-def test_the_state_is_that_of_the_scan_not_of_its_live_reconstruction(tmp_path: Path) -> None:
-    lines = [
-        {"event": "state", "state": "paused", "message": ""},
-        {"event": "state", "state": "finishing", "source": "recon"},
-    ]
-    (tmp_path / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    assert state_of(tmp_path) is State.PAUSED

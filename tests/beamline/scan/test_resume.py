@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.errors import BeamlineError, ConfigError
+from beamline.core.errors import BeamlineError, ConfigError, DataError
 from beamline.core.files import parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
@@ -298,7 +298,7 @@ def test_what_cannot_go_on_is_refused_in_one_line(run: Path, change: Callable[[P
 
 def test_a_run_that_another_process_holds_is_refused(run: Path) -> None:
     lock = WriterLock(run / "scan.h5")
-    with pytest.raises(ConfigError, match="open in another process"):
+    with pytest.raises(DataError, match="open in a program that still runs"):
         _go_on(run)
     lock.release()
     with open_for_resume(run), pytest.raises(ConfigError, match="another process goes on"):

@@ -41,7 +41,8 @@ def test_a_run_from_trigger_to_file(tmp_path: Path, mode: str) -> None:
     assert ran.result.path == ran.folder / "scan.h5"
     assert (ran.result.n_frames, ran.result.missing, ran.result.flags) == (19, (), {})
     assert ran.result.bytes == ran.result.path.stat().st_size
-    assert {p.name for p in ran.folder.iterdir()} == {"config.resolved.yaml", "events.jsonl", "scan.h5", "user.log"}
+    names = {"config.resolved.yaml", "events.jsonl", "scan.h5", "state.json", "user.log"}
+    assert {p.name for p in ran.folder.iterdir()} == names
     assert ran.folder.name.endswith("_battery")
     assert load(ran.folder / "config.resolved.yaml", environment={}) == small(f"scan.mode={mode}")
     assert "close" not in ran.instrument.log  # whoever brings the devices closes them

@@ -1,18 +1,25 @@
 """Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
 
-import json
 import os
 import shutil
+import sys
 import time
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from beamline.core.errors import ConfigError
+from beamline.core.events import Event
 from beamline.core.stop import StopRequest
+from beamline.scan.control import State, running
+from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
+from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
+from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran
+from tests.beamline.ran import Ran, killed
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
@@ -29,14 +36,13 @@ def _run(runs: Path, at: int | None = None, *, abort: bool = True) -> Path:
     return ran.folder
 
 
-def _log(run: Path, *events: object) -> Path:
-    run.mkdir(parents=True)
-    (run / "events.jsonl").write_text("".join(f"{json.dumps(event)}\n" for event in events))
-    return run
-
-
-def _began(sample: str) -> dict[str, object]:
-    return {"event": "run_started", "time": 7.0, "sample": sample, "n_frames": 20}
+def _part(folder: Path, record: RunRecord) -> Path:
+    """A part that has ended, or died."""
+    folder.mkdir(parents=True)
+    for name in ("config.resolved.yaml", "events.jsonl"):
+        (folder / name).touch()
+    write_record(folder, record)
+    return folder
 
 
 def test_a_whole_run(tmp_path: Path) -> None:
@@ -62,41 +68,32 @@ def test_a_run_that_ended_early_has_its_frames_and_a_reason(tmp_path: Path) -> N
 def test_a_run_whose_process_was_killed_has_died_with_the_frames_of_its_file(tmp_path: Path) -> None:
     run = _run(tmp_path, 9)
     stored = describe(run).frames
-    events = (run / "events.jsonl").read_text().splitlines()
-    end = next(i for i, line in enumerate(events) if '"finishing"' in line)
-    (run / "events.jsonl").write_text("\n".join(events[:end]) + '\n{"event": "fra')
-    (run / "control").mkdir()  # nobody took it away
+    write_record(run, RunRecord(State.ACQUIRING, sample="battery", frames=2, planned=FRAMES))
     died = describe(run)
-    assert (died.state, died.frames) == ("died", stored)
+    assert (died.state, died.frames, died.planned) == ("died", stored, FRAMES)
+    assert "--resume" in died.next_step
 
 
 def test_parts_of_a_resumed_run_are_one_run(tmp_path: Path) -> None:
     """As run_scan writes it: what a later part says of its frames is of the joined file, of its flags its own."""
-    run = _log(
-        tmp_path / "2026-01-02T03-04-05_a",
-        _began("a"),
-        {"event": "scan_done", "path": "scan.h5", "n_frames": 9, "flags": {"mass": {"warn": 2}}},
-        {"event": "state", "state": "stopped"},
-        {"event": "failed", "message": "stopped"},
-    )
-    _log(
-        run / "part-2",
-        _began("a") | {"n_frames": 13},
-        {"event": "state", "state": "done"},
-        {"event": "done", "path": "joined.h5", "n_frames": 22, "flags": {"mass": {"warn": 1, "alarm": 4}}},
-    )
+    first = RunRecord(State.STOPPED, True, "a", 9, planned=20, flags={"mass": {"warn": 2}})
+    run = _part(tmp_path / "2026-01-02T03-04-05_a", first)
+    later = RunRecord(State.DONE, True, "a", 22, True, 13, {"mass": {"warn": 1, "alarm": 4}})
+    _part(run / "part-2", later)
     found = describe(run)
     assert runs_in(tmp_path) == [run]
     assert (found.frames, found.parts, found.state, found.planned) == (22, 2, "done", 20)
     assert found.flags == {"mass": {"warn": 3, "alarm": 4}}
-    (run / "part-2" / "events.jsonl").write_text('{"event": "frame", "n": 5}\n')
+    write_record(run / "part-2", replace(later, state=State.ACQUIRING, over=False, frames=5))
+    (run / "part-2" / "scan.h5").touch()
     assert (describe(run).frames, describe(run).state) == (None, "died")
 
 
 def test_newest_first_also_within_a_second(tmp_path: Path) -> None:
     names = ["2026-01-02T03-04-05_a", "2026-01-02T03-04-05_a-2", "2026-01-02T03-04-05_a-10", "2026-01-02T03-04-06_a"]
-    runs = [_log(tmp_path / name, _began("a")) for name in names]
-    renamed = _log(tmp_path / "the good one", _began("b"))  # began 7 s after the epoch
+    runs = [_part(tmp_path / name, RunRecord(State.DONE, True)) for name in names]
+    renamed = _part(tmp_path / "the good one", RunRecord(State.DONE, True))
+    os.utime(renamed / "config.resolved.yaml", (7.0, 7.0))  # it began then
     (tmp_path / "no run").mkdir()
     assert runs_in(tmp_path) == [*reversed(runs), renamed]
     assert newest(tmp_path) == runs[-1]
@@ -105,32 +102,112 @@ def test_newest_first_also_within_a_second(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "log",
-    [b"", b"\xff\xfe\n[1]\n7\n", b'{"event": "done", "n_frames": "x", "flags": [1], "path": 3}\n{"event"', b"\0" * 99],
+    "record", [b"", b"\xff\xfe\n[1]\n7\n", b'{"state": "done", "over": true, "frames": "x"}', b'{"state"', b"\0" * 99]
 )
-def test_a_damaged_log_hides_no_run(tmp_path: Path, log: bytes) -> None:
-    run = tmp_path / "2026-01-02T03-04-05_cell"
-    run.mkdir()
-    (run / "events.jsonl").write_bytes(log)
+def test_a_damaged_record_hides_no_run(tmp_path: Path, record: bytes) -> None:
+    run = _part(tmp_path / "2026-01-02T03-04-05_cell", RunRecord(State.DONE))
+    (run / "state.json").write_bytes(record)
     found = describe(run)
-    assert (found.sample, found.frames, found.state) == ("cell", None, "died")
+    assert (found.sample, found.frames, found.state) == ("cell", None, "not known")
+
+
+@pytest.mark.parametrize(("at", "abort", "state"), [(None, False, "done"), (8, False, "stopped"), (8, True, "stopped")])
+def test_a_run_of_an_earlier_version_has_the_state_of_its_file(
+    tmp_path: Path, at: int | None, abort: bool, state: str
+) -> None:
+    run = _run(tmp_path, at, abort=abort)
+    now = describe(run)
+    (run / "state.json").unlink()
+    earlier = describe(run)
+    assert (earlier.state, earlier.frames, earlier.sample) == (state, now.frames, "battery")
+
+
+def test_a_run_of_an_earlier_version_whose_file_is_not_closed_is_not_said_to_have_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with killed(monkeypatch):
+        run = _run(tmp_path, 9)
+    (run / "state.json").unlink()
+    lock = WriterLock(run / "scan.h5")
+    assert describe(run).state == "not known" and describe(run).next_step.startswith("Its scan still runs")
+    lock.release()
+    assert describe(run).state == "not known" and describe(run).next_step.startswith("Its scan has died")
+
+
+FIT = """
+import json, pathlib, sys, time
+print(json.dumps({"event": "state", "state": "ready", "message": "", "time": 0.0}), flush=True)
+def wait(name):
+    while not pathlib.Path(sys.argv[1], name).exists():
+        time.sleep(0.01)
+wait("closed")
+progress = {"event": "progress", "stage": "fit", "of": 9000, "per_s": 1.0, "eta_s": 1e3, "time": 0.0}
+for n in range(9000):
+    print(json.dumps(progress | {"n": n}), flush=n == 8999)
+wait("listed")
+print(json.dumps({"event": "done", "time": 0.0, "output": "v.h5"}))
+"""
+
+
+def test_a_scan_whose_last_fit_says_much_is_listed_as_it_is_until_its_process_ends(tmp_path: Path) -> None:
+    """The fit writes a megabyte of events after the scan's last one."""
+    listed, runs = list[tuple[str, int | None]](), tmp_path / "runs"
+
+    def look(event: Event) -> None:
+        if event.event == "scan_done":
+            (tmp_path / "closed").touch()
+        elif event.event == "progress" and event.data["n"] % 1000 == 999:
+            (run,) = map(describe, runs_in(runs))
+            listed.append((run.state, run.frames))
+            assert running(runs) == [newest(runs)] == [run.folder]
+            if event.data["n"] == 8999:
+                (tmp_path / "listed").touch()
+
+    command = [sys.executable, "-c", FIT, str(tmp_path)]
+    ran = Ran(runs, FakeInstrument(), live=lambda scan, volume: command, heard=look)
+    assert (ran.folder / "events.jsonl").stat().st_size > 2**20
+    assert listed == [("finishing", FRAMES)] * 9
+    assert (describe(ran.folder).state, describe(ran.folder).frames) == ("done", FRAMES)
+
+
+def test_of_a_kill_in_the_last_fit_the_run_has_died_and_recover_says_that_it_is_complete(tmp_path: Path) -> None:
+    run = _run(tmp_path)
+    record = read_record(run)
+    assert record is not None
+    write_record(run, replace(record, state=State.FINISHING, over=False))
+    died = describe(run)
+    assert (died.state, died.frames) == ("died", FRAMES)
+    assert f"`beamline recover {run}` ends the run" in died.next_step
+    recover_run(run)
+    assert (describe(run).state, describe(run).frames, describe(run).next_step) == ("done", FRAMES, "")
+
+
+def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in_preparation(tmp_path: Path) -> None:
+    run = _run(tmp_path, 9)
+    file = RecordFile(run, RunRecord(State.FINISHING, sample="battery"))
+    for take_up in (recover_run, open_for_resume):
+        with pytest.raises(ConfigError, match=r"still runs.*Nothing was changed"), ExitStack() as opened:
+            taken = take_up(run)
+            opened.enter_context(taken)  # type: ignore[arg-type]
+    assert describe(run).state == "finishing"
+    file.close()
+    assert describe(run).state == "failed"  # by a process that ended without a word of how
+    with open_for_resume(run), pytest.raises(ConfigError, match="another process goes on with it or recovers it"):
+        assert describe(run).state == "preparing"
+        recover_run(run)
+    assert describe(run).state == "failed"
 
 
 @pytest.mark.bench
 def test_five_hundred_runs_take_less_than_two_seconds(tmp_path: Path) -> None:
-    """A tenth of them have no end in their log; each log has a megabyte of frames in its middle."""
+    """A tenth of them have died."""
     run = _run(tmp_path / "one", 9)
-    began, *rest = (run / "events.jsonl").read_text().splitlines()
-    middle = json.dumps({"event": "frame", "time": 0.0, "n": 1, "of": 2})
-    whole = "\n".join([began, *([middle] * 20_000), *rest, ""])
-    (run / "events.jsonl").unlink()
-    (tmp_path / "whole").write_text(whole)
-    (tmp_path / "cut").write_text("\n".join([began, middle, ""]))
+    record = read_record(run)
+    assert record is not None
     for i in range(500):
         one = tmp_path / "runs" / f"2026-01-02T03-{i // 60:02}-{i % 60:02}_a"
-        one.mkdir(parents=True)
+        _part(one, replace(record, state=State.ACQUIRING, over=False) if i % 10 == 0 else record)
         os.link(run / "scan.h5", one / "scan.h5") if hasattr(os, "link") else shutil.copy(run / "scan.h5", one)
-        os.link(tmp_path / ("whole" if i % 10 else "cut"), one / "events.jsonl")
     began_at = time.process_time()
     found = [describe(each) for each in runs_in(tmp_path / "runs")]
     assert time.process_time() - began_at < 2

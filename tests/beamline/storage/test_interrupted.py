@@ -75,12 +75,14 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
     shutil.copy2(scan, alone)
     said = f"Its scan has died: `beamline recover {alone}` makes an ordinary file of the frames that are there."
     assert next_step(alone) == said
-    os.utime(scan)  # perhaps on a disk without locks
-    assert next_step(scan).startswith("Its scan has died, unless the program that wrote to it 0 s ago still runs: ")
-    lock = WriterLock(scan)
-    assert next_step(scan).startswith(f"Its scan still runs: `beamline watch {died}`")
-    assert "recover" not in next_step(scan)
-    lock.release()
+    for file in (scan, alone):
+        os.utime(file)
+    assert next_step(scan) == f"Its scan has died: {_both(died)}"
+    assert next_step(alone).startswith("Its scan has died, unless a program still writes to it: ")  # perhaps no locks
+    for lock in (WriterLock(scan), WriterLock(died / "config.resolved.yaml", exclusive=True)):
+        assert next_step(scan).startswith(f"Its scan still runs: `beamline watch {died}`")
+        assert "recover" not in next_step(scan)
+        lock.release()
 
 
 @pytest.mark.parametrize("end", ["stopped", "aborted"])

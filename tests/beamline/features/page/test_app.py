@@ -19,6 +19,7 @@ from beamline.monitor.check import Level
 from beamline.page.recording import Recording
 from beamline.page.run_files import EventLog, watched
 from beamline.scan.control import verbs_taken
+from beamline.storage.run_record import RunRecord, write_record
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.features.page.served import Served, served
@@ -145,7 +146,8 @@ def test_what_is_not_there_is_a_sentence(page: Served) -> None:
 
 def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All threads that answer requests are busy with a file that does not answer."""
-    write_run(tmp_path, {"event": "state", "state": "finishing"})  # how it answers
+    write_run(tmp_path)
+    write_record(tmp_path, RunRecord("stopped", True))  # how it answers
     free, stop = threading.Event(), StopRequest()
     monkeypatch.setattr(Recording, "facts", lambda file: {"free": free.wait(60)})
     with (

@@ -1,0 +1,109 @@
+"""The record of a run: a small file in the folder of each of its parts, and locks that tell whether a process is at
+work there.
+
+The process of a part holds a lock on the part's configuration as long as it lives, to the end of its last fit. The
+system drops it with the process. A process that recovers a run or goes on with it holds one on the run's events.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from beamline.core.files import CONFIG, RECORD, SETTINGS, bytes_below
+from beamline.storage.writer_lock import WriterLock, held
+
+DIED = "died"  # State of a part whose process has ended without writing another
+EVERY = 1.0  # real s between two writes of the record while only its number of frames grows
+_TRIES, _PAUSE = 20, 0.01  # real s between tries to write the last record: Windows replaces no file that is being read
+
+FlagCounts = dict[str, dict[str, int]]
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a part of a run is doing, and what it has.
+
+    Attributes:
+        state: see docs/states.md.
+        over: whether that is its last state.
+        sample: its name.
+        frames: in its file, or where `joined` in the file that joins the parts so far; None: not known.
+        planned: frames that it is to have; None: not known.
+        flags: frames that the monitor flagged: their number by check, then by level; empty before its file is closed.
+        time: when this was written, s since the Unix epoch.
+    """
+
+    state: str
+    over: bool = False
+    sample: str = ""
+    frames: int | None = 0
+    joined: bool = False
+    planned: int | None = None
+    flags: FlagCounts = field(default_factory=dict)
+    time: float = field(default=0.0, compare=False)
+
+
+_RECORDS = TypeAdapter(RunRecord)
+
+
+def read_record(part: Path) -> RunRecord | None:
+    """The record of a part, `died` where its process has ended without writing its last state.
+
+    None: it has none, as those of earlier versions, or it is damaged.
+    """
+    lives = alive(part)  # asked first: the last record is written before the lock goes
+    with suppress(OSError, ValueError):
+        record = _RECORDS.validate_json(bytes_below(part, RECORD, SETTINGS), strict=True)
+        return record if record.over or lives is not False else replace(record, state=DIED)
+    return None
+
+
+def write_record(part: Path, record: RunRecord) -> None:
+    """Write the record of a part: readers see the one before or this one. Raises OSError."""
+    path = part / RECORD
+    partial = path.with_name(f".{RECORD}.new")
+    partial.write_text(json.dumps(asdict(replace(record, time=time.time()))), encoding="utf-8")
+    partial.replace(path)
+
+
+def alive(part: Path) -> bool | None:
+    """Whether the process of a part lives; None: its file system has no locks."""
+    return held(part / CONFIG, exclusively=True)
+
+
+class RecordFile:
+    """The record of a part that this process takes, until `close`. Locks the part, whose configuration is there.
+
+    Raises:
+        OSError: the record cannot be written, or another process holds the part.
+    """
+
+    def __init__(self, part: Path, record: RunRecord) -> None:
+        self._part, self.record, self._written_at = part, record, time.monotonic()
+        self._lock = WriterLock(part / CONFIG, exclusive=True)
+        write_record(part, record)
+        self._written = record
+
+    def close(self) -> None:
+        """Let go of the part; one without a last state has failed."""
+        last = self.record if self.record.over else replace(self.record, state="failed", over=True)
+        for _ in range(_TRIES):
+            self.put(last)
+            time.sleep(_PAUSE * (self._written != last))
+        self._lock.release()
+
+    def put(self, record: RunRecord, *, at_once: bool = True) -> None:
+        """Note what it is doing, unless `at_once` only once in EVERY; a disk that refuses is asked again at the next
+        call."""
+        self.record = record
+        if record == self._written or not (at_once or time.monotonic() - self._written_at > EVERY):
+            return
+        with suppress(OSError):
+            write_record(self._part, record)
+            self._written, self._written_at = record, time.monotonic()
