@@ -65,11 +65,12 @@ class Terminal:
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self._console = Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+        acting = getattr(stream, "acting", stream)
+        self._console = Console(file=acting, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=24),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
             console=self._console,
             transient=True,
@@ -132,7 +133,7 @@ class Terminal:
                 text = sentence(event)
                 if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                     self._last_text = text
-                    self._console.print(printable(text))
+                    self._console.print(text)
 
     def _show_phase(self, reached: PhaseReached) -> None:
         if reached.n or not self._bar.disable:
@@ -150,6 +151,7 @@ class Terminal:
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:
             return
+        note = printable(note).replace("\n", " ")
         if not self._bar.disable:
             self._bar.start()
             if what not in self._tasks:

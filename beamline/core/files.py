@@ -25,6 +25,7 @@ PART = "part-{}"  # The folder of a later part of a scan that was resumed, in th
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
 RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
+JOINED = "joined.h5"  # The file of all parts of a run, beside the first one
 CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 USER_LOG, RECON_LOG = "user.log", "recon.log"
@@ -205,11 +206,19 @@ def broken_link(path: Path) -> str:
     return ""
 
 
+_BESIDE = 44  # bytes by which names of temporary files and of what lies beside a volume are longer than its own
+
+
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
+    if len(os.fsencode(path.name)) > (most := _longest_name(path.parent) - _BESIDE):
+        raise DataError(
+            f"{path} has a name of {len(os.fsencode(path.name))} bytes, and {most} are the most that leave room for "
+            "temporary files and those beside it. Name another output. Nothing was written."
+        )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
     if path.exists():
@@ -218,6 +227,13 @@ def refuse_existing(path: Path) -> None:
         raise DataError(
             f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create it first."
         )
+
+
+def _longest_name(folder: Path) -> int:
+    """Bytes of a name in a folder, by its file system."""
+    with suppress(AttributeError, OSError):  # Windows says nothing, nor does a folder that is not there
+        return os.pathconf(folder, "PC_NAME_MAX")
+    return 255
 
 
 def refuse_not_utf8(path: Path | str) -> None:

@@ -30,12 +30,20 @@ from beamline.core.events import (
     TrialDone,
     Warned,
 )
-from beamline.core.text import size, spans
+from beamline.core.text import one_line, size, spans
 from drivers.base.clock import Clock
 
 
 def sentence(event: Event) -> str | None:
-    """The event as a sentence; None for events that only update a progress display."""
+    """The event as a sentence in one line of printable text; None for events that only update a progress display."""
+    text = _sentence(event)
+    return None if text is None else one_line(text, _LONGEST)
+
+
+_LONGEST = 10_000  # characters of a sentence
+
+
+def _sentence(event: Event) -> str | None:
     match event:
         case RunStarted(folder, _, _, n, duration, total_bytes):
             return f"Run {folder}: {n} frames, {size(total_bytes)}, {duration:.0f} s"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 
@@ -40,6 +41,22 @@ def one_line(text: str, most: int = 200) -> str:
     return line if len(line) <= most else line[: most - 3] + "..."
 
 
+_NO_NAME = frozenset('<>:"/\\|?*$`;')  # characters that some file system, or a shell, takes for more than a letter
+_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
+
+
+def safe_name(text: str, most: int = 120) -> str:
+    """A name for a file or folder by a foreign text: one that stays in its folder, and that no file system, shell,
+    terminal or spreadsheet takes for anything else. It is its own safe name.
+
+    Args:
+        most: bytes; what is beyond is cut off.
+    """
+    legal = "".join(c if c.isprintable() and c not in _NO_NAME else "_" for c in text).lstrip(" .-=+@~")
+    legal = f"_{legal}" if _DEVICE.match(legal) else legal
+    return legal.encode()[:most].decode(errors="ignore").rstrip(" .") or "unnamed"
+
+
 def count(n: int, noun: str) -> str:
     """`1 view`, `2 views`."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
@@ -65,10 +82,14 @@ def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
     )
 
 
+_FORMULA = re.compile(r"[=@\t\r\n]|[+-](?!$|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$|inf$|nan$)", re.IGNORECASE)
+
+
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV, one line per row."""
+    """Rows of cells as CSV, one line per row; text that a spreadsheet would compute begins with `'`."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
+    cells = ([f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows)
+    csv.writer(out, lineterminator="\n").writerows(cells)
     return out.getvalue()
 
 

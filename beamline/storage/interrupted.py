@@ -9,9 +9,16 @@ import time
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.files import CONFIG, EVENTS, RECON, SCAN, parts_of, run_of
+from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, may_hold_frames, to_join, views_in, views_planned
+from beamline.storage.parts import (
+    joined_file_of,
+    may_hold_frames,
+    other_parts,
+    to_join,
+    views_in,
+    views_planned,
+)
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
 
@@ -34,6 +41,19 @@ def scan_file(path: str | Path) -> Path:
         step = next_step(parts[-1]) or f"{to_join(path)}."
         raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
     return path / SCAN
+
+
+def whole_scan(path: Path) -> Path:
+    """The scan file at a path as `scan_file`; for a part of a run that was resumed the file with all parts.
+
+    Raises:
+        DataError: as `scan_file`, also for a part that no file joins with the others.
+    """
+    if path.is_dir():
+        return scan_file(path)
+    if (joined := joined_file_of(path)) is not None:
+        return joined[0]
+    return scan_file(run_of(path.resolve().parent)) if other_parts(path) else path
 
 
 def volume_file(path: Path) -> Path:

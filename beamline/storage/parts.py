@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, LONGEST
-from beamline.core.files import EVENTS, open_below, parts_of, run_of, whole_file
+from beamline.core.files import EVENTS, JOINED, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
 from beamline.storage.superblock import superblock
@@ -37,7 +37,6 @@ from beamline.storage.writers.rows import (
 )
 from drivers.base.frame import FrameKind
 
-JOINED = "joined.h5"  # The file of all parts, in the folder of the run, where its first part is
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)

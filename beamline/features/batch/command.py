@@ -14,20 +14,23 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import BeamlineError, DataError, ScanStopped
 from beamline.core.files import RECON
 from beamline.core.machine import Need
-from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
+from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch, scan_of
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
-    """Files that match names and patterns, each once, in the order given."""
-    from beamline.storage.interrupted import scan_file  # here: help needs none of it
-
+    """Scans that match names and patterns, each once, in the order given."""
     scans: dict[Path, None] = {}
     for name in value:
         path, root = Path(name), Path(Path(name).anchor)
         matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
         if not matches:
             raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
-        scans.update((scan_file(match.resolve()), None) for match in matches)
+        for match in matches:
+            scans[scan := scan_of(match)] = None
+            if not match.is_dir() and scan != match.resolve():
+                click.echo(
+                    f"{match} is a part of a run that was resumed: {scan}, which has all of it, is taken.", err=True
+                )
     return list(scans)
 
 

@@ -194,7 +194,7 @@ def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sen
         (("/x/a.h5", "/x/b.h5"), ["a", "b"]),
         (("/x/run1/scan.h5", "/x/run2/scan.h5", "/x/c.h5"), ["run1_scan", "run2_scan", "c"]),
         (("/1/r/s.h5", "/2/r/s.h5"), ["1_r_s", "2_r_s"]),
-        (("/x/s.h5", "/x/s.tif"), ["x_s_0", "x_s_1"]),
+        (("/x/s.h5", "/x/s.tif"), ["x_s", "x_s_2"]),
         (("/a/Tooth.h5", "/b/tooth.h5"), ["a_Tooth", "b_tooth"]),  # one folder on some disks
     ],
 )  # fmt: skip
