@@ -89,8 +89,8 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Rows of cells as CSV, one line per row; text that a spreadsheet would compute begins with `'`."""
     out = io.StringIO()
     cells = ([f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows)
-    csv.writer(out, lineterminator="\n").writerows(cells)
-    return out.getvalue()
+    csv.writer(out, lineterminator="\r\n").writerows(cells)  # which quotes cells with either of these
+    return out.getvalue().replace("\r\n", "\n")
 
 
 def frames_text(frames: Iterable[int]) -> str:

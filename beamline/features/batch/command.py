@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
             raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
         for match in matches:
             scans[scan := scan_of(match)] = None
-            if not match.is_dir() and scan != match.resolve():
+            if not match.is_dir() and scan != Path(os.path.realpath(match)):
                 click.echo(
                     f"{match} is a part of a run that was resumed: {scan}, which has all of it, is taken.", err=True
                 )
