@@ -74,6 +74,8 @@ class Terminal:
             TimeElapsedColumn(),
             console=self._console,
             transient=True,
+            redirect_stdout=False,  # rich's stand-ins let control characters of others through
+            redirect_stderr=False,
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}

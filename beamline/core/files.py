@@ -216,8 +216,8 @@ def refuse_existing(path: Path) -> None:
     """
     if len(os.fsencode(path.name)) > (most := _longest_name(path.parent) - _BESIDE):
         raise DataError(
-            f"{path} has a name of {len(os.fsencode(path.name))} bytes, and {most} are the most that leave room for "
-            "temporary files and those beside it. Name another output. Nothing was written."
+            f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for temporary files "
+            f"and for what lies beside {path}. Name another output. Nothing was written."
         )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
