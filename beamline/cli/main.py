@@ -195,8 +195,8 @@ class LazyGroup(click.Group):
                 left = leave_traceback(error, Path())
                 message += f"; the traceback is in {left}" if left else "; --debug shows where"
                 message += ". Please report it. What was written before is as it was written."
-            message = re.sub(r"\n(?! )", " ", message)  # of a file's name: lines of ours are indented
-            click.echo(f"beamline: {printable(message)}", err=True)
+            # A line end that no indent follows is one of a file's name.
+            click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)
             ctx.exit(exit_code(error))
 
 

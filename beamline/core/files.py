@@ -214,10 +214,12 @@ def refuse_existing(path: Path) -> None:
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
-    if len(os.fsencode(path.name)) > (most := _longest_name(path.parent) - _BESIDE):
+    asked = hasattr(os, "pathconf") and path.parent.is_dir()
+    most = (os.pathconf(path.parent, "PC_NAME_MAX") if asked else 255) - _BESIDE
+    if len(os.fsencode(path.name)) > most:
         raise DataError(
-            f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for temporary files "
-            f"and for what lies beside {path}. Name another output. Nothing was written."
+            f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for names of "
+            f"temporary files and of what lies beside {path}. Name another output. Nothing was written."
         )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
@@ -227,13 +229,6 @@ def refuse_existing(path: Path) -> None:
         raise DataError(
             f"The folder {path.parent} does not exist, so {path.name} cannot be written there. Create it first."
         )
-
-
-def _longest_name(folder: Path) -> int:
-    """Bytes of a name in a folder, by its file system."""
-    with suppress(AttributeError, OSError):  # Windows says nothing, nor does a folder that is not there
-        return os.pathconf(folder, "PC_NAME_MAX")
-    return 255
 
 
 def refuse_not_utf8(path: Path | str) -> None:

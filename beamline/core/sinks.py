@@ -30,20 +30,12 @@ from beamline.core.events import (
     TrialDone,
     Warned,
 )
-from beamline.core.text import one_line, size, spans
+from beamline.core.text import SENTENCE, one_line, size, spans
 from drivers.base.clock import Clock
 
 
 def sentence(event: Event) -> str | None:
-    """The event as a sentence in one line of printable text; None for events that only update a progress display."""
-    text = _sentence(event)
-    return None if text is None else one_line(text, _LONGEST)
-
-
-_LONGEST = 10_000  # characters of a sentence
-
-
-def _sentence(event: Event) -> str | None:
+    """The event as a sentence; None for events that only update a progress display."""
     match event:
         case RunStarted(folder, _, _, n, duration, total_bytes):
             return f"Run {folder}: {n} frames, {size(total_bytes)}, {duration:.0f} s"
@@ -95,7 +87,7 @@ class UserLog:
         text = sentence(event)
         if text:
             stamp = datetime.fromtimestamp(event.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            self._stream.write(f"{stamp}  {text}\n")
+            self._stream.write(f"{stamp}  {one_line(text, SENTENCE)}\n")
             self._stream.flush()
 
 

@@ -35,13 +35,15 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
+SENTENCE = 10_000  # characters of the longest one that is shown in one line
+
+
 def one_line(text: str, most: int = 200) -> str:
     """A foreign text as one line for a log or a terminal: shortened, without control characters."""
     line = printable(" ".join(text[: 4 * most].split()))
     return line if len(line) <= most else line[: most - 3] + "..."
 
 
-_NO_NAME = frozenset('<>:"/\\|?*$`;')  # characters that some file system, or a shell, takes for more than a letter
 _DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
 
 
@@ -52,7 +54,8 @@ def safe_name(text: str, most: int = 120) -> str:
     Args:
         most: bytes; what is beyond is cut off.
     """
-    legal = "".join(c if c.isprintable() and c not in _NO_NAME else "_" for c in text).lstrip(" .-=+@~")
+    shown = "".join(c if c.isprintable() else "_" for c in text)
+    legal = re.sub(r'[<>:"/\\|?*$`;]', "_", shown).lstrip(" .-=+@~")  # each is more than a letter to some program
     legal = f"_{legal}" if _DEVICE.match(legal) else legal
     return legal.encode()[:most].decode(errors="ignore").rstrip(" .") or "unnamed"
 
@@ -88,8 +91,9 @@ _FORMULA = re.compile(r"[=@\t\r\n]|[+-](?!$|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$|inf$|
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Rows of cells as CSV, one line per row; text that a spreadsheet would compute begins with `'`."""
     out = io.StringIO()
-    cells = ([f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows)
-    csv.writer(out, lineterminator="\r\n").writerows(cells)  # which quotes cells with either of these
+    csv.writer(out, lineterminator="\r\n").writerows(  # which quotes cells with either of these
+        [f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows
+    )
     return out.getvalue().replace("\r\n", "\n")
 
 

@@ -5,20 +5,15 @@ Every command that meets such a run says the same, by `next_step`.
 
 from __future__ import annotations
 
+import os
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import (
-    joined_file_of,
-    may_hold_frames,
-    other_parts,
-    to_join,
-    views_in,
-    views_planned,
-)
+from beamline.storage.parts import joined_file_of, may_hold_frames, to_join, views_in, views_planned
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
 
@@ -44,16 +39,14 @@ def scan_file(path: str | Path) -> Path:
 
 
 def whole_scan(path: Path) -> Path:
-    """The scan file at a path as `scan_file`; for a part of a run that was resumed the file with all parts.
+    """The scan file at a path, without links: of a run's folder, or a part of one that was resumed, that of all parts.
 
-    Raises:
-        DataError: as `scan_file`, also for a part that no file joins with the others.
+    Where there is none the path itself, of which no scan can be opened; the error then says why.
     """
-    if path.is_dir():
-        return scan_file(path)
-    if (joined := joined_file_of(path)) is not None:
-        return joined[0]
-    return scan_file(run_of(path.resolve().parent)) if other_parts(path) else path
+    with suppress(DataError, RuntimeError):  # RuntimeError: links in a circle
+        joined = None if path.is_dir() else joined_file_of(path)
+        path = scan_file(path) if joined is None else joined[0]
+    return Path(os.path.realpath(path))
 
 
 def volume_file(path: Path) -> Path:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import itertools
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -177,9 +175,8 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
     """A safe name for each file: its stem, with as many of its folders as tell it from the other files and those of
     earlier rows, and a number where their names, or the batch's own, are the same."""
     paths = [*(Path(row.scan) for row in earlier), *scans]
-    stems = [Path(SCAN if path.name == JOINED else path).stem for path in paths]
-    parts = [(*path.absolute().parent.parts[1:], stem) for path, stem in zip(paths, stems, strict=True)]
-    names = [safe_name(stem) for stem in stems]
+    parts = [(*path.absolute().parent.parts[1:], (path, Path(SCAN))[path.name == JOINED].stem) for path in paths]
+    names = [safe_name(own[-1]) for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
         folded = [name.casefold() for name in names]
         names = [
@@ -217,21 +214,13 @@ def _refuse_other(folder: Path, recipe: bytes) -> None:
         )
 
 
-def scan_of(path: Path) -> Path:
-    """The file to reconstruct for a path: for a part of a run that was resumed, or the run's folder, that of the whole
-    scan. Where there is none, the reconstruction of the path says why."""
-    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
-
-    with suppress(DataError, RuntimeError):  # RuntimeError: links in a circle
-        path = whole_scan(path)
-    return Path(os.path.realpath(path))
-
-
 def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
-    rows = [row if row.has_volume else replace(row, scan=str(scan_of(Path(row.scan)))) for row in earlier]
+    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+
+    rows = [row if row.has_volume else replace(row, scan=str(whole_scan(Path(row.scan)))) for row in earlier]
     old = {row.scan for row in rows}
-    new = [path for path in dict.fromkeys(map(scan_of, scans)) if str(path) not in old]
+    new = [path for path in dict.fromkeys(map(whole_scan, scans)) if str(path) not in old]
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
@@ -304,11 +293,10 @@ def _read(folder: Path) -> list[BatchRow]:
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
             rows = [{name: value for name, value in row.items() if name and value} for row in csv.DictReader(file)]
         table = TypeAdapter(list[BatchRow]).validate_python(rows)
-        used = {TABLE, RECIPE}
-        for row in table:
-            if row.name != safe_name(row.name) or row.name.casefold() in used:
+        folded = [TABLE, RECIPE, *(row.name.casefold() for row in table)]
+        for n, row in enumerate(table, start=2):
+            if row.name != safe_name(row.name) or folded[n] in folded[:n]:
                 raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
-            used.add(row.name.casefold())
         return table
     except ValidationError as error:
         first = error.errors()[0]

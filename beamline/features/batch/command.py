@@ -15,11 +15,13 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import BeamlineError, DataError, ScanStopped
 from beamline.core.files import RECON
 from beamline.core.machine import Need
-from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch, scan_of
+from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
     """Scans that match names and patterns, each once, in the order given."""
+    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+
     scans: dict[Path, None] = {}
     for name in value:
         path, root = Path(name), Path(Path(name).anchor)
@@ -27,7 +29,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
         if not matches:
             raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
         for match in matches:
-            scans[scan := scan_of(match)] = None
+            scans[scan := whole_scan(match)] = None
             if not match.is_dir() and scan != Path(os.path.realpath(match)):
                 click.echo(
                     f"{match} is a part of a run that was resumed: {scan}, which has all of it, is taken.", err=True
