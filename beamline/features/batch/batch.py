@@ -175,7 +175,7 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
     """A safe name for each file: its stem, with as many of its folders as tell it from the other files and those of
     earlier rows, and a number where their names, or the batch's own, are the same."""
     paths = [*(Path(row.scan) for row in earlier), *scans]
-    parts = [(*path.absolute().parent.parts[1:], (path, Path(SCAN))[path.name == JOINED].stem) for path in paths]
+    parts = [(*path.absolute().parent.parts[1:], Path(SCAN if path.name == JOINED else path).stem) for path in paths]
     names = [safe_name(own[-1]) for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
         folded = [name.casefold() for name in names]

@@ -183,7 +183,8 @@ def _assert_told_of_parts(run: Path) -> None:
 def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path) -> None:
     _go_on(run)
     _assert_told_of_parts(run)
-    ingest(run / "joined.h5", tmp_path / "ingested.h5")
+    assert ingest(run / "joined.h5", tmp_path / "ingested.h5").doubts == ()
+    assert "one of 2 parts" in ingest(run / "scan.h5", tmp_path / "part.h5").doubts[0]
     images = np.zeros((2, 8, 12), np.uint16)
     for path in (run / "joined.h5", tmp_path / "ingested.h5"):
         with open_scan(path) as source, h5py.File(run / "scan.h5") as part:
