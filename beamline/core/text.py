@@ -44,7 +44,7 @@ def one_line(text: str, most: int = 200) -> str:
     return line if len(line) <= most else line[: most - 3] + "..."
 
 
-_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
 
 
 def safe_name(text: str, most: int = 120) -> str:
@@ -55,8 +55,7 @@ def safe_name(text: str, most: int = 120) -> str:
         most: bytes; what is beyond is cut off.
     """
     shown = "".join(c if c.isprintable() else "_" for c in text)
-    legal = re.sub(r'[<>:"/\\|?*$`;]', "_", shown).lstrip(" .-=+@~")  # each is more than a letter to some program
-    legal = f"_{legal}" if _DEVICE.match(legal) else legal
+    legal = _DEVICE.sub(r"_\g<0>", re.sub(r'[<>:"/\\|?*$`;]', "_", shown).lstrip(" .-=+@~"))
     return legal.encode()[:most].decode(errors="ignore").rstrip(" .") or "unnamed"
 
 

@@ -16,7 +16,7 @@ from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached,
 from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
 from beamline.core.machine import Need
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import count, csv_text, one_line, safe_name, size
+from beamline.core.text import SENTENCE, count, csv_text, one_line, safe_name, size
 from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
@@ -131,7 +131,10 @@ class BatchPlan(Need):
     def lines(self) -> list[str]:
         """The plan as lines for people."""
         width = max((len(row.name) for row in self.rows), default=4)
-        rows = [f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{row.scan}" for row in self.rows]
+        rows = [
+            f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{one_line(row.scan, SENTENCE)}"
+            for row in self.rows
+        ]
         refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]
         unknown = sum(needs.seconds is None and not needs.refusal for needs in self.needs.values())
         time = f"about {duration_text(self.seconds or 0.0)} at most, reading and correction not counted"
@@ -261,7 +264,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
         residual=last.get("residual_held_out", last.get("residual")),
-        message="" if state == "done" else one_line(reason, 2000),
+        message="" if state == "done" else one_line(reason, SENTENCE),
     )  # fmt: skip
 
 

@@ -91,9 +91,8 @@ def ingest(
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
-        findings = (*parts_joined(source), *stated_used(source))
-        doubts = tuple(finding.message for finding in findings if finding.severity != "info")
-        return Ingested(out, definition, frames, size, invalid, doubts)
+        findings = (*parts_joined(source), *(each for each in stated_used(source) if each.severity != "info"))
+        return Ingested(out, definition, frames, size, invalid, tuple(finding.message for finding in findings))
 
 
 def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
