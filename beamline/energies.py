@@ -15,6 +15,7 @@ from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.core.sinks import Warn
+from beamline.core.text import safe_name
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
@@ -78,7 +79,7 @@ def read_spectra(path: Path) -> Spectra:
     values = values[np.argsort(values[:, 0])]
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
         raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
-    if any(not name.isprintable() or set(name) & set('/\\:*?"<>|') for name in names) or "" in names:
+    if any(name != safe_name(name) for name in names):
         raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
     if len({name.casefold() for name in names}) < len(names):
         raise DataError(f"{path}: names of materials must differ, in more than capitals; found {', '.join(names)}.")

@@ -17,7 +17,7 @@ from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
-from beamline.core.files import SCAN, parts_of
+from beamline.core.files import JOINED, SCAN, parts_of
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.energies import EnergyScans, read_spectra
@@ -31,7 +31,6 @@ from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
 from beamline.storage.interrupted import scan_file
-from beamline.storage.parts import JOINED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord

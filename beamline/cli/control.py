@@ -129,9 +129,8 @@ def recover(file: Path, as_json: bool) -> None:
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is. It can be
     run again after whatever stopped it, needs no room for a copy, and says what room it needs.
     """
-    from beamline.core.files import SCAN
+    from beamline.core.files import JOINED, SCAN
     from beamline.scan.resume import recover_run
-    from beamline.storage.parts import JOINED
     from beamline.storage.recover import recover as recover_scan
 
     def say(what: str) -> None:

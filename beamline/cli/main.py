@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -50,8 +51,23 @@ class _Lasting(io.FileIO):
         return memoryview(data).nbytes
 
 
+class _Printable:
+    """A text stream that shows control characters instead of sending them: names of files and texts in them may hold
+    some, whoever prints them. `acting` is the stream itself, for a progress bar."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.acting = stream
+
+    def write(self, text: str) -> int:
+        return self.acting.write(printable(text) if isinstance(text, str) else text)  # click tries bytes
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.acting, name)
+
+
 class Outputs:
-    """Puts `sys.stdout` and `sys.stderr` on files that last. Both, and stdin, are open from now on.
+    """Puts `sys.stdout` and `sys.stderr` on files that last, and that get printable text. Both, and stdin, are open
+    from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
     Only `sys.stdout` leads to the results: what a library or a plug-in writes to the descriptor 1 goes to stderr.
@@ -61,8 +77,8 @@ class Outputs:
         while (number := os.open(os.devnull, os.O_RDWR)) < 3:
             os.set_inheritable(number, True)
         os.close(number)
-        sys.stdout = _lasting(sys.stdout, apart=True) or _nowhere()
-        sys.stderr = _lasting(sys.stderr) or _nowhere()
+        sys.stdout = _Printable(_lasting(sys.stdout, apart=True) or _nowhere())
+        sys.stderr = _Printable(_lasting(sys.stderr) or _nowhere())
 
     def lost(self) -> str:
         """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
@@ -179,7 +195,8 @@ class LazyGroup(click.Group):
                 left = leave_traceback(error, Path())
                 message += f"; the traceback is in {left}" if left else "; --debug shows where"
                 message += ". Please report it. What was written before is as it was written."
-            click.echo(f"beamline: {printable(message)}", err=True)
+            # A line end that no indent follows is one of a file's name.
+            click.echo("beamline: " + printable(re.sub(r"\n(?! )", " ", message)), err=True)
             ctx.exit(exit_code(error))
 
 
@@ -229,7 +246,7 @@ def run() -> NoReturn:
     closed terminal, or a disk that takes no output, does not end a command: the rest of its output is lost.
     """
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
-    warnings.showwarning = lambda message, *_: click.echo(f"Warning: {printable(str(message))}", err=True)
+    warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     outputs, code = Outputs(), 0
     _say_begun(sys.argv[1:])
     try:

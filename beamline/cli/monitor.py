@@ -17,7 +17,7 @@ from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Done, FrameFlagged, Sink, Warned
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.stop import StopOnSignal
-from beamline.core.text import spans
+from beamline.core.text import SENTENCE, one_line, spans
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def monitor(request: MonitorRequest) -> None:
         sink(Done(_facts(request.file, summed, returned), time=clock.now()))
     n, alarmed, references = summed.n_frames, summed.alarmed, summed.references
     if not request.as_json:
-        end = f"{request.file}: {n} frames, flagged: {counted(summed.flags)}"
+        end = f"{one_line(str(request.file), SENTENCE)}: {n} frames, flagged: {counted(summed.flags)}"
         if again := summed.retaken:
             end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []

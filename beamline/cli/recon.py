@@ -27,7 +27,7 @@ from beamline.core.installed import version
 from beamline.core.process import EndsWithParent
 from beamline.core.sinks import fan_out, sentence, while_it_works
 from beamline.core.stop import StopOnSignal
-from beamline.core.text import printable
+from beamline.core.text import printable, safe_name
 from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
@@ -132,7 +132,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     """
     values, file = dict(context.params), context.params["file"]
     method = _checked_method(context, default)
-    path = values["output"] or Path(f"{file.stem}_{method}.h5")
+    path = values["output"] or Path(f"{safe_name(file.stem)}_{method}.h5")
     if there and not file.exists():
         with json_events(values["as_json"]):
             raise DataError(f"{file} does not exist.")

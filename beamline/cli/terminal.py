@@ -37,7 +37,7 @@ from beamline.core.events import (
 from beamline.core.process import ChildProcess
 from beamline.core.sinks import Warnings, sentence
 from beamline.core.stop import terminated_like_interrupted
-from beamline.core.text import printable
+from beamline.core.text import SENTENCE, one_line, printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock, SystemClock
 from drivers.in_beam import Ask
@@ -65,14 +65,18 @@ class Terminal:
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self._console = Console(file=stream, highlight=False, markup=False, soft_wrap=True)
+        self._console = Console(
+            file=getattr(stream, "acting", stream), highlight=False, markup=False, emoji=False, soft_wrap=True
+        )
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=24),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
             console=self._console,
             transient=True,
+            redirect_stdout=False,  # rich's stand-ins let control characters of others through
+            redirect_stderr=False,
             disable=not self._console.is_terminal,
         )
         self._tasks: dict[str, TaskID] = {}
@@ -132,7 +136,7 @@ class Terminal:
                 text = sentence(event)
                 if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                     self._last_text = text
-                    self._console.print(printable(text))
+                    self._console.print(one_line(text, SENTENCE))
 
     def _show_phase(self, reached: PhaseReached) -> None:
         if reached.n or not self._bar.disable:
@@ -240,7 +244,7 @@ def trials(done: TrialReached, what: str = "trials") -> str:
     parts = [f"{done.n}/{done.of}"]
     if done.eta_s is not None:
         parts += [f"{done.per_min:.1f} {what}/min", f"{_clock_time(done.eta_s)} left"]
-    return "  ".join([*parts, done.label])
+    return "  ".join([*parts, one_line(done.label, SENTENCE)])
 
 
 def fit(at: FitReached) -> str:

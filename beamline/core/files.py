@@ -25,6 +25,7 @@ PART = "part-{}"  # The folder of a later part of a scan that was resumed, in th
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
 RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
+JOINED = "joined.h5"  # The file of all parts of a run, beside the first one
 CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 RECORD = "state.json"  # The state of a run, or of a later part of it, in its folder
@@ -206,11 +207,20 @@ def broken_link(path: Path) -> str:
     return ""
 
 
+_BESIDE = 44  # bytes by which names of temporary files and of what lies beside a volume are longer than its own
+
+
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
+    told = hasattr(os, "pathconf") and path.parent.is_dir()
+    if len(os.fsencode(path.name)) > (most := (os.pathconf(path.parent, "PC_NAME_MAX") if told else 255) - _BESIDE):
+        raise DataError(
+            f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for names of "
+            f"temporary files and of what lies beside {path}. Name another output. Nothing was written."
+        )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
     if path.exists():

@@ -30,7 +30,7 @@ from beamline.core.events import (
     TrialDone,
     Warned,
 )
-from beamline.core.text import size, spans
+from beamline.core.text import SENTENCE, one_line, size, spans
 from drivers.base.clock import Clock
 
 
@@ -87,7 +87,7 @@ class UserLog:
         text = sentence(event)
         if text:
             stamp = datetime.fromtimestamp(event.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            self._stream.write(f"{stamp}  {text}\n")
+            self._stream.write(f"{stamp}  {one_line(text, SENTENCE)}\n")
             self._stream.flush()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 
@@ -34,10 +35,28 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
+SENTENCE = 10_000  # characters of the longest one that is shown in one line
+
+
 def one_line(text: str, most: int = 200) -> str:
     """A foreign text as one line for a log or a terminal: shortened, without control characters."""
     line = printable(" ".join(text[: 4 * most].split()))
     return line if len(line) <= most else line[: most - 3] + "..."
+
+
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
+
+
+def safe_name(text: str, most: int = 120) -> str:
+    """A name for a file or folder by a foreign text: one that stays in its folder, and that no file system, shell,
+    terminal or spreadsheet takes for anything else. It is its own safe name.
+
+    Args:
+        most: bytes; what is beyond is cut off.
+    """
+    shown = "".join(c if c.isprintable() else "_" for c in text)
+    legal = _DEVICE.sub(r"_\g<0>", re.sub(r'[<>:"/\\|?*$`;]', "_", shown).lstrip(" .-=+@~"))
+    return legal.encode()[:most].decode(errors="ignore").rstrip(" .") or "unnamed"
 
 
 def count(n: int, noun: str) -> str:
@@ -65,11 +84,16 @@ def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
     )
 
 
+_FORMULA = re.compile(r"[=@\t\r\n]|[+-](?!$|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$|inf$|nan$)", re.IGNORECASE)
+
+
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV, one line per row."""
+    """Rows of cells as CSV, one line per row; text that a spreadsheet would compute begins with `'`."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(rows)
-    return out.getvalue()
+    csv.writer(out, lineterminator="\r\n").writerows(  # which quotes cells with either of these
+        [f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows
+    )
+    return out.getvalue().replace("\r\n", "\n")
 
 
 def frames_text(frames: Iterable[int]) -> str:

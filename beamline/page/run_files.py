@@ -15,12 +15,13 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, event_in
-from beamline.core.files import EVENTS, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
+from beamline.core.files import EVENTS, JOINED, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
+from beamline.storage.parts import joined_file_of
 from beamline.storage.run_record import DIED, read_record
 from beamline.storage.structure import require_inside
 from beamline.storage.writer_lock import abandoned
@@ -53,7 +54,8 @@ class Watched:
 
 
 def watched(path: Path) -> Watched:
-    """The paths for a run folder, or a scan file. Raises DataError if there is neither."""
+    """The paths for a run folder, or a scan file; of a run whose parts are joined, the joined file. Raises DataError if
+    there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
@@ -61,11 +63,17 @@ def watched(path: Path) -> Watched:
                 f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file; `beamline "
                 f"view {path}` shows images."
             )
-        return Watched(folder / SCAN, folder)
+        return Watched(_joined(folder), folder)
     if not path.is_file():
         raise DataError(f"{path} is not there.")
     of_run = path.name == SCAN and is_below(path.parent, SCAN) and is_below(path.parent, EVENTS)
-    return Watched(path, path.parent if of_run else None)
+    return Watched(_joined(path.parent), path.parent) if of_run else Watched(path, None)
+
+
+def _joined(part: Path) -> Path:
+    """The file that joins a part of a run with the others, else its own."""
+    joined = joined_file_of(part / SCAN) if is_below(run_of(part), JOINED) else None
+    return part / SCAN if joined is None else joined[0]
 
 
 class EventLog:
@@ -165,7 +173,7 @@ class Reader:
             what = self.what
             if what.folder is not None and os.path.lexists(what.scan):
                 try:
-                    require_below(what.folder, what.scan.name)
+                    require_below(what.scan.parent, what.scan.name)
                 except OSError as error:
                     raise DataError(f"{what.scan}: {error.strerror}. Name the scan file itself to watch it.") from error
             self._recording = Recording(what.scan, alone=what.folder is not None)

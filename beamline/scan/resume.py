@@ -17,13 +17,12 @@ import h5py
 
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import CONFIG, EVENTS, RECORD, SCAN, create_part, parts_of
+from beamline.core.files import CONFIG, EVENTS, JOINED, RECORD, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
 from beamline.storage.parts import (
-    JOINED,
     end_references_missing,
     is_joined,
     join,

@@ -44,7 +44,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
-        raise (NotReadyError if follow else DataError)(f"{path} does not exist.")
+        what = "is no file, but a folder, a device or a pipe" if path.exists() else "does not exist"
+        raise (NotReadyError if follow else DataError)(f"{path} {what}.")
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):

@@ -5,12 +5,14 @@ Every command that meets such a run says the same, by `next_step`.
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.files import CONFIG, EVENTS, RECON, SCAN, parts_of, run_of
+from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, may_hold_frames, to_join, views_in, views_planned
+from beamline.storage.parts import joined_file_of, may_hold_frames, to_join, views_in, views_planned
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
@@ -34,6 +36,17 @@ def scan_file(path: str | Path) -> Path:
         step = next_step(parts[-1]) or f"{to_join(path)}."
         raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
     return path / SCAN
+
+
+def whole_scan(path: Path) -> Path:
+    """The scan file at a path, without links: of a run's folder, or a part of one that was resumed, that of all parts.
+
+    Where there is none the path itself, of which no scan can be opened; the error then says why.
+    """
+    with suppress(DataError, RuntimeError):  # RuntimeError: links in a circle
+        joined = None if path.is_dir() else joined_file_of(path)
+        path = scan_file(path) if joined is None else joined[0]
+    return Path(os.path.realpath(path))
 
 
 def volume_file(path: Path) -> Path:

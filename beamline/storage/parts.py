@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import parts_of, run_of, whole_file
+from beamline.core.files import JOINED, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
 from beamline.storage.run_record import read_record
@@ -37,7 +37,6 @@ from beamline.storage.writers.rows import (
 )
 from drivers.base.frame import FrameKind
 
-JOINED = "joined.h5"  # The file of all parts, in the folder of the run, where its first part is
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)

@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import run_of, whole_file
+from beamline.core.files import whole_file
 from beamline.core.text import count, spans
 from beamline.monitor.digest import checksum_of, has_checksum
 from beamline.storage import datasets, hdf5
-from beamline.storage.parts import joined_file_of, other_parts, to_join
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.scan import altered_sentence
+from beamline.storage.rules.scan import altered_sentence, parts_joined
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 
@@ -121,20 +120,14 @@ def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
         frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))
-        damage = altered_sentence(source) if altered else ""
+        damage, alone = altered_sentence(source) if altered else "", [part.message for part in parts_joined(source)]
     if not finished or (head is not None and head.open_for_writing):
         raise DataError(
             f"{scan} is being written, or its writer died. Let the scan end, or run `beamline recover` first. Nothing "
             "was written."
         )
-    if (joined_file := joined_file_of(scan)) is not None:
-        joined, n = joined_file
-        raise DataError(f"{scan} is one of {n} parts of a scan. Archive all of it: {joined}. Nothing was written.")
-    if others := other_parts(scan):
-        raise DataError(
-            f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
-            f"{to_join(run_of(scan.resolve().parent))}; then archive joined.h5. Nothing was written."
-        )
+    if alone:
+        raise DataError(f"{scan} is not archived. {alone[0]} Nothing was written.")
     return frames, altered, damage
 
 

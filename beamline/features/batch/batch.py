@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,11 +13,11 @@ from typing import Any, Literal
 from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
-from beamline.core.files import RECON, named_on_failure, remove, whole_file, write_whole
+from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
 from beamline.core.machine import Need
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import count, csv_text, one_line, size
-from beamline.storage.writer_lock import WriterLock, held
+from beamline.core.text import SENTENCE, count, csv_text, one_line, safe_name, size
+from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 
@@ -82,9 +83,13 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
     """
     folder = options.folder
     _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
-    if held(folder / RECIPE):
-        raise DataError(f"Another batch works in {folder}. Wait for its end, or name another folder.")
-    lock = WriterLock(folder / RECIPE)
+    try:
+        lock = WriterLock(folder / RECIPE, exclusive=True)
+    except (BlockingIOError, PermissionError) as error:
+        raise DataError(
+            f"Another batch works in {folder}, or its {RECIPE} cannot be written to ({error.strerror}). Wait for its "
+            "end, or name another folder."
+        ) from error
     try:
         rows = _rows(options.scans, _read(folder))
         _write(folder, rows)
@@ -126,7 +131,10 @@ class BatchPlan(Need):
     def lines(self) -> list[str]:
         """The plan as lines for people."""
         width = max((len(row.name) for row in self.rows), default=4)
-        rows = [f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{row.scan}" for row in self.rows]
+        rows = [
+            f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{one_line(row.scan, SENTENCE)}"
+            for row in self.rows
+        ]
         refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]
         unknown = sum(needs.seconds is None and not needs.refusal for needs in self.needs.values())
         time = f"about {duration_text(self.seconds or 0.0)} at most, reading and correction not counted"
@@ -166,26 +174,24 @@ def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) ->
     return BatchPlan(folder=folder, rows=rows, needs=needs, **vars(Need.in_turn(needs.values())))
 
 
-def names_of(scans: Sequence[Path]) -> list[str]:
-    """A name for each file: its stem, with as many of its folders as make it unique."""
-    parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
-    names = [own[-1] for own in parts]
+def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[str]:
+    """A safe name for each file: its stem, with as many of its folders as tell it from the other files and those of
+    earlier rows, and a number where their names, or the batch's own, are the same."""
+    paths = [*(Path(row.scan) for row in earlier), *scans]
+    parts = [(*path.absolute().parent.parts[1:], Path(SCAN if path.name == JOINED else path).stem) for path in paths]
+    names = [safe_name(own[-1]) for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
-        shared = _shared(names)
+        folded = [name.casefold() for name in names]
         names = [
-            "_".join(own[-depth:]) if is_shared else name
-            for own, name, is_shared in zip(parts, names, shared, strict=True)
+            safe_name("_".join(own[-depth:])) if folded.count(name.casefold()) > 1 else name
+            for own, name in zip(parts, names, strict=True)
         ]
-    return [
-        f"{name}_{n}" if is_shared else name
-        for n, (name, is_shared) in enumerate(zip(names, _shared(names), strict=True))
-    ]
-
-
-def _shared(names: Sequence[str]) -> list[bool]:
-    """Whether each name is also another's, if upper and lower case are equal."""
-    folded = [name.casefold() for name in names]
-    return [folded.count(name) > 1 for name in folded]
+    free, used = list[str](), {TABLE, RECIPE, *(row.name.casefold() for row in earlier)}
+    for name in names[len(earlier) :]:
+        numbered = (f"{safe_name(name, 100)}_{n}" for n in itertools.count(2))
+        free.append(next(each for each in itertools.chain([name], numbered) if each.casefold() not in used))
+        used.add(free[-1].casefold())
+    return free
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
@@ -212,13 +218,13 @@ def _refuse_other(folder: Path, recipe: bytes) -> None:
 
 
 def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
-    """The earlier rows, and one for each scan that is new."""
-    old = {row.scan for row in earlier}
-    new = [path for path in scans if str(path.resolve()) not in old]
-    names = names_of([*(Path(row.scan) for row in earlier), *new])[len(earlier) :]
-    taken = {row.name.casefold() for row in earlier}
-    free = [f"{name}_{len(earlier) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
-    return [*earlier, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
+    """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
+    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+
+    rows = [row if row.has_volume else replace(row, scan=str(whole_scan(Path(row.scan)))) for row in earlier]
+    old = {row.scan for row in rows}
+    new = [path for path in dict.fromkeys(map(whole_scan, scans)) if str(path) not in old]
+    return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
 def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> BatchRow:
@@ -236,32 +242,29 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         else:
             sink(replace(event, scan=row.scan))
 
-    place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
+    place = options.folder / row.name
     if (place / RECON).is_file():
         return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
-    remove(work)  # of a batch that was killed
     try:
-        with named_on_failure(work):
+        with whole_file(place) as work:
             work.mkdir()
-        log = work / "stderr.txt"
-        ending, code, stderr = run_to_end(
-            [*COMMAND, *_arguments(options, row.scan, work)], log, pass_on, silence=_SILENCE
-        )
-        log.unlink()
-        state = _WITH_VOLUME.get(code, "failed") if (work / RECON).is_file() else "failed"
-        if state != "failed":
-            with named_on_failure(place):
-                work.replace(place)
-    finally:
-        remove(work)
-    residual = last.get("residual_held_out", last.get("residual"))
-    reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
-    if ending is ProcessEnd.SILENT:
-        reason = f"no output from its process for {_SILENCE:g} s; it was ended"
-    message = "" if state == "done" else reason or f"no volume: its process ended with code {code}"
+            log = work / "stderr.txt"
+            ending, code, stderr = run_to_end(
+                [*COMMAND, *_arguments(options, row.scan, work)], log, pass_on, silence=_SILENCE
+            )
+            log.unlink()
+            reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+            if ending is ProcessEnd.SILENT:
+                reason = f"no output from its process for {_SILENCE:g} s; it was ended"
+            if code not in _WITH_VOLUME or not (work / RECON).is_file():
+                raise DataError(reason or f"no volume: its process ended with code {code}")
+        state = _WITH_VOLUME[code]
+    except DataError as error:  # also of a folder of this name that somebody else made
+        state, reason = "failed", str(error)
     return replace(
-        row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
-        message=message,
+        row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
+        residual=last.get("residual_held_out", last.get("residual")),
+        message="" if state == "done" else one_line(reason, SENTENCE),
     )  # fmt: skip
 
 
@@ -292,7 +295,12 @@ def _read(folder: Path) -> list[BatchRow]:
     try:
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
             rows = [{name: value for name, value in row.items() if name and value} for row in csv.DictReader(file)]
-        return TypeAdapter(list[BatchRow]).validate_python(rows)
+        table = TypeAdapter(list[BatchRow]).validate_python(rows)
+        folded = [TABLE, RECIPE, *(row.name.casefold() for row in table)]
+        for n, row in enumerate(table, start=2):
+            if row.name != safe_name(row.name) or folded[n] in folded[:n]:
+                raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
+        return table
     except ValidationError as error:
         first = error.errors()[0]
         place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"

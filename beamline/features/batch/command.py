@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -18,8 +19,8 @@ from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
-    """Files that match names and patterns, each once, in the order given."""
-    from beamline.storage.interrupted import scan_file  # here: help needs none of it
+    """Scans that match names and patterns, each once, in the order given."""
+    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
 
     scans: dict[Path, None] = {}
     for name in value:
@@ -27,7 +28,12 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
         matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
         if not matches:
             raise click.BadParameter(f"{name!r} is neither a file nor a pattern that matches one")
-        scans.update((scan_file(match.resolve()), None) for match in matches)
+        for match in matches:
+            scans[scan := whole_scan(match)] = None
+            if not match.is_dir() and scan != Path(os.path.realpath(match)):
+                click.echo(
+                    f"{match} is a part of a run that was resumed: {scan}, which has all of it, is taken.", err=True
+                )
     return list(scans)
 
 

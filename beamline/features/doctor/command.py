@@ -6,13 +6,14 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.options import json_events, set_option
 from beamline.core.events import Diagnosed, Done
 from beamline.core.stop import terminated_like_interrupted
+from beamline.core.text import printable
 from beamline.features.doctor.check import Grade
 from drivers.base.clock import SystemClock
 
@@ -75,9 +76,8 @@ def _show(checks: Sequence[Diagnosis], compared: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(file=sys.stdout, highlight=False)
-    if not console.is_terminal:
-        console = Console(file=sys.stdout, highlight=False, width=_WIDTH)
+    out: Any = getattr(sys.stdout, "acting", sys.stdout)
+    console = Console(file=out, highlight=False, markup=False, emoji=False, width=None if out.isatty() else _WIDTH)
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for column in ("check", "verdict", "observed"):
         table.add_column(column, no_wrap=column != "observed")
@@ -87,6 +87,5 @@ def _show(checks: Sequence[Diagnosis], compared: bool) -> None:
             lines.append(f"Expected: {check.expected}.")
         if check.advice:
             lines.append(f"{check.advice}.")
-        # Text, not markup: a reply may hold square brackets.
-        table.add_row(check.name, Text(check.verdict, _STYLES[check.verdict]), Text("\n".join(lines)))
+        table.add_row(printable(check.name), Text(check.verdict, _STYLES[check.verdict]), printable("\n".join(lines)))
     console.print(table)

@@ -16,7 +16,7 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.events import RuleBroken
 from beamline.core.files import refuse_existing
-from beamline.core.text import aligned, count, printable
+from beamline.core.text import SENTENCE, aligned, count, one_line, printable
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -183,8 +183,14 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
         for finding in findings:
             answer.sink(RuleBroken(**vars(finding), time=now))
         errors = count(counts["error"], "error")
-        lines = [f"{finding.severity:<9}{finding.rule:<16}{finding.message}" for finding in findings]
-        answer.done({"file": file, **counts}, *lines, f"{file}: {errors}, {count(counts['warning'], 'warning')}")
+        lines = [
+            f"{finding.severity:<9}{finding.rule:<16}{one_line(finding.message, SENTENCE)}" for finding in findings
+        ]
+        answer.done(
+            {"file": file, **counts},
+            *lines,
+            f"{one_line(str(file), SENTENCE)}: {errors}, {count(counts['warning'], 'warning')}",
+        )
     if counts["error"]:
         raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
 

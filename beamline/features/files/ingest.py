@@ -24,7 +24,7 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.scan import altered_sentence, stated_used
+from beamline.storage.rules.scan import altered_sentence, parts_joined, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Record, Rows, ScanEnding, complete
@@ -91,8 +91,8 @@ def ingest(
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
-        doubts = tuple(finding.message for finding in stated_used(source) if finding.severity != "info")
-        return Ingested(out, definition, frames, size, invalid, doubts)
+        findings = (*parts_joined(source), *(each for each in stated_used(source) if each.severity != "info"))
+        return Ingested(out, definition, frames, size, invalid, tuple(finding.message for finding in findings))
 
 
 def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:

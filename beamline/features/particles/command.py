@@ -22,6 +22,7 @@ from beamline.cli.options import (
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError
+from beamline.core.text import safe_name
 from recon.base.choices import NECK
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def segment(
 
     if view and importlib.util.find_spec("napari") is None:
         raise ConfigError("--napari: napari is not installed. Install it with: pip install 'napari[all]'")
-    output = output or Path(f"{volume.name.split('.')[0]}_particles.h5")
+    output = output or Path(f"{safe_name(volume.name.split('.')[0])}_particles.h5")
     if output.suffix.lower() in (".csv", ".png"):
         raise click.UsageError(f"--output {output} is the HDF5 file of the labels; name it .h5")
     options = SegmentOptions(

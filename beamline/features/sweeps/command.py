@@ -24,7 +24,7 @@ from beamline.cli.recon import options_of, recon
 from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
 from beamline.core.files import refuse_existing, refuse_not_utf8, write_whole
-from beamline.core.text import aligned, csv_text
+from beamline.core.text import aligned, csv_text, safe_name
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
 from beamline.report.metrics import METRICS
 from recon.methods import BASELINE
@@ -73,7 +73,7 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
     --rows. Ctrl-C keeps the slices that are done (exit code 4).
     """
     options, common = _parsed(words)
-    path = output or Path(f"{Path(common[0]).stem if common else 'scan'}_sweep.png")
+    path = output or Path(f"{safe_name(Path(common[0]).stem) if common else 'scan'}_sweep.png")
     if path.suffix.lower() != ".png":
         raise click.UsageError(f"-o {path}: the sheet is a picture; give a name such as {path.with_suffix('.png')}.")
     trials = _trials(options, common)

@@ -34,6 +34,7 @@ from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, headin
 from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
 from beamline.cli.terminal import answering, events_shown
 from beamline.core.errors import ScanStopped
+from beamline.core.text import safe_name
 from beamline.features.trials.view_choices import STUDIES
 from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
@@ -157,7 +158,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     refuse_contradictions(context.command, names_given(context))
     if request.spectra is None and len(files) > 1:
         raise click.UsageError(f"A comparison of {len(files)} files {_OF_MATERIALS}")
-    folder = request.output or Path(f"{files[0].stem}_tradeoff")
+    folder = request.output or Path(f"{safe_name(files[0].stem)}_tradeoff")
     with events_shown(request.as_json) as sink:
         if request.spectra is not None:
             files = scans_of(files, Warnings(sink, SystemClock()))
@@ -277,7 +278,7 @@ def study(request: StudyRequest) -> None:
     refuse_contradictions(context.command, names_given(context))
     settings = row_settings(context.command, methods, dict(request.values))
     source, selection = chosen(request.file, request.seed, request.values)
-    folder = request.output or Path(f"{request.file.stem}_{request.which}")
+    folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
     scan = ComparedScan(
         source, selection, folder, methods, request.truth, _light(request), request.seconds, seed=request.seed,
         command=repeating(context, request.file, folder),

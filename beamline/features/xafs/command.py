@@ -26,6 +26,7 @@ from beamline.cli.terminal import Terminal, answering
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Sink
 from beamline.core.stop import StopRequest, stop_signals
+from beamline.core.text import safe_name
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
     """
     from beamline.features.xafs.results import refuse_existing_results
 
-    target = output or Path(f"{Path(sources[-1]).stem}_xafs.png")
+    target = output or Path(f"{safe_name(Path(sources[-1]).stem)}_xafs.png")
     if target.suffix.lower() != ".png":
         raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
     if volume is not None:

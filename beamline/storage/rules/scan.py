@@ -304,10 +304,13 @@ def parts_joined(source: ScanSource) -> Iterator[Finding]:
         return
     if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):
         joined, n = joined_file
-        yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
+        sentence = f"This file is one of {n} parts of a scan: give {joined}, which has the frames of all"
     elif others := other_parts(source.path):
         sentence = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
-        yield Finding("warning", "parts", f"{sentence}: {to_join(run_of(source.path.resolve().parent))}.")
+        sentence += f": {to_join(run_of(source.path.resolve().parent))}"
+    else:
+        return
+    yield Finding("error", "parts", f"{sentence}. For this part alone, copy it out of the folder of its run.")
 
 
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (

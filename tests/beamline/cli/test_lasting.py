@@ -1,5 +1,6 @@
 """A terminal or a disk that takes no output ends no command, and changes no exit code of one that leaves files."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -49,3 +50,14 @@ def test_only_results_reach_stdout_by_whatever_way_a_plug_in_writes() -> None:
     code += "print('two', file=sys.__stdout__, flush=True); os.system('echo three'); print('{}'); outputs.lost()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr.split()) == ("{}\n", ["one", "two", "three"])
+
+
+@POSIX
+def test_a_name_acts_on_no_terminal_whoever_prints_it(tmp_path: Path) -> None:
+    name = os.fsdecode(b"\x1b[2J\x07\xff\xe2\x80\xaea.h5")
+    (tmp_path / name).touch()
+    for words in (("view", name), ("info", name), ("recon", name, "-o", name)):
+        done = subprocess.run([sys.executable, "-m", "beamline.cli.main", *words], capture_output=True, cwd=tmp_path)
+        assert done.returncode in (2, 5), done.stderr
+        output = (done.stdout + done.stderr).decode()
+        assert output.replace("\n", "").isprintable() and "a.h5" in output

@@ -4,6 +4,7 @@ import errno
 import io
 import math
 import re
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -88,6 +89,24 @@ def test_a_terminal_gets_a_bar_that_is_gone_at_the_end() -> None:
     assert "10.0 frames/s" in text
     assert "Warning: [dark] ring overrun" in text  # brackets are not markup
     assert "\x1b[2K" in text[text.rindex("frames/s") :]  # the line is erased
+
+
+@pytest.mark.parametrize("stream", [Tty(), io.StringIO()])
+def test_names_in_a_bar_and_in_sentences_are_text(stream: io.StringIO) -> None:
+    name = "in/[/b]\x1b[2J\n:boom:\u202e.h5"
+    trial = {"stage": "batch", "n": 1, "of": 2, "label": name, "eta_s": None, "per_min": 0.0}
+    text = shown(stream, ("progress", trial), ("warning", {"message": name}))
+    assert text.count("[/b]\\x1b[2J :boom:\\u202e.h5") >= 2 and "\x1b[2J" not in text
+
+
+def test_what_others_print_beside_the_bar_goes_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich would put streams of its own in the place of those that show control characters."""
+    stream = Tty()
+    monkeypatch.setattr(sys, "stderr", stream)
+    before = sys.stdout
+    with Terminal(stream) as terminal:
+        terminal(FrameStored(**FRAME))
+        assert sys.stderr is stream and sys.stdout is before
 
 
 def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:

@@ -1,12 +1,15 @@
 """Text of files is shown, and does nothing to a terminal; an advised number has three digits and keeps its side."""
 
+import csv
+import io
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.core.text import printable, rounded
+from beamline.core.text import csv_text, printable, rounded, safe_name
 
 
 def test_control_characters_are_shown_not_sent() -> None:
@@ -32,3 +35,33 @@ def test_rounded_has_three_digits_on_the_side_asked_for(value: float) -> None:
 @pytest.mark.parametrize("value", [0.0, math.inf])
 def test_what_has_no_digits_stays(value: float) -> None:
     assert rounded(value) == rounded(value, up=True) == value
+
+
+@given(st.text(), st.integers(8, 130))
+def test_a_safe_name_is_its_own_and_stays_in_its_folder(text: str, most: int) -> None:
+    name = safe_name(text, most)
+    assert safe_name(name, most) == name and name.isprintable() and 0 < len(name.encode()) <= most
+    assert not set(name) & set('/\\:*?"<>|$`;') and name[0] not in ".-=+@~ " and name[-1] not in ". "
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("walnut (1), 20 °C", "walnut (1), 20 °C"), ("..", "unnamed"), ("./../victim", "_.._victim"),
+        ("con", "_con"), ("LPT1.tif", "_LPT1.tif"), ("control", "control"), ("\x1b[2J\udcff", "_[2J_"),
+        ("=1+1", "1+1"), ("骨" * 50, "骨" * 40),
+    ],
+)  # fmt: skip
+def test_safe_names(text: str, name: str) -> None:
+    assert safe_name(text) == name
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1+1", "-1+1", "@sum(a1)", "\t=1", "\r=1", "-cmd", "=1+1\n"])
+def test_a_table_has_no_formula_of_a_foreign_text(text: str) -> None:
+    ((cell, other),) = csv.reader(io.StringIO(csv_text([[text, "a=1"]]), newline=""))
+    assert (cell, other) == (f"'{text}", "a=1")
+
+
+def test_numbers_of_a_table_stay_numbers() -> None:
+    row = [-1.5, "-1.5", "+3", "-1e-07", "-.5", "-inf", "-", None, Path("=1")]
+    assert csv_text([row]) == "-1.5,-1.5,+3,-1e-07,-.5,-inf,-,,'=1\n"

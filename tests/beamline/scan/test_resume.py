@@ -2,9 +2,11 @@
 are."""
 
 import hashlib
+import re
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import h5py
@@ -12,11 +14,12 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError
-from beamline.core.files import parts_of
+from beamline.core.files import JOINED, parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
+from beamline.page.run_files import Reader, watched
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
@@ -27,7 +30,8 @@ from beamline.scan.control import State, Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.hdf5 import open_hdf5
-from beamline.storage.parts import JOINED, joined_file_of
+from beamline.storage.interrupted import whole_scan
+from beamline.storage.parts import joined_file_of
 from beamline.storage.readers.changed import overlaid
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writer_lock import WriterLock
@@ -160,14 +164,15 @@ def test_a_view_that_became_invalid_is_taken(tmp_path: Path, monkeypatch: pytest
 
 
 def _assert_told_of_parts(run: Path) -> None:
-    """Each part names the joined file, which speaks of no other."""
+    """Each part names the joined file, which speaks of no other, and is reconstructed as little as it is archived."""
     for part in (run / "scan.h5", run / "part-2/scan.h5"):
-        line = f"This file is one of 2 parts of a scan: {run / 'joined.h5'} has the frames of all."
-        assert describe(part)["findings"].count(line) == 1
-        warned: list[str] = []
-        with open_scan(part) as source:
-            checked_views(source, Selection(steps=(Preparation(references="accept"),)), warned.append)
-        assert warned.count(line) == 1
+        line = f"This file is one of 2 parts of a scan: give {run / 'joined.h5'}, which has the frames of all."
+        assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1
+        with open_scan(part) as source, pytest.raises(DataError, match=re.escape(line)):
+            checked_views(source, Selection(steps=(Preparation(references="accept"),)), lambda _: None)
+        assert whole_scan(part) == run / "joined.h5" == watched(part).scan
+    with closing(Reader(watched(run))) as reader:
+        assert reader.state()["frames"] == open_scan(run / "joined.h5").image_key.size
     facts = describe(run / "joined.h5")
     assert not any("parts of a scan" in finding for finding in facts["findings"])
     assert facts["kinds"]["projection"] == VIEWS
@@ -178,7 +183,8 @@ def _assert_told_of_parts(run: Path) -> None:
 def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path) -> None:
     _go_on(run)
     _assert_told_of_parts(run)
-    ingest(run / "joined.h5", tmp_path / "ingested.h5")
+    assert ingest(run / "joined.h5", tmp_path / "ingested.h5").doubts == ()
+    assert "one of 2 parts" in ingest(run / "scan.h5", tmp_path / "part.h5").doubts[0]
     images = np.zeros((2, 8, 12), np.uint16)
     for path in (run / "joined.h5", tmp_path / "ingested.h5"):
         with open_scan(path) as source, h5py.File(run / "scan.h5") as part:

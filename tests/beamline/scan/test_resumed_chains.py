@@ -15,7 +15,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.core.errors import BeamlineError, DataError
-from beamline.core.files import parts_of
+from beamline.core.files import JOINED, parts_of
 from beamline.core.stop import StopRequest
 from beamline.features.archive.archive import archive
 from beamline.features.files.validate import describe, validate
@@ -23,7 +23,7 @@ from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage import parts
 from beamline.storage.hdf5 import open_hdf5
-from beamline.storage.parts import JOINED, is_joined
+from beamline.storage.parts import is_joined
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers import layout

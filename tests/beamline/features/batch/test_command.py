@@ -14,12 +14,14 @@ import psutil
 import pytest
 
 from beamline.core.process import ProcessEnd
+from beamline.core.text import csv_text, safe_name
 from beamline.features.batch import batch, command
 from beamline.features.batch.batch import COMMAND, BatchOptions, BatchRow, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scan.test_resume import ENDS, FIRST, VIEWS, _go_on
 from tests.beamline.scans import write_exchange
 from tests.clock import wait_until
 
@@ -194,7 +196,7 @@ def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sen
         (("/x/a.h5", "/x/b.h5"), ["a", "b"]),
         (("/x/run1/scan.h5", "/x/run2/scan.h5", "/x/c.h5"), ["run1_scan", "run2_scan", "c"]),
         (("/1/r/s.h5", "/2/r/s.h5"), ["1_r_s", "2_r_s"]),
-        (("/x/s.h5", "/x/s.tif"), ["x_s_0", "x_s_1"]),
+        (("/x/s.h5", "/x/s.tif"), ["x_s", "x_s_2"]),
         (("/a/Tooth.h5", "/b/tooth.h5"), ["a_Tooth", "b_tooth"]),  # one folder on some disks
     ],
 )  # fmt: skip
@@ -209,7 +211,86 @@ def test_rows_of_an_earlier_call_keep_their_names() -> None:
     assert command.batch.name == "batch"
 
 
-def test_a_killed_batch_leaves_no_reconstruction_behind(folder: Path) -> None:
+@pytest.mark.usefixtures("in_this_process")
+def test_names_that_mean_something_else_are_only_names(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    hostile = ("..h5", "batch.csv.h5", "recipe.yaml.h5", "=1+1.h5", "[", "\x1b[2J.h5", f"{'x' * 246}.h5")
+    Path("in/[").mkdir(parents=True)
+    for name in hostile:
+        Path("in", name if name != "[" else "[/b].h5").write_bytes((folder / "scan.h5").read_bytes())
+    Path("in/circle.h5").symlink_to("circle.h5")
+    os.mkfifo("in/pipe.h5")
+    for _ in range(2):
+        result = beamline("batch", "in/*.h5", "in/[[]/*.h5", "--config", "recipe.yaml", "-o", "out")
+        assert result.exit_code == 5 and "2 of 9 scans failed" in result.output, result.output
+        assert "\x1b" not in result.output
+    table = _table(folder / "out")
+    assert {"unnamed", "batch.csv_2", "recipe.yaml_2", "1+1", "b]", "_[2J", "x" * 120} < table.keys()
+    assert all(name == safe_name(name) for name in table)
+    made = {name for name, row in table.items() if row["state"] == "done"}
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", *made}
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_resumed_run_is_one_row_of_all_its_parts(folder: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        run = ENDS["stopped"](tmp_path / "runs", patch, at=FIRST + 4)
+    Path("recipe.yaml").write_text("method: fbp\naxis: 5.5\n")
+    before = batch._rows([run / "scan.h5"], [])
+    _go_on(run)
+    given = [run / name for name in ("scan.h5", "part-2/scan.h5", "joined.h5", ".")]
+    result = beamline("batch", run.parent / "*/scan.h5", *given, "--config", "recipe.yaml", "-o", "out")
+    assert result.exit_code == 0, result.output
+    assert f"{run / 'scan.h5'} is a part of a run that was resumed: {run / 'joined.h5'}" in result.stderr
+    assert {name: row["scan"] for name, row in _table(folder / "out").items()} == {"scan": str(run / "joined.h5")}
+    assert read_reconstruction(Path("out/scan/recon.h5")).parameters["n_views"] == VIEWS
+    assert [row.scan for row in batch._rows([run], before)] == [str(run / "joined.h5")]
+    part = beamline("recon", run / "scan.h5", "-m", "fbp", "-o", "part.h5")
+    assert part.exit_code == 5 and f"give {run / 'joined.h5'}" in part.output and not Path("part.h5").exists()
+    (run / "joined.h5").unlink()
+    result = beamline("batch", run / "scan.h5", "--config", "recipe.yaml", "-o", "other")
+    assert result.exit_code == 5 and f"beamline recover {run}" in _table(folder / "other")["scan"]["message"]
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize("name", ["./../victim", "..", "/victim", "a/b", "batch.csv", "Scan", "-o", "a\\b", ".hidden"])
+def test_a_table_of_names_that_are_not_of_this_program_is_refused_and_nothing_is_touched(
+    folder: Path, name: str
+) -> None:
+    Path("recipe.yaml").write_text("method: fbp\n")
+    given = ("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
+    Path("out").mkdir()
+    Path("victim.partial").mkdir()
+    Path("out/recipe.yaml").write_text("method: fbp\n")
+    rows = csv_text([["name", "scan", "state"], ["scan", "x.h5", "done"], [name, folder / "scan.h5", "waiting"]])
+    Path("out/batch.csv").write_text(rows.replace("'-o", "-o"))
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    for words in (given, (*given, "--dry-run")):
+        result = beamline(*words)
+        assert result.exit_code == 5 and f"{name!r} is no name that this program gives" in result.stderr
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_folder_that_somebody_put_in_the_place_of_a_result_fails_this_scan_alone(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    write_exchange(folder / "second.h5", SCAN)
+    given = ("batch", "scan.h5", "second.h5", "--config", "recipe.yaml", "-o", "out")
+    beamline(*given, "--dry-run")
+    assert beamline(*given).exit_code == 0
+    Path("out/batch.csv").unlink()
+    (folder / "out" / "scan" / "recon.h5").rename("moved.h5")
+    Path("out/batch.csv").write_text("name,scan,state\n")
+    assert beamline(*given).exit_code == 5
+    table = _table(folder / "out")
+    assert (table["scan"]["state"], table["second"]["state"]) == ("failed", "done")
+    assert "exists and results are never overwritten" in table["scan"]["message"]
+    assert left(folder / "out" / "scan") == {"report.html", "log.txt"}
+
+
+def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_at_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It would go on in the folder of the next call."""
     Path("recipe.yaml").write_text("method: sirt\niterations: 10000000\naxis: 19.5\n")
     process = psutil.Popen([*COMMAND, "batch", "scan.h5", "--config", "recipe.yaml", "-o", "out"])
@@ -217,6 +298,15 @@ def test_a_killed_batch_leaves_no_reconstruction_behind(folder: Path) -> None:
     children = process.children(recursive=True)
     process.kill()
     process.wait()
+
+    def run(command: Sequence[str], log: Path, *_: object, **__: object) -> tuple[ProcessEnd, int, str]:
+        log.touch()
+        Path(command[command.index("--output") + 1]).touch()
+        return ProcessEnd.EXITED, 0, ""
+
+    monkeypatch.setattr(batch, "run_to_end", run)
+    assert beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out").exit_code == 0
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
     assert children and not psutil.wait_procs(children, 30)[1]
 
 
