@@ -1,4 +1,4 @@
-"""Types of arrays that signatures share, the spread of values by their median, and binning of projections."""
+"""Types of arrays that signatures share, masked arrays, the spread of values by their median, and binning of views."""
 
 from __future__ import annotations
 
@@ -14,6 +14,21 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MEDIAN = 0.6745  # of |x|, for a normal variable x with standard deviation 1
+
+
+def is_masked(values: object) -> bool:
+    """Whether some values of a masked array, or of one in a list or tuple, are masked."""
+    if isinstance(values, list | tuple):
+        return any(is_masked(each) for each in values)
+    return isinstance(values, np.ma.MaskedArray) and bool(np.ma.getmaskarray(values).any())
+
+
+def without_mask(values: Any) -> Any:
+    """Real numbers of which some are masked as floats that are NaN there; all other values unchanged."""
+    masked: Any = np.ma.array(values) if is_masked(values) else None
+    if masked is None or masked.dtype.kind not in "fiub":
+        return values
+    return masked.astype(np.result_type(masked.dtype, np.float32)).filled(np.nan)
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:
