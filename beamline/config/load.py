@@ -32,6 +32,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.installed import config_folder as config_folder
 from beamline.core.installed import version
+from beamline.core.quantities import doubt, is_impossible
 from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
@@ -147,7 +148,7 @@ def _validated(tree: Tree, name: str) -> Config:
 
 def _refuse(path: str, found: Sequence[str]) -> None:
     if len(found) == 1:
-        raise ConfigError(f"{found[0]}. Nothing was started.") from None
+        raise ConfigError(f"{found[0]}{'' if found[0].endswith('?') else '.'} Nothing was started.") from None
     if found:
         lines = "".join(f"\n  {fault}" for fault in found)
         raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
@@ -264,6 +265,9 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
+    for at, value in quantities(config):
+        if is_impossible(name := ".".join(at), value):
+            yield at, doubt(name, value)
     try:
         wide_places(config)
     except ValueError as error:
@@ -285,6 +289,22 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
             ("simulation", "scene"),
             f"simulation.scene: there is no file {simulation.scene}; expected one beside this file, or {scenes}",
         )
+
+
+def quantities(config: Config) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Key path and value of each number but those of the simulation; several ones of a key have its path."""
+
+    def numbers(value: Any, at: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
+        if isinstance(value, dict):
+            for name, each in value.items():
+                yield from numbers(each, (*at, str(name)))
+        elif isinstance(value, list | tuple):
+            for each in value:
+                yield from numbers(each, at)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield at, value
+
+    yield from numbers(config.model_dump(exclude={"simulation"}), ())
 
 
 _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}

@@ -43,7 +43,7 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
 
 
 def warn_of_degrees(angles: NDArray[np.floating]) -> bool:
-    """Give a UserWarning if angles look like degrees, and return so; it names the line that called the asking function."""
+    """Whether angles look like degrees; then a UserWarning names the line that called the asking function."""
     if looks := look_like_degrees(angles):
         warnings.warn(
             f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
