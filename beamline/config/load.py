@@ -37,6 +37,9 @@ from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
+NO_LIVE = ("recon.live=false", "recon.stop_when=null")
+"""Overrides of a run without a reconstruction."""
+
 
 def load(
     path: str | Path,
@@ -265,9 +268,8 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
-    for at, value in quantities(config):
-        if is_impossible(name := ".".join(at), value):
-            yield at, doubt(name, value)
+    numbers = ((at, ".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"})))
+    yield from ((at, doubt(name, value)) for at, name, value in numbers if is_impossible(name, value))
     try:
         wide_places(config)
     except ValueError as error:
@@ -291,20 +293,13 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
         )
 
 
-def quantities(config: Config) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Key path and value of each number but those of the simulation; several ones of a key have its path."""
-
-    def numbers(value: Any, at: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], float]]:
-        if isinstance(value, dict):
-            for name, each in value.items():
-                yield from numbers(each, (*at, str(name)))
-        elif isinstance(value, list | tuple):
-            for each in value:
-                yield from numbers(each, at)
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield at, value
-
-    yield from numbers(config.model_dump(exclude={"simulation"}), ())
+def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Key path and value of each number of plain values; several ones of a key have its path."""
+    if isinstance(values, dict | list | tuple):
+        for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
+            yield from quantities(each, at if name is None else (*at, str(name)))
+    elif isinstance(values, int | float) and not isinstance(values, bool):
+        yield at, values
 
 
 _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}

@@ -66,19 +66,17 @@ class PlausibleRange:
 
 
 _MS, _COUNTS = {"ms": 1e-3, "us": 1e-6}, "counts of 0.001 degrees"
-_ENERGY = PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3})
-_TIME = PlausibleRange(1e-6, 600.0, "s", _MS)
 RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
     {
         "pixel_size_um": PlausibleRange(0.05, 5000.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
-        "kev": _ENERGY, "energy": _ENERGY, "energies": _ENERGY,
+        **dict.fromkeys(("kev", "energy", "energies"), PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3})),
         "tolerance_ev": PlausibleRange(1e-3, 100.0, "eV", {"keV": 1e3, "meV": 1e-3}),
         "distance_mm": PlausibleRange(0.0, 2e4, "mm", {"um": 1e-3, "nm": 1e-6}),
         "mm": PlausibleRange(0.0, 500.0, "mm", {"um": 1e-3, "nm": 1e-6}),
         "um": PlausibleRange(1e-3, 1e5, "um", {"nm": 1e-3, "m": 1e6}),
         "nm": PlausibleRange(100.0, 2000.0, "nm", {"um": 1e3, "pm": 1e-3}),
         "mm_per_deg": PlausibleRange(1e-4, 100.0, "mm/deg", {"um/deg": 1e-3, "m/deg": 1e3}),
-        "exposure_s": _TIME, "period_s": _TIME, "settle_s": _TIME, "timeout_s": _TIME,
+        **dict.fromkeys(("exposure_s", "period_s", "settle_s", "timeout_s"), PlausibleRange(1e-6, 600.0, "s", _MS)),
         "warm_up_s": PlausibleRange(0.0, 7200.0, "s", _MS), "cool_s": PlausibleRange(0.0, 7200.0, "s", _MS),
         "trigger_delay_s": PlausibleRange(0.0, 0.5, "s", _MS),
         "pulse_width_s": PlausibleRange(1e-8, 10.0, "s", _MS),  # as long as an exposure, of a level that exposes
@@ -103,7 +101,7 @@ ten turns a second, hundreds of turns, and motors and encoders of up to 27 bits.
 def range_of(name: str) -> PlausibleRange | None:
     """The range of a setting by its name, such as `scan.exposure_s`; None if it has no unit that is known."""
     words = name.rpartition(".")[2].split("_")
-    ends = ["_".join(words[at:]) for at in range(1 if "per" in words else len(words))]
+    ends = ("_".join(words[at:]) for at in range(1 if "per" in words else len(words)))
     return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
@@ -112,11 +110,12 @@ def doubt(name: str, value: float | None) -> str:
     known = range_of(name)
     if value is None or known is None or known.holds(value):
         return ""
-    ratio = abs(value) / known.high if abs(value) > known.high else known.low / abs(value)
-    beyond = f"{ratio:.2g} times beyond the {known.low:g} to {known.high:g} {known.unit} of instruments of this kind"
     meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.meant(value).items()]
-    asked = f": did you mean {' or '.join(meant)}?" if meant else "."
-    return f"{name}: {value:.6g} {known.unit} is {beyond}{asked}"
+    return (
+        f"{name}: {value:.6g} {known.unit} is {max(abs(value) / known.high, known.low / abs(value)):.2g} times beyond "
+        f"the {known.low:g} to {known.high:g} {known.unit} of instruments of this kind"
+        f"{': did you mean ' + ' or '.join(meant) + '?' if meant else '.'}"
+    )
 
 
 def is_impossible(name: str, value: float) -> bool:

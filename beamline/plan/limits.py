@@ -48,6 +48,9 @@ class Flight:
         return np.concatenate([train.start + train.interval * np.arange(train.n) for train in self.trains])
 
 
+_OTHER_SPAN = 0.05  # share by which rounding to counts may change the span: 9 degrees of half a turn
+
+
 def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) -> Flight:
     """Pulse trains for `angles` (float64 [view], radians, in order), their spacing rounded to whole counts.
 
@@ -63,10 +66,12 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     index, step = _lattice(angles, abs(scale.per_count))
     exact = step / abs(scale.per_count)
     whole = round(exact)
-    if whole < 1:
+    if whole < 1 or abs(whole / exact - 1) > _OTHER_SPAN:
         raise ValueError(
             f"views {math.degrees(step):.3g}° apart are {exact:.3g} counts of the stage "
-            f"({math.degrees(abs(scale.per_count)):.3g}° each); take fewer views or a stage with finer counts"
+            f"({math.degrees(abs(scale.per_count)):.3g}° each), which gives pulses at whole ones: they would span "
+            f"{whole / exact:.3g} times the angles of the plan. Take fewer views, a wider span (its unit is degrees), "
+            "or a stage with finer counts"
         )
     direction = 1 if scale.per_count > 0 else -1
     first = to_counts(float(angles[0])) - direction * whole * int(index[0])
@@ -120,8 +125,6 @@ ROOM = 1.1
 MARGIN = 1.01
 """Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
 
-_OTHER_SPAN = 0.05  # share by which rounding to counts may change the span: 9 degrees of half a turn
-
 
 @dataclass(frozen=True, eq=False)
 class PlanFacts:
@@ -152,7 +155,6 @@ def violations(facts: PlanFacts) -> Iterator[str]:
             yield "the stage has no trigger output, which a fly scan needs; use scan.mode: step"
         elif facts.flight:
             yield from _spacing(facts.flight.interval, facts.stage)
-            yield from _resolution(facts.flight, plan)
     yield from _limits(facts)
     cols = facts.camera.shape[1]
     if facts.axis_col is not None and not -0.5 <= facts.axis_col <= cols - 0.5:
@@ -258,17 +260,6 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
             f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
             f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer views, a shorter "
             f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
-        )
-
-
-def _resolution(flight: Flight, plan: ScanPlan) -> Iterator[str]:
-    """Views so near to a count of the stage that another range of angles would be taken."""
-    if abs(flight.step / flight.exact - 1) > _OTHER_SPAN:
-        span = float(np.ptp(plan.angles))
-        yield (
-            f"views {degrees(span / (plan.n_views - 1))} apart are {flight.exact:.3g} counts of the stage, which takes "
-            f"whole ones: they would span {degrees(span * flight.step / flight.exact)} instead of {degrees(span)}. "
-            "Take fewer views, a span in degrees that is as wide as it is meant, or a stage with finer counts"
         )
 
 

@@ -197,8 +197,11 @@ def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None
     size_mm = pixel_size(source, selection)
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
-        names = {each.name for each in fields(step)} & {"pixel_size_um", "energy_kev", "distance_mm"}  # type: ignore[arg-type]
-        stated += [(name, getattr(step, name)) for name in sorted(names)]
+        stated += [
+            (each.name, getattr(step, each.name))
+            for each in fields(step)  # type: ignore[arg-type]
+            if each.name in ("pixel_size_um", "energy_kev", "distance_mm")
+        ]
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)

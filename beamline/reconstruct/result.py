@@ -89,10 +89,10 @@ def write_result(
     elif target.written:
         _write(record, target)
     timed: Callable[[float], None] = _nothing
-    if target.report is not None:
+    if (page := target.report) is not None:
         phases.enter("report")
         try:
-            timed = _report(judged, volumes, record.parameters, context)
+            timed = _report(page, judged, volumes, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
@@ -107,20 +107,23 @@ def write_result(
 
 
 def _report(
-    judged: VolumeLooks, volumes: Mapping[str, Volume], parameters: Mapping[str, Value], context: ReportContext
+    page: Path,
+    judged: VolumeLooks,
+    volumes: Mapping[str, Volume],
+    parameters: Mapping[str, Value],
+    context: ReportContext,
 ) -> Callable[[float], None]:
     """Write the page; what is returned states on it how long the whole command took, in s."""
     from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
     made, target = judged.made, judged.target
-    assert target.report is not None
     report = compose(
         made, judged.prepared, judged.truth, volumes, judged.metrics, parameters, context, judged.unexplained
     )  # fmt: skip
     report = replace(report, volume=target.output.name if target.written else "")
-    write_report(target.report, report, replace=target.replace)
-    return partial(write_timed, target.report, report, label_of(made.method))
+    write_report(page, report, replace=target.replace)
+    return partial(write_timed, page, report, label_of(made.method))
 
 
 def _nothing(elapsed: float) -> None:

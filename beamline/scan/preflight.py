@@ -14,7 +14,6 @@ import numpy as np
 
 from beamline.config.beam import NoBeamMonitor
 from beamline.config.load import Config, at_energies, camera_settings, plan_of, quantities, resolved_yaml
-from beamline.config.models import FileAngles, SectorAngles
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.files import broken_link
@@ -111,15 +110,13 @@ class DryRun:
 
 def doubts(config: Config) -> list[str]:
     """Warnings of implausible values, as from a mistaken unit; empty if all are plausible."""
-    angles = config.scan.angles
-    if isinstance(angles, SectorAngles):
-        spans = [angles.last_deg - angles.first_deg]
-    elif isinstance(angles, FileAngles):
-        theta = np.degrees(plan_of(config).angles)
-        spans = [float(np.ptp(theta)), float(np.ptp(theta)) * theta.size / max(theta.size - 1, 1)]
-    else:
-        spans = [angles.span_deg]
-    sentences = [*(doubt(".".join(at), value) for at, value in quantities(config)), *map(doubt_span, spans)]
+    theta = np.degrees(plan_of(config).angles)
+    ends = float(np.ptp(theta))
+    spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
+    sentences = [
+        *(doubt(".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"}))),
+        next(filter(None, map(doubt_span, spans)), ""),
+    ]
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 
 

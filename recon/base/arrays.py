@@ -16,19 +16,15 @@ Mask = NDArray[np.bool_]
 MEDIAN = 0.6745  # of |x|, for a normal variable x with standard deviation 1
 
 
-def is_masked(values: object) -> bool:
-    """Whether some values of a masked array, or of one in a list or tuple, are masked."""
-    if isinstance(values, list | tuple):
-        return any(is_masked(each) for each in values)
-    return isinstance(values, np.ma.MaskedArray) and bool(np.ma.getmaskarray(values).any())
-
-
 def without_mask(values: Any) -> Any:
-    """Real numbers of which some are masked as floats that are NaN there; all other values unchanged."""
-    masked: Any = np.ma.array(values) if is_masked(values) else None
-    if masked is None or masked.dtype.kind not in "fiub":
-        return values
-    return masked.astype(np.result_type(masked.dtype, np.float32)).filled(np.nan)
+    """Numbers of which some are masked, of an array or of those in a list or tuple, as floats that are NaN there.
+
+    All other values are returned as they are.
+    """
+    several = values if isinstance(values, list | tuple) else (values,)
+    masked = any(isinstance(each, np.ma.MaskedArray) and np.ma.getmaskarray(each).any() for each in several)
+    numbers: Any = np.ma.array(values) if masked else None
+    return numbers.astype(np.result_type(numbers.dtype, np.float32)).filled(np.nan) if masked else values
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:

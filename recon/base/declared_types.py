@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recon.base.arrays import is_masked
+from recon.base.arrays import without_mask
 from recon.base.registry import unknown
 
 _ARRAYS = frozenset(get_args(getattr(ArrayLike, "__value__", ArrayLike)))  # numpy names it by `type` from Python 3.12
@@ -273,7 +273,7 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
         if (is_number(value) or _only_numbers(value, kind)) and not bound.holds(value, whole):
             raise ValueError(f"{name} must be {bound.words(whole)}, got {shown(value)}")
     for name, value in values.items():
-        if is_masked(value):
+        if without_mask(value) is not value:
             raise ValueError(
                 f"{name} has masked values, which this function cannot leave out: give an array without those views, "
                 "or one in which they are filled"

@@ -442,13 +442,12 @@ def unseen_axis(axis_cols: ArrayLike, cols: int) -> str:
     Without any view of it, what lies about the axis is not measured, and the field is a ring of any size.
     """
     axes = np.atleast_1d(np.asarray(axis_cols, np.float64))
-    if ((axes >= -0.5) & (axes <= cols - 0.5)).any():
-        return ""
-    return (
+    sentence = (
         f"The rotation axis, column {axes[0]:g}, lies outside the detector's columns 0 to {cols - 1}: no view shows "
         "what lies about it. Columns count from 0 at the centre of the first column that was given: of a cropped or "
         "binned detector, give the axis less the columns cropped before it, in binned columns."
     )
+    return "" if ((axes >= -0.5) & (axes <= cols - 0.5)).any() else sentence
 
 
 def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:

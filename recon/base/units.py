@@ -42,15 +42,14 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
     return bool(round_numbers or turns)
 
 
-def warn_of_degrees(angles: NDArray[np.floating]) -> bool:
-    """Whether angles look like degrees; then a UserWarning names the line that called the asking function."""
-    if looks := look_like_degrees(angles):
+def warn_of_degrees(angles: NDArray[np.floating]) -> None:
+    """Give a UserWarning if angles look like degrees; it names the line that called the asking function."""
+    if look_like_degrees(angles):
         warnings.warn(
             f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
             "np.deg2rad(angles)",
             stacklevel=3,
         )
-    return looks
 
 
 def look_like_counts(projections: NDArray[np.floating]) -> bool:

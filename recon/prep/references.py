@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, MEDIAN, Mask, is_masked, median_deviation, without_mask
+from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation, without_mask
 from recon.base.declared_types import check_settings
 from recon.base.masks import NEIGHBOURS, Image
 from recon.prep.dynamic_flats import DynamicFlats
@@ -41,9 +41,8 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        if not is_masked((self.dark, self.flats)):  # masked pixels are dead
-            check_settings(self)
         object.__setattr__(self, "dark", _mean(self.dark, "darks"))
+        check_settings(self)
         flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 

@@ -23,7 +23,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
-from recon.base.units import warn_of_degrees
+from recon.base.units import look_like_degrees, warn_of_degrees
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -108,7 +108,6 @@ class StreamingFit:
         self._data: list[F32] = []
         self._angles: list[float] = []
         self._held_out: list[bool] = []  # of each view; also where others before it are dropped
-        self._in_degrees = False  # said once
         self._unseen: list[int] = []  # views that no step has learnt, in the order they came
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
@@ -156,7 +155,8 @@ class StreamingFit:
         self._held_out += [is_held_out(self._arrived + k) for k in range(theta.size)]
         self._arrived += theta.size
         self._angles.extend(theta.tolist())
-        self._in_degrees = self._in_degrees or warn_of_degrees(np.asarray(self._angles))
+        if not look_like_degrees(np.asarray(self._angles[: self.n_views - theta.size])):  # else it was said
+            warn_of_degrees(np.asarray(self._angles))
         if self._state is not None and theta.size:
             new = range(self.n_views - theta.size, self.n_views)
             self._unseen += [view for view in new if not self._held_out[view]]
