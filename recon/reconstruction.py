@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import some_values
+from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import Natural, check_arguments
-from recon.base.geometry import Geometry, require_views
+from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
 from recon.base.method import Reconstruction as Reconstruction
@@ -45,8 +45,8 @@ def reconstruct(
 
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
-            finite are filled from their neighbours and weigh nothing. Or what was counted, where photons are few. The
-            method is then given line integrals and weights that carry the likelihood of the counts, see
+            finite, or masked, are filled from their neighbours and weigh nothing. Or what was counted, where photons
+            are few. The method is then given line integrals and weights that carry the likelihood of the counts, see
             `recon.prep.counts.line_integrals`; `use.weights` multiply them. Of an `Emission` likewise, see
             `recon.weighted_lines`; mlem and osem take the counts themselves.
         method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
@@ -59,13 +59,15 @@ def reconstruct(
         control: how to watch, end and continue the reconstruction.
 
     Raises:
-        ValueError: an unknown method, shapes that disagree, views from one side only, data without matter, a negative
-            seed, or views, views held out, a device or a checkpoint that the method does not take.
+        ValueError: an unknown method, shapes that disagree, views from one side only, an axis outside the detector,
+            data without matter, a negative seed, or views, views held out, a device or a checkpoint that the method
+            does not take.
 
     Warns:
         UserWarning: projections are not finite where weights do not leave them out, angles look like degrees,
             projections like counts or transmission, or, where no voxel may be below 0, like -1 times line integrals.
     """
+    projections = without_mask(projections)
     check_arguments(reconstruct, locals())
     chosen = by_name(method)() if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
@@ -81,6 +83,8 @@ def reconstruct(
         _warn_of_unknown(data, use.weights)
     if isinstance(chosen, SignedMethod) and not chosen.allow_negative:
         _warn_of_negative(data)
+    if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
+        raise ValueError(sentence)
     warn_of_degrees(geometry.angles)
     grid = grid or Grid.matching(geometry)
     _warn_of_unseen_cone(chosen, geometry, grid)

@@ -24,7 +24,7 @@ from beamline.energies import EnergyScans, read_spectra
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
-from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
+from beamline.projections.replay import ScanVerdict, awaited, frames_of, replay, verdict
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -32,7 +32,7 @@ from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import SystemClock
@@ -146,7 +146,6 @@ def _rows(source: SourceOptions | EnergyScans, rows: slice | tuple[int, int]) ->
     return first, end
 
 
-_PATIENCE = 120.0  # real s to wait for the begin of a followed scan
 _POLL = 0.25  # real s
 
 
@@ -225,11 +224,4 @@ def volumes(run: str | Path) -> Iterator[Volume]:
 
 def _opened(path: Path, follow: bool) -> ScanSource:
     """The scan; with `follow` it waits until there is one."""
-    deadline = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            return open_scan(path, follow=follow)
-        except NotReadyError as error:
-            if time.monotonic() > deadline:
-                raise DataError(f"No scan began in {path} within {_PATIENCE:.0f} s.") from error
-            time.sleep(_POLL)
+    return awaited(lambda: open_scan(path, follow=follow), path, SystemClock())

@@ -247,6 +247,7 @@ def run() -> NoReturn:
     """
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
+    os.environ["MPLBACKEND"] = "agg"  # of a notebook that started this, which may be absent here: matplotlib refuses it
     outputs, code = Outputs(), 0
     _say_begun(sys.argv[1:])
     try:

@@ -31,7 +31,7 @@ from beamline.core.text import printable, safe_name
 from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT, IN_TIME
+from recon.methods import DEFAULT, IN_TIME, streams
 
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
@@ -181,7 +181,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
     if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
-    for step in chosen_steps(values) if values["follow"] else ():
+    for step in chosen_steps(values) if values["follow"] and method != AUTO and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
     return method

@@ -146,7 +146,7 @@ recon_options = together(
         "--follow",
         of_one_call=True,
         is_flag=True,
-        help="Follow a running scan: reconstruct while its file grows.",
+        help="Follow a running scan: reconstruct while it grows. A method that needs all views waits for its end.",
     ),
     run_option(
         "--earlier",

@@ -35,7 +35,7 @@ from beamline.core.events import (
     VolumeDone,
 )
 from beamline.core.process import ChildProcess
-from beamline.core.sinks import Warnings, sentence
+from beamline.core.sinks import Narration, Warnings, sentence
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import SENTENCE, one_line, printable
 from beamline.report.metrics import METRICS, formatted
@@ -81,7 +81,7 @@ class Terminal:
         )
         self._tasks: dict[str, TaskID] = {}
         self._printed: dict[str, tuple[float, int]] = {}  # real s and frame or step of the last line
-        self._last_text = ""
+        self._last_text, self._narrated = "", Narration()
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
         self._long: threading.Timer | None = None  # names the phase after LONG
@@ -106,7 +106,8 @@ class Terminal:
 
     def __call__(self, event: Event) -> None:
         with self._lock, closed_terminal_ignored():
-            self._take(event)
+            for each in self._narrated(event):
+                self._take(each)
 
     def say(self, text: str) -> None:
         """Print a line that is not an event."""

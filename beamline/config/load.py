@@ -32,9 +32,13 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.installed import config_folder as config_folder
 from beamline.core.installed import version
+from beamline.core.quantities import doubt, is_impossible
 from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
+
+NO_LIVE = ("recon.live=false", "recon.stop_when=null")
+"""Overrides of a run without a reconstruction."""
 
 
 def load(
@@ -147,7 +151,7 @@ def _validated(tree: Tree, name: str) -> Config:
 
 def _refuse(path: str, found: Sequence[str]) -> None:
     if len(found) == 1:
-        raise ConfigError(f"{found[0]}. Nothing was started.") from None
+        raise ConfigError(f"{found[0]}{'' if found[0].endswith('?') else '.'} Nothing was started.") from None
     if found:
         lines = "".join(f"\n  {fault}" for fault in found)
         raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
@@ -264,6 +268,8 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
+    numbers = ((at, ".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"})))
+    yield from ((at, doubt(name, value)) for at, name, value in numbers if is_impossible(name, value))
     try:
         wide_places(config)
     except ValueError as error:
@@ -285,6 +291,15 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
             ("simulation", "scene"),
             f"simulation.scene: there is no file {simulation.scene}; expected one beside this file, or {scenes}",
         )
+
+
+def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
+    """Key path and value of each number of plain values; several ones of a key have its path."""
+    if isinstance(values, dict | list | tuple):
+        for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
+            yield from quantities(each, at if name is None else (*at, str(name)))
+    elif isinstance(values, int | float) and not isinstance(values, bool):
+        yield at, values
 
 
 _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}

@@ -37,12 +37,15 @@ class VoxelKind(Enum):
         return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
 
 
-_SAME = 1e-3  # share by which an angle may be off half a turn or a turn in radians
+_SAME = 1e-3  # share by which an angle may be off a quarter of a turn, half a turn or a turn in radians
+_IMPOSSIBLE = (
+    10.0  # times beyond its range a value is refused where another unit makes it plausible; nearer it is doubted
+)
 
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """The plausible range of a quantity of an instrument.
+    """The plausible range of the size of a quantity of an instrument; 0 is always plausible.
 
     Attributes:
         others: units that are mistaken for this one, each with its factor to this one.
@@ -53,42 +56,80 @@ class PlausibleRange:
     unit: str
     others: Mapping[str, float]
 
+    def holds(self, value: float, wider: float = 1.0) -> bool:
+        """Whether the range, `wider` times on each side, has the value."""
+        return value == 0 or self.low / wider <= abs(value) <= self.high * wider
 
+    def meant(self, value: float) -> dict[str, float]:
+        """By units that are mistaken for this one: the value, in this one, if it is of them; the plausible ones."""
+        return {other: value * factor for other, factor in self.others.items() if self.holds(value * factor)}
+
+
+_MS, _COUNTS = {"ms": 1e-3, "us": 1e-6}, "counts of 0.001 degrees"
 RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
     {
         "pixel_size_um": PlausibleRange(0.05, 5000.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
-        "energy_kev": PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3}),
+        **dict.fromkeys(("kev", "energy", "energies"), PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3})),
+        "tolerance_ev": PlausibleRange(1e-3, 100.0, "eV", {"keV": 1e3, "meV": 1e-3}),
         "distance_mm": PlausibleRange(0.0, 2e4, "mm", {"um": 1e-3, "nm": 1e-6}),
-        "exposure_s": PlausibleRange(1e-6, 600.0, "s", {"ms": 1e-3, "us": 1e-6}),
+        "mm": PlausibleRange(0.0, 500.0, "mm", {"um": 1e-3, "nm": 1e-6}),
+        "um": PlausibleRange(1e-3, 1e5, "um", {"nm": 1e-3, "m": 1e6}),
+        "nm": PlausibleRange(100.0, 2000.0, "nm", {"um": 1e3, "pm": 1e-3}),
+        "mm_per_deg": PlausibleRange(1e-4, 100.0, "mm/deg", {"um/deg": 1e-3, "m/deg": 1e3}),
+        **dict.fromkeys(("exposure_s", "period_s", "settle_s", "timeout_s"), PlausibleRange(1e-6, 600.0, "s", _MS)),
+        "warm_up_s": PlausibleRange(0.0, 7200.0, "s", _MS), "cool_s": PlausibleRange(0.0, 7200.0, "s", _MS),
+        "trigger_delay_s": PlausibleRange(0.0, 0.5, "s", _MS),
+        "pulse_width_s": PlausibleRange(1e-8, 10.0, "s", _MS),  # as long as an exposure, of a level that exposes
+        "firmware_pulse_s": PlausibleRange(1e-8, 0.02, "s", _MS), "shortest_s": PlausibleRange(1e-8, 0.1, "s", _MS),
+        "s": PlausibleRange(0.0, 3600.0, "s", _MS),
+        "seconds": PlausibleRange(0.0, 2e5, "s", _MS),
+        "deg": PlausibleRange(0.0, 1e5, "degrees", {_COUNTS: 1e-3, "arcseconds": 1 / 3600}),
+        "deg_s": PlausibleRange(1e-5, 3600.0, "degrees/s", {f"{_COUNTS}/s": 1e-3}),
+        "deg_s2": PlausibleRange(1e-4, 2e4, "degrees/s²", {f"{_COUNTS}/s²": 1e-3}),
+        "counts_per_turn": PlausibleRange(100, 2e8, "counts", {}),
+        "counts": PlausibleRange(0, 5000, "counts", {}),
+        "views": PlausibleRange(1, 1e5, "views", {}), "count": PlausibleRange(1, 5000, "frames", {}),
+        "mb": PlausibleRange(1, 5e5, "MB", {"kB": 1e-3, "bytes": 1e-6, "GB": 1e3}),
+        "baudrate": PlausibleRange(110, 4e6, "baud", {}),
     }
-)
-"""By name: from pixels behind X-ray lenses to those of a scanner of patients, from carbon's edge to tubes of 600 kV,
-the longest hutches, and the longest exposures that a ring lasts."""
+)  # fmt: skip
+"""By the name of a setting or its last words, as its unit: from pixels behind X-ray lenses to those of a scanner of
+patients, from carbon's edge to tubes of 600 kV, the longest hutches, the longest exposures that a ring lasts, stages of
+ten turns a second, hundreds of turns, and motors and encoders of up to 27 bits."""
+
+
+def range_of(name: str) -> PlausibleRange | None:
+    """The range of a setting by its name, such as `scan.exposure_s`; None if it has no unit that is known."""
+    words = name.rpartition(".")[2].split("_")
+    ends = ("_".join(words[at:]) for at in range(1 if "per" in words else len(words)))
+    return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
 def doubt(name: str, value: float | None) -> str:
     """A sentence on an implausible value, with the unit that may be meant; empty for a plausible value."""
-    known = RANGES[name]
-    if value is None or known.low <= value <= known.high or not value > 0:
+    known = range_of(name)
+    if value is None or known is None or known.holds(value):
         return ""
-    ratio = value / known.high if value > known.high else known.low / value
-    orders = max(1, math.ceil(math.log10(ratio) - 1e-9))
-    meant = [
-        f"{value * factor:.4g} {known.unit} ({value:.6g} {other})"
-        for other, factor in known.others.items()
-        if known.low <= value * factor <= known.high
-    ]
-    beyond = f"{orders} order{'s' * (orders > 1)} of magnitude beyond instruments of this kind"
-    asked = f": did you mean {' or '.join(meant)}?" if meant else "."
-    return f"{name}: {value:.6g} {known.unit} is {beyond} ({known.low:g} to {known.high:g} {known.unit}){asked}"
+    meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.meant(value).items()]
+    return (
+        f"{name}: {value:.6g} {known.unit} is {max(abs(value) / known.high, known.low / abs(value)):.2g} times beyond "
+        f"the {known.low:g} to {known.high:g} {known.unit} of instruments of this kind"
+        f"{': did you mean ' + ' or '.join(meant) + '?' if meant else '.'}"
+    )
 
 
-def doubt_span(span_deg: float | None) -> str:
-    """A sentence on a span that looks like radians (half a turn or a turn); empty for any other span."""
-    for turn in (math.pi, 2 * math.pi):
-        if span_deg is not None and abs(abs(span_deg) / turn - 1) < _SAME:
+def is_impossible(name: str, value: float) -> bool:
+    """Whether the value is far beyond its range, and plausible in a unit that is mistaken for its own."""
+    known = range_of(name)
+    return known is not None and not known.holds(value, _IMPOSSIBLE) and bool(known.meant(value))
+
+
+def doubt_span(span_deg: float) -> str:
+    """A sentence on a span that looks like radians (a quarter of a turn, half a turn or a turn); empty for others."""
+    for turn in (math.pi / 2, math.pi, 2 * math.pi):
+        if abs(abs(span_deg) / turn - 1) < _SAME:
             return (
-                f"span_deg: {span_deg:g} degrees is {math.degrees(turn):.0f} degrees in radians: did you mean "
-                f"{math.copysign(math.degrees(turn), span_deg):.0f}?"
+                f"scan.angles: a span of {span_deg:g} degrees is {math.degrees(turn):.0f} degrees in radians: did you "
+                f"mean {math.copysign(math.degrees(turn), span_deg):.0f}?"
             )
     return ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from queue import SimpleQueue
@@ -13,10 +13,12 @@ from typing import Self, TextIO
 from beamline.core.events import (
     BlockDone,
     BlockStarted,
+    Done,
     EnoughReached,
     Event,
     Failed,
     FrameFlagged,
+    FrameStored,
     ReconDone,
     ReconStarted,
     RunDone,
@@ -30,6 +32,7 @@ from beamline.core.events import (
     TrialDone,
     Warned,
 )
+from beamline.core.flag import Level
 from beamline.core.text import SENTENCE, one_line, size, spans
 from drivers.base.clock import Clock
 
@@ -48,7 +51,8 @@ def sentence(event: Event) -> str | None:
         case BlockDone():
             return _missing(event)
         case FrameFlagged(flag):
-            return f"{flag.level.capitalize()} ({flag.check}, frame {flag.frame}): {flag.advice}"
+            where = "frame" if len(flag.frames) == 1 else f"{len(flag.frames)} frames, {flag.frames.start} to"
+            return f"{flag.level.capitalize()} ({flag.check}, {where} {flag.frame}): {flag.advice}"
         case ReconStarted():
             again = " again, from the start" if event.again else ""
             return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
@@ -77,18 +81,47 @@ def sentence(event: Event) -> str | None:
     return None
 
 
+_OVER = 32  # frames after the last one of a finding that takes several: more come every 8 views at most
+_HELD = 60.0  # s after the first of them the frames so far are told
+
+
+class Narration:
+    """The events for people: those that say a finding of several frames again, with more of them, become one.
+
+    It comes when the finding has ended, `_HELD` s after its first event, or before the end of a block or a command.
+    """
+
+    def __init__(self) -> None:
+        self._open: dict[str, FrameFlagged] = {}  # by check: a finding with all frames so far
+
+    def __call__(self, event: Event) -> Iterator[Event]:
+        """The events to be told now."""
+        if isinstance(event, FrameFlagged) and event.flag.first is not None and event.flag.level != Level.ALARM:
+            flag, known = event.flag, self._open.get(event.flag.check, event)
+            if flag.frames.start > known.flag.frame + 1 or event.time - known.time >= _HELD:
+                yield self._open.pop(flag.check)
+                known = event
+            flag = replace(flag, first=min(known.flag.frames.start, flag.frames.start))
+            self._open[flag.check] = replace(event, flag=flag, time=known.time)
+            return
+        end = math.inf if isinstance(event, BlockDone | ScanDone | Failed | Done | RunDone) else 0
+        now = event.n - _OVER if isinstance(event, FrameStored) else end
+        yield from map(self._open.pop, [check for check, known in self._open.items() if known.flag.frame < now])
+        yield event
+
+
 class UserLog:
     """A sink that writes each event's sentence with its UTC time."""
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+        self._stream, self._narrated = stream, Narration()
 
     def __call__(self, event: Event) -> None:
-        text = sentence(event)
-        if text:
-            stamp = datetime.fromtimestamp(event.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-            self._stream.write(f"{stamp}  {one_line(text, SENTENCE)}\n")
-            self._stream.flush()
+        for each in self._narrated(event):
+            if text := sentence(each):
+                stamp = datetime.fromtimestamp(each.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+                self._stream.write(f"{stamp}  {one_line(text, SENTENCE)}\n")
+                self._stream.flush()
 
 
 def _trial(trial: TrialDone) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import MOST, TileRegion, bin_mean
+from beamline.page.tiles import MOST, TileRegion, bin_mean, lit
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.structure import require_inside
@@ -193,7 +193,8 @@ class Recording:
             darks, flats = (np.flatnonzero(kinds == kind)[:8] for kind in (FrameKind.DARK, FrameKind.FLAT))
             if darks.size == 0 or flats.size == 0:
                 return None
-            self._dark_and_flat = self._mean(darks), self._mean(flats)
+            dark = self._mean(darks)
+            self._dark_and_flat = dark, lit(self._mean(flats), dark)
         return self._dark_and_flat
 
     def _mean(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import TileRegion
+from beamline.page.tiles import TileRegion, lit
 from beamline.page.volume import ShownVolume, VolumeTile
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.resampling import TiltAndLens
@@ -49,15 +49,16 @@ class _OverFlats:
             raise DataError(f"{source.path} has no projections to show: `beamline info` says what its frames are.")
         self.shape = self.frames.size, *source.shape
         self.dark, self.flat = self._mean(FrameKind.DARK), self._mean(FrameKind.FLAT)
+        self._zero = np.zeros(source.shape, np.float32) if self.dark is None else self.dark
+        self._light = None if self.flat is None else lit(self.flat, self._zero) - self._zero
         self.light = np.full(self.frames.size, np.nan)
         self.total = np.zeros(source.shape)
 
     def __getitem__(self, part: slice) -> F32:
         views = read_known(self.source, self.frames[part]).astype(np.float32)
-        if self.flat is not None:
-            dark = np.float32(0) if self.dark is None else self.dark
+        if self._light is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
-                views = (views - dark) / (self.flat - dark)
+                views = (views - self._zero) / self._light
         for at, view in zip(np.arange(self.shape[0])[part], views, strict=True):
             if np.isnan(self.light[at]):
                 finite = np.isfinite(view)

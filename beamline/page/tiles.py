@@ -14,6 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from beamline.core.errors import DataError
+from beamline.monitor.view import BRIGHT, UNLIT
 
 MOST = 1024
 """Pixels that a tile has along an axis, at most."""
@@ -57,6 +58,12 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
     sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float32), starts[0], 0), starts[1], 1)
     counts = [np.minimum(factor, n - first) for n, factor, first in zip(pixels.shape, factors, starts, strict=True)]
     return np.asarray(sums / np.outer(*counts), np.float32)
+
+
+def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray[np.float32]:
+    """The flat with NaN where it has no light, as behind slits: a ratio there is of noise, and no grey window is."""
+    light = flat - dark
+    return np.where(light > UNLIT * np.nanpercentile(light, BRIGHT), flat, np.float32(np.nan))
 
 
 @dataclass(frozen=True, eq=False)

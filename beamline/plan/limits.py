@@ -48,6 +48,9 @@ class Flight:
         return np.concatenate([train.start + train.interval * np.arange(train.n) for train in self.trains])
 
 
+_OTHER_SPAN = 0.05  # share by which rounding to counts may change the span: 9 degrees of half a turn
+
+
 def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) -> Flight:
     """Pulse trains for `angles` (float64 [view], radians, in order), their spacing rounded to whole counts.
 
@@ -63,10 +66,12 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     index, step = _lattice(angles, abs(scale.per_count))
     exact = step / abs(scale.per_count)
     whole = round(exact)
-    if whole < 1:
+    if whole < 1 or abs(whole / exact - 1) > _OTHER_SPAN:
         raise ValueError(
             f"views {math.degrees(step):.3g}° apart are {exact:.3g} counts of the stage "
-            f"({math.degrees(abs(scale.per_count)):.3g}° each); take fewer views or a stage with finer counts"
+            f"({math.degrees(abs(scale.per_count)):.3g}° each), which gives pulses at whole ones: they would span "
+            f"{whole / exact:.3g} times the angles of the plan. Take fewer views, a wider span (its unit is degrees), "
+            "or a stage with finer counts"
         )
     direction = 1 if scale.per_count > 0 else -1
     first = to_counts(float(angles[0])) - direction * whole * int(index[0])

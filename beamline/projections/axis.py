@@ -179,10 +179,13 @@ def locate_axis(
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
+    lit = np.flatnonzero(~band.masked.all(axis=0))  # what slits hide is filled, and its noise has a long lever
+    first, last = (int(lit[0]), int(lit[-1]) + 1) if lit.size else (0, band.data.shape[2])
     try:
-        estimate = find_axis(band.data, source.angles[band.view_ids])
+        estimate = find_axis(band.data[..., first:last], source.angles[band.view_ids])
     except ValueError as error:
         raise _not_found(source, error) from error
+    estimate = replace(estimate, value=estimate.value + first, candidates=estimate.candidates + first)
     if all_there and not estimate.confident and source.axis_col is None and estimate.method != ENDS:
         estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
     axis_col = unbinned(estimate.value, correction.binning)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.quantities import RANGES, doubt
+from beamline.core.quantities import doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, cut_sentence, passing_sentence, warn_of_inconsistency
@@ -197,7 +197,11 @@ def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None
     size_mm = pixel_size(source, selection)
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
-        stated += [(each.name, getattr(step, each.name)) for each in fields(step) if each.name in RANGES]  # type: ignore[arg-type]
+        stated += [
+            (each.name, getattr(step, each.name))
+            for each in fields(step)  # type: ignore[arg-type]
+            if each.name in ("pixel_size_um", "energy_kev", "distance_mm")
+        ]
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)

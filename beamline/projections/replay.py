@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,14 @@ from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.readers.changed import stated_frames_per_view
 from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.scan import altered_sentence
-from beamline.storage.writer_lock import WriterWatch
+from beamline.storage.writer_lock import PATIENCE, WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.views import spread
@@ -188,10 +190,7 @@ def frames_of(
     A view that was taken again later has the kind that it had when it came.
     """
     done = 0
-    writer = None if follow is None else WriterWatch(source.path, follow.now())
-    while True:
-        ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
-        n = source.refresh()
+    for n in growing(source, follow) if follow is not None else (source.refresh(),):
         again = frozenset(rows_replaced(source).tolist())
         for frame in _frames(source, done):
             if should_stop():
@@ -199,15 +198,42 @@ def frames_of(
             if frame.index in again:  # what the monitor saw before it was taken again
                 frame = replace(frame, kind=FrameKind.PROJECTION)
             yield frame, n
-        if ended:
-            return
-        assert follow is not None and writer is not None
-        if why := writer.lost(follow.now(), n > done, lambda: source.finished):
-            raise DataError(
-                f"{source.path} {why} and is not finished; its {n} frames were checked. {next_step(source.path)}"
-            )
         done = n
-        follow.sleep(POLL)
+
+
+def awaited(
+    opened: Callable[[], ScanSource], path: Path, clock: Clock, patience: float = PATIENCE, poll: float = POLL
+) -> ScanSource:
+    """The scan that begins at `path`, when its file can be read.
+
+    Raises:
+        DataError: none begins within `patience` s.
+    """
+    last = clock.now() + patience
+    while True:
+        try:
+            return opened()
+        except NotReadyError as error:
+            if clock.now() > last:
+                raise DataError(f"No scan began in {path} within {patience:.0f} s.") from error
+            clock.sleep(poll)
+
+
+def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: float = POLL) -> Iterator[int]:
+    """Frames in a file at each look, until it is finished.
+
+    Raises:
+        DataError: it is not finished and grows no more.
+    """
+    writer, n, ended = WriterWatch(source.path, clock.now(), patience), 0, False
+    while not ended:
+        ended = source.finished  # asked before the frames, so that none can slip in between
+        before, n = n, source.refresh()
+        yield n
+        if not ended and (why := writer.lost(clock.now(), n > before, lambda: source.finished)):
+            raise DataError(f"{source.path} {why} and is not finished; it has {n} frames. {next_step(source.path)}")
+        if not ended:
+            clock.sleep(poll)
 
 
 def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:

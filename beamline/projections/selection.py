@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.projections.step import NamedStep
 from recon.base.declared_types import check_settings
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, unseen_axis
 from recon.base.views import parse_views
 
 if TYPE_CHECKING:
@@ -109,10 +109,8 @@ def rows_of(source: ScanSource, selection: Selection) -> slice:
 
 def check_axis(source: ScanSource, axis_col: float) -> None:
     """Raise ConfigError if the axis lies outside the detector."""
-    if not -0.5 <= axis_col <= source.shape[1] - 0.5:
-        raise ConfigError(
-            f"The rotation axis, column {axis_col:g}, lies outside the detector's columns 0 to {source.shape[1] - 1}."
-        )
+    if sentence := unseen_axis(axis_col, source.shape[1]):
+        raise ConfigError(sentence)
 
 
 def unbinned(column: float, binning: int) -> float:

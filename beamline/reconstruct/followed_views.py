@@ -121,7 +121,8 @@ _UNKNOWN = (
 
 
 class AxisSearch:
-    """Repeats the search for the rotation axis each time the views have grown by half, at half a turn, and at the end.
+    """Repeats the search for the rotation axis each time the views have grown by half, at a quarter of a turn, at half
+    a turn, and at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.
@@ -147,8 +148,8 @@ class AxisSearch:
             self.col, self.settled = stated_axis(self._source), True
             return
         before, self._turned = self._turned, float(np.ptp(self._source.angles[views])) * (1 + 1.5 / views.size)
-        half = before < np.pi <= self._turned and views.size > _FIRST_VIEWS
-        if views.size < self._next and not half and not ended:
+        passed = any(before < turn <= self._turned for turn in (np.pi / 2, np.pi)) and views.size > _FIRST_VIEWS
+        if views.size < self._next and not passed and not ended:
             return
         self._next, self.settled = views.size + views.size // 2, ended
         last_chance = ended and self.col is None
@@ -160,7 +161,7 @@ class AxisSearch:
         except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise
-        if self.col is None and np.pi / 2 < self._turned < np.pi and not self._told:
+        if self.col is None and np.pi / 2 <= self._turned < np.pi and not self._told:
             self._told = True
             self._warn(_UNKNOWN)
 

@@ -316,10 +316,15 @@ class ReconOptions:
         """
         if not isinstance(self.method, FitMethod):
             raise ConfigError(
-                f"--follow needs a method whose volume grows with the views ({', '.join(filter(streams, names()))}); "
-                f"run {self.method.name} without --follow when the scan has ended."
+                f"--enough-loss and --enough-gain need a method whose volume grows with the views "
+                f"({', '.join(filter(streams, names()))}); {self.method.name} begins when the scan has ended."
             )
         return self.method
+
+    @property
+    def streams(self) -> bool:
+        """Whether the volume of the method grows with the views; another one waits for the end of the scan."""
+        return isinstance(self.method, FitMethod)
 
 
 def _at(whole: Any, path: str) -> Any:

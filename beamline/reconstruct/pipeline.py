@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
+from pathlib import Path
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
@@ -15,6 +16,7 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.replay import awaited, growing
 from beamline.reconstruct.job import (
     Channels,
     Job,
@@ -89,6 +91,21 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     follower.snapshots.remove()
 
 
+def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ReconOptions:
+    """Wait for the end of a scan whose method needs all views; the options for the finished scan.
+
+    Raises:
+        DataError: the scan died. KeyboardInterrupt: a stop before its end; nothing was written.
+    """
+    with channels.stop_scope() as should_stop, _open(options, channels, timing) as source:
+        until = f"{options.method.name} needs all views: it begins when the scan has ended"
+        channels.sink(StateEntered("waiting", until, time=channels.clock.now()))
+        for _ in growing(source, channels.clock, timing.patience, timing.poll):
+            if should_stop():
+                raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")
+    return replace(options, follow=None)
+
+
 def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
     """Compile what the fit needs, once on a machine, before the first view. Sweeps on voxels follow the last one.
 
@@ -108,19 +125,11 @@ def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) ->
 
 def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ScanSource:
     """Wait until the file exists and is readable."""
-    sink, clock = channels.sink, channels.clock
-    begin = clock.now()
-    told = False
-    while True:
-        try:
-            return options.source.open(follow=True)
-        except NotReadyError as error:
-            if clock.now() - begin > timing.patience:
-                raise DataError(f"No scan began in {options.source.path} within {timing.patience:.0f} s.") from error
-            if not told:
-                sink(StateEntered("waiting", f"Waiting for {options.source.path}", time=clock.now()))
-                told = True
-            clock.sleep(timing.poll)
+    with suppress(NotReadyError):
+        return options.source.open(follow=True)
+    path, clock = Path(options.source.path), channels.clock
+    channels.sink(StateEntered("waiting", f"Waiting for {path}", time=clock.now()))
+    return awaited(lambda: options.source.open(follow=True), path, clock, timing.patience, timing.poll)
 
 
 def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:
@@ -254,6 +263,8 @@ def reconstruct_file(
         sink, clock, Warnings(sink, clock), Phases(sink, clock), stop_scope, clock.now(), time.process_time()
     )
     truth_given = refuse_before_reading(options)
+    if options.follow is not None and not options.streams:
+        options = _when_it_has_ended(options, channels, options.follow)
     views_of = finished_views if options.follow is None else growing_views
     with views_of(options, channels) as job:
         if truth_given is not None:  # before the work

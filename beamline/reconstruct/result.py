@@ -1,9 +1,9 @@
-"""Delivery: a volume becomes a file, figures of merit and a report; either all of them or none."""
+"""Delivery: a volume becomes a file, and then a report with its figures of merit."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.events import Sink, VolumeDone
+from beamline.core.events import Sink, VolumeDone, Warned
 from beamline.core.files import remove
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
@@ -74,7 +74,7 @@ def write_result(
         partial_volume: the partial volume that becomes the output as it is; None: the volume is written.
 
     Raises:
-        DataError: a result could not be written; none is left where one fails.
+        DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
     phases = context.phases
     phases.enter("measuring the volume")
@@ -82,28 +82,21 @@ def write_result(
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
     stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
     context = replace(context, warnings=remarks, stray=stray)
-    phases.enter("report")
     record, volumes = _record(judged, prepared, context, clock.now())
-    page, timed = None, _nothing
-    try:
-        if target.report is not None:
-            from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
-            from beamline.report.html import write_report, write_timed
-
-            metrics, parameters = judged.metrics, record.parameters
-            report = compose(made, judged.prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
-            report = replace(report, volume=target.output.name if target.written else "")
-            write_report(target.report, report, replace=target.replace)
-            page, timed = target.report, partial(write_timed, target.report, report, label_of(made.method))
-        phases.enter("writing the volume")
-        if partial_volume is not None:
-            complete(partial_volume, record, target.output, replace=target.replace)
-        elif target.written:
-            _write(record, target)
-    except BaseException:
-        if page is not None:
-            remove(page)
-        raise
+    phases.enter("writing the volume")
+    if partial_volume is not None:
+        complete(partial_volume, record, target.output, replace=target.replace)
+    elif target.written:
+        _write(record, target)
+    timed: Callable[[float], None] = _nothing
+    if (page := target.report) is not None:
+        phases.enter("report")
+        try:
+            timed = _report(page, judged, volumes, record.parameters, context)
+        except Exception as error:  # the volume stands, whatever its page lacks
+            said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
+            sink(Warned(said, time=clock.now()))
+            record = replace(record, report=None, warnings=(*record.warnings, said))
     phases.end()
     elapsed = clock.now() - context.started
     timed(elapsed)
@@ -111,6 +104,26 @@ def write_result(
     record = _with_voxels_in_files(record, target)
     sink(VolumeDone(record, time=clock.now()))
     return record
+
+
+def _report(
+    page: Path,
+    judged: VolumeLooks,
+    volumes: Mapping[str, Volume],
+    parameters: Mapping[str, Value],
+    context: ReportContext,
+) -> Callable[[float], None]:
+    """Write the page; what is returned states on it how long the whole command took, in s."""
+    from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
+    from beamline.report.html import write_report, write_timed
+
+    made, target = judged.made, judged.target
+    report = compose(
+        made, judged.prepared, judged.truth, volumes, judged.metrics, parameters, context, judged.unexplained
+    )  # fmt: skip
+    report = replace(report, volume=target.output.name if target.written else "")
+    write_report(page, report, replace=target.replace)
+    return partial(write_timed, page, report, label_of(made.method))
 
 
 def _nothing(elapsed: float) -> None:

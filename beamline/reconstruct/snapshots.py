@@ -337,7 +337,11 @@ class LiveSlices:
         with suppress(ValueError):
             slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
             count = f"{n} of {of}" if of > n else str(n)
-            place = "the middle, not known yet" if axis_col is None else f"column {col:.1f}"
+            place = (
+                "the middle, not known yet: crescents are no fault of the scan (optics.axis_col or --axis states it)"
+                if axis_col is None
+                else f"column {col:.1f}"
+            )
             unseen = max(unseen_wedges(geometry), key=lambda wedge: wedge.size, default=None)
             heading = f"FBP of {count} views so far{_coverage(unseen, geometry.angles)}, axis at {place}"
             self._snapshots.write_slices(slices, n, heading, unseen)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamline.config.beam import NoBeamMonitor
-from beamline.config.load import Config, at_energies, camera_settings, plan_of, resolved_yaml
+from beamline.config.load import Config, at_energies, camera_settings, plan_of, quantities, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.files import broken_link
@@ -110,15 +110,12 @@ class DryRun:
 
 def doubts(config: Config) -> list[str]:
     """Warnings of implausible values, as from a mistaken unit; empty if all are plausible."""
-    optics, scan = config.optics, config.scan
-    energies = (optics.energy_kev, scan.energy, *(scan.energies or ()))
-    exposures = (scan.exposure_s, scan.darks.exposure_s, scan.flats.exposure_s)
+    theta = np.degrees(plan_of(config).angles)
+    ends = float(np.ptp(theta))
+    spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
     sentences = [
-        doubt("pixel_size_um", optics.pixel_size_um),
-        doubt("distance_mm", optics.distance_mm),
-        *(doubt("energy_kev", energy) for energy in energies),
-        *(doubt("exposure_s", exposure) for exposure in exposures),
-        doubt_span(getattr(scan.angles, "span_deg", None)),
+        *(doubt(".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"}))),
+        next(filter(None, map(doubt_span, spans)), ""),
     ]
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 

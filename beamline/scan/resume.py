@@ -15,7 +15,7 @@ from typing import Any
 
 import h5py
 
-from beamline.config.load import Config, load, resolved_yaml
+from beamline.config.load import NO_LIVE, Config, changed, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECORD, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
@@ -160,6 +160,8 @@ def _alone(run: Path) -> Iterator[WriterLock]:
 def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     files, left_out = _files(run)
     config = load(run / CONFIG, environment={})
+    if given is not None and not config.recon.live:
+        given = changed(given, NO_LIVE)
     views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):

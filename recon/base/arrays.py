@@ -1,4 +1,4 @@
-"""Types of arrays that signatures share, the spread of values by their median, and binning of projections."""
+"""Types of arrays that signatures share, masked arrays, the spread of values by their median, and binning of views."""
 
 from __future__ import annotations
 
@@ -14,6 +14,17 @@ I64 = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MEDIAN = 0.6745  # of |x|, for a normal variable x with standard deviation 1
+
+
+def without_mask(values: Any) -> Any:
+    """Numbers of which some are masked, of an array or of those in a list or tuple, as floats that are NaN there.
+
+    All other values are returned as they are.
+    """
+    several = values if isinstance(values, list | tuple) else (values,)
+    masked = any(isinstance(each, np.ma.MaskedArray) and np.ma.getmaskarray(each).any() for each in several)
+    numbers: Any = np.ma.array(values) if masked else None
+    return numbers.astype(np.result_type(numbers.dtype, np.float32)).filled(np.nan) if masked else values
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:

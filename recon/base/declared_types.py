@@ -21,6 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 import numpy as np
 from numpy.typing import ArrayLike
 
+from recon.base.arrays import without_mask
 from recon.base.registry import unknown
 
 _ARRAYS = frozenset(get_args(getattr(ArrayLike, "__value__", ArrayLike)))  # numpy names it by `type` from Python 3.12
@@ -260,6 +261,9 @@ def shown(value: object) -> str:
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
     """Raise ValueError for an argument of another type than the function declares, or a number beyond its `Bound`.
 
+    So it does for masked values: numpy computes with what lies below a mask. A function that can leave them out calls
+    `without_mask` before.
+
     Args:
         values: by name, such as `locals()` in the function's first line.
     """
@@ -269,6 +273,11 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
         if (is_number(value) or _only_numbers(value, kind)) and not bound.holds(value, whole):
             raise ValueError(f"{name} must be {bound.words(whole)}, got {shown(value)}")
     for name, value in values.items():
+        if without_mask(value) is not value:
+            raise ValueError(
+                f"{name} has masked values, which this function cannot leave out: give an array without those views, "
+                "or one in which they are filled"
+            )
         if name in declared and not is_of_type(value, declared[name]):
             raise ValueError(refusal(name, value, declared[name]))
 

@@ -436,6 +436,20 @@ class Geometry:
         )
 
 
+def unseen_axis(axis_cols: ArrayLike, cols: int) -> str:
+    """The sentence on a rotation axis outside the detector's columns in all views; empty where a view shows it.
+
+    Without any view of it, what lies about the axis is not measured, and the field is a ring of any size.
+    """
+    axes = np.atleast_1d(np.asarray(axis_cols, np.float64))
+    sentence = (
+        f"The rotation axis, column {axes[0]:g}, lies outside the detector's columns 0 to {cols - 1}: no view shows "
+        "what lies about it. Columns count from 0 at the centre of the first column that was given: of a cropped or "
+        "binned detector, give the axis less the columns cropped before it, in binned columns."
+    )
+    return "" if ((axes >= -0.5) & (axes <= cols - 0.5)).any() else sentence
+
+
 def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
     """Raise ValueError unless the values are [view, row, col] of the geometry's views."""
     if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import Mask
+from recon.base.arrays import Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.masks import Image, fill, plan_fill
 from recon.prep.counts import Photons, of_view
@@ -350,6 +350,7 @@ def correct(
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
     Memory beyond the result: a few frames. Arguments and errors are those of `Correction` and of its `transmission`.
     """
+    counts = without_mask(counts)
     check_arguments(correct, locals())
     correction = Correction(references, settings, masked)
     ids = None if view_ids is None else np.asarray(view_ids, np.int64)

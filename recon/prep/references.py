@@ -6,13 +6,13 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation
+from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation, without_mask
 from recon.base.declared_types import check_settings
 from recon.base.masks import NEIGHBOURS, Image
 from recon.prep.dynamic_flats import DynamicFlats
@@ -41,8 +41,8 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        check_settings(self)
         object.__setattr__(self, "dark", _mean(self.dark, "darks"))
+        check_settings(self)
         flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 
@@ -54,12 +54,12 @@ class References:
 
 
 def _mean(frames: Image, what: str) -> Image:
-    """The mean of a stack; an image is returned as it is."""
+    """The mean of a stack, or an image as it is; NaN where all is masked."""
     if np.ndim(frames) != 3:
-        return frames
+        return cast(Image, without_mask(frames))
     if not len(frames):
         raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
-    return np.asarray(np.mean(frames, axis=0, dtype=np.float64), np.float32)
+    return np.asarray(without_mask(np.mean(frames, axis=0, dtype=np.float64)), np.float32)
 
 
 def check(references: References) -> None:

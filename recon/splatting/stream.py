@@ -23,6 +23,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
+from recon.base.units import look_like_degrees, warn_of_degrees
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -140,6 +141,9 @@ class StreamingFit:
         Raises:
             ValueError: where shapes disagree with the template, values are not finite, or a view holds nothing but
                 values far too large; nothing is added.
+
+        Warns:
+            UserWarning: where the angles so far look like degrees, once.
         """
         check_arguments(StreamingFit.add_views, locals())
         theta = np.atleast_1d(np.asarray(angles, np.float64))
@@ -151,6 +155,8 @@ class StreamingFit:
         self._held_out += [is_held_out(self._arrived + k) for k in range(theta.size)]
         self._arrived += theta.size
         self._angles.extend(theta.tolist())
+        if not look_like_degrees(np.asarray(self._angles[: self.n_views - theta.size])):  # else it was said
+            warn_of_degrees(np.asarray(self._angles))
         if self._state is not None and theta.size:
             new = range(self.n_views - theta.size, self.n_views)
             self._unseen += [view for view in new if not self._held_out[view]]

@@ -85,6 +85,8 @@ def test_any_kind_of_array_gives_the_same_volume(noisy: np.ndarray, kind: Callab
         ({"device": "abacus"}, "'abacus' was asked for"),
         ({"seed": -1}, "seed"),
         ({"geometry": VIEWS.at(np.pi * np.arange(24) + 0.3)}, "24 views from one side"),
+        ({"geometry": replace(VIEWS, axis_col=60.0)}, "column 60, lies outside the detector's columns 0 to 39: .*crop"),
+        ({"geometry": replace(VIEWS, axis_col=-0.6)}, "columns 0 to 39"),
     ],
 )
 def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], message: str) -> None:
@@ -190,6 +192,43 @@ def test_one_view_is_refused(noisy: np.ndarray) -> None:
 def test_line_integrals_beyond_any_are_refused_with_their_size(noisy: np.ndarray, method: str) -> None:
     with pytest.raises(ValueError, match=r"line integrals is above [\d.]+e\+(19|20); up to 1e\+15"):
         recon.reconstruct(noisy * np.float32(1e20), VIEWS, method)
+
+
+def test_masked_values_are_as_those_that_are_not_finite_or_refused(noisy: np.ndarray) -> None:
+    hole = np.zeros(noisy.shape, bool)
+    hole[:, :, 20:22] = True
+    masked = np.ma.array(np.where(hole, 0, noisy), mask=hole)
+    unseen, nothing_masked = np.where(hole, np.nan, noisy), np.ma.array(noisy, mask=False)
+    with pytest.warns(UserWarning, match="960 of 19200 values .* are not finite"):
+        volumes = [recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (masked, [*masked], unseen)]
+    assert np.array_equal(volumes[0], volumes[2]) and np.array_equal(volumes[1], volumes[2])
+    assert np.array_equal(*(recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (nothing_masked, noisy)))
+    light, dark = np.round(2e4 * np.exp(-noisy)).astype(np.uint16), np.zeros(SHAPE, np.float32)
+    flat = np.full((2, *SHAPE), 2e4, np.float32)
+    counted = np.ma.array(np.where(hole, 65535, light), mask=hole)
+    assert np.abs(recon.correct(counted, np.arange(24), recon.References(dark, ((0, flat),))).data - noisy).max() < 1.5
+    some = np.ma.array(flat, mask=np.broadcast_to(np.arange(40) == 7, flat.shape))
+    lost = recon.correct(light, np.arange(24), recon.References(np.ma.array(dark, mask=hole[0]), ((0, some),))).masked
+    assert lost[:, [7, 20, 21]].all() and not lost[:, 30].any()
+    model = recon.StreamingFit(VIEWS)
+    for call in (
+        lambda: recon.find_axis(masked, ANGLES),
+        lambda: recon.remove_rings(masked, ANGLES),
+        lambda: model.add_views(masked, ANGLES),
+        lambda: recon.Geometry.parallel(np.ma.array(ANGLES, mask=ANGLES > 1), SHAPE),
+        lambda: DataUse(weights=np.ma.array(noisy, mask=hole)),
+    ):
+        with pytest.raises(ValueError, match=r"(projections|data|angles|weights) has masked values"):
+            call()
+    assert model.n_views == 0
+
+
+def test_degrees_are_told_as_views_come(noisy: np.ndarray) -> None:
+    model = recon.StreamingFit(VIEWS, gaussians=100)
+    with pytest.warns(UserWarning, match=r"look like degrees.*np\.deg2rad") as told:
+        for view, angle in zip(noisy, np.rad2deg(ANGLES), strict=True):
+            model.add_views(view[None], [angle])
+    assert len(told) == 1 and told[0].filename == __file__  # once
 
 
 def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:

@@ -205,3 +205,15 @@ def test_under_a_limit_of_addresses_compiled_kernels_are_used(monkeypatch: pytes
     monkeypatch.setattr(module, "import_module", imported)
     module._load_early(("scipy.linalg",))
     assert loaded == ["recon", "scipy.linalg", "numba"]
+
+
+def test_figures_do_not_depend_on_the_back_end_of_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jupyter hands its back end to what it starts, in whose environment the package may be absent."""
+    monkeypatch.setenv("MPLBACKEND", "module://absent.backend_inline")
+    code = (
+        "import sys; sys.argv = ['beamline', '--version']; import atexit; "
+        "atexit.register(lambda: print(__import__('matplotlib').get_backend())); "
+        "from beamline.cli.main import run; run()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split()[-1].lower() == "agg", done.stderr

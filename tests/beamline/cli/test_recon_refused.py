@@ -105,7 +105,6 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "a file for a folder": ({}, ["-o", "scan.npy"], 5, "never overwritten"),
     "method misspelt": ({}, ["--method", "r3"], 2, "r3"),
     "folder missing": ({}, ["-o", "no/out.h5"], 5, "does not exist"),
-    "fbp cannot follow": ({}, ["--follow"], 2, "--follow"),
 }
 
 SEEN_IN_FRAMES = {"black views", "flats without noise", "a gain of nothing", "a gain of no photon", "air too wide"}

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,8 +15,10 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.page.recording import Recording
+from beamline.page.shown_scan import ShownScan
 from beamline.page.tiles import TileRegion
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -35,6 +38,23 @@ def test_a_view_over_the_flats_is_the_transmission(recording: Recording) -> None
     values, region, factor = recording.picture(10, WHOLE, corrected=True)
     assert (region, factor) == (WHOLE, 1)
     np.testing.assert_allclose(values, np.exp(-SCAN.line_integrals()[6]), atol=2e-4)
+
+
+def test_behind_slits_there_is_no_value_and_the_window_is_that_of_the_light(tmp_path: Path) -> None:
+    """A ratio of noise there made the greys of a frame reach from -22 to 22."""
+    noise, frames = np.random.default_rng(0), []
+    for frame in frames_of(SCAN):
+        counts = frame.counts.copy()
+        counts[[0, 3]] = 100 + noise.integers(-2, 3, (2, 40))
+        frames.append(replace(frame, counts=counts))
+    with closing(Recording(write_flagged(tmp_path / "slits.h5", frames, {}))) as recording:
+        values, *_ = recording.picture(10, WHOLE, corrected=True)
+        assert np.isnan(values[[0, 3]]).all()
+        np.testing.assert_allclose(values[1:3], np.exp(-SCAN.line_integrals()[6, 1:3]), atol=2e-4)
+    with closing(ShownScan(open_scan(tmp_path / "slits.h5"))) as shown:
+        assert np.isnan(shown.stack.cut(0, 3, WHOLE).values[[0, 3]]).all()
+        low, high = shown.stack.facts()["window"]
+        assert 0 < low < high < 1.2
 
 
 def test_without_correction_a_view_is_counts(recording: Recording) -> None:

@@ -276,7 +276,7 @@ def test_scans_that_make_no_volume(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"method": Fbp()},
+        {"method": Fbp(), "enough": Goal(1.0, None)},
         {"selection": Selection(views="fixed:5")},
         {"method": R2(steps=10)},
         {"truth": "missing.npz"},
@@ -359,4 +359,22 @@ def test_references_that_follow_the_views_are_waited_for_until_the_scan_has_ende
         assert [event.data["state"] for event in events] == ["waiting"]
         follower.take_new_frames(True)
         assert follower.state is FollowState.FEEDS and follower.n_views_taken == 30
+    close(clock)
+
+
+def test_a_method_that_needs_all_views_waits_for_the_end(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", frames_of(SCAN))
+    wanted = options(tmp_path, method=Fbp(), selection=Selection(rows=(0, 1), axis_col=SCAN.axis_col))
+    record = reconstruct_file(wanted, events.append, clock)
+    assert record.method == "fbp" and record.parameters["n_views"] == SCAN.angles.size
+    assert [e.data["state"] for e in events if e.event == "state"][:2] == ["waiting", "waiting"]  # for it, for its end
+
+
+def test_a_method_that_needs_all_views_tells_of_a_scan_that_died(tmp_path: Path) -> None:
+    clock = ScanClock()
+    schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), status=None)
+    with pytest.raises(DataError, match=r"is not finished; it has 34 frames"):
+        reconstruct_file(options(tmp_path, method=Fbp()), lambda event: None, clock)
+    assert not (tmp_path / "recon.h5").exists()
     close(clock)

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection
 from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.prep.align import AxisEstimate
+from tests.beamline.array_source import scan_of
 from tests.beamline.reconstruct.growing_scan import BRIEF, FIT, INTERLACED, SCAN, ScanClock, options, schedule
-from tests.beamline.scans import frames_of
+from tests.beamline.scans import TwoCylinders, frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -62,7 +64,7 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
 def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_told_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A full turn, that other looks would reach at 90 and 135 views; the half turn is there at 100."""
+    """A full turn, that other looks would reach at 90 and 135 views; a quarter is there at 50, the half turn at 100."""
     looks, told = list[int](), list[str]()
     warn: Any = told.append
     correction: Any = None
@@ -79,8 +81,22 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     for n in range(1, 101):
         search.look(correction, np.arange(n), False)
         assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
-    assert looks[-2:] == [90, 100] and search.col == 20.7
+    assert 50 in looks and looks[-1] == 100 and search.col == 20.7
     assert len(set(told)) == 1 and "--axis COLUMN" in told[0] and "optics.axis_col" in told[0]
+
+
+def test_slits_beside_the_sample_do_not_hide_the_axis() -> None:
+    """Ratios of noise behind them, far from the middle, moved the centre of mass: half a turn was needed."""
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 60, 1.0)), shape=(4, 80), axis_col=41.3)
+    rng, lit = np.random.default_rng(1), (np.arange(80) > 17) & (np.arange(80) < 64)
+    dark, flat = (rng.normal(mean, 2, (6, 4, 80)) for mean in (100, 20_100 * lit + 100 * ~lit))
+    views = np.where(lit, 100 + 20_000 * np.exp(-scan.line_integrals()), 100)
+    source: Any = scan_of(dark, flat, rng.normal(views, 10 * lit + 2), scan.angles)
+    search = followed_views.AxisSearch(source, Selection(), pytest.fail)  # type: ignore[arg-type]
+    for n in range(1, 61):
+        correction = ScanCorrection(source, Selection(), lambda sentence: None)
+        search.look(correction, np.arange(12, 12 + n), False)
+    assert search.col == pytest.approx(41.3, abs=0.5)
 
 
 @pytest.mark.slow

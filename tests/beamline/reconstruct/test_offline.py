@@ -75,7 +75,7 @@ def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tm
     assert list(done["times"]) == [
         "opening the scan", "flags and references", "tilt and references", "rotation axis", "jumps", "correction",
         "background, rings, views held out, hardening", "compiling kernels", "reconstruction", "measuring the volume",
-        "FBP for comparison", "report", "writing the volume",
+        "FBP for comparison", "writing the volume", "report",
     ]  # fmt: skip
     begun = [event.data["phase"] for event in events if event.data.get("stage") == "phase" and event.data["n"] == 0]
     assert begun == list(done["times"])
@@ -219,14 +219,20 @@ def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> No
     assert _names(tmp_path) == {"scan.h5", existing}
 
 
-def test_a_report_that_fails_takes_the_volume_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise DataError("no space left")
+@pytest.mark.parametrize("error", [DataError("no space left"), ValueError("module://absent")])
+def test_a_report_that_fails_costs_a_warning_and_no_volume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
 
-    monkeypatch.setattr("beamline.report.html.write_report", full)
-    with pytest.raises(DataError, match="no space"):
-        _made(_options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")))
-    assert _names(tmp_path) == {"scan.h5"}
+    monkeypatch.setattr("beamline.report.html.write_report", fail)
+    events: list[Event] = []
+    target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
+    record = reconstruct_file(_options(tmp_path, target=target), events.append, SystemClock())
+    assert _names(tmp_path) == {"scan.h5", "out.h5"} and record.report is None
+    assert any(e.event == "warning" and str(error) in e.data["message"] for e in events)
+    assert read_reconstruction(tmp_path / "out.h5").volume.data.any()
 
 
 def test_a_scan_still_being_written_is_not_taken_for_a_finished_one(tmp_path: Path) -> None:
