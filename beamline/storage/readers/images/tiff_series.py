@@ -28,7 +28,7 @@ from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
+from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.rows import ScanEnding
@@ -73,11 +73,13 @@ class TiffSeriesSource(ScanSource):
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
-        if two_orders([without_angle(name) for name in series]):
+        if two_orders(images.plain):
             self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
+        if images.doubt:
+            self.facts |= {"angles": images.doubt}
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
