@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import are_a_count
+
 _NUMBER = re.compile(
     r"(?P<word>(?<![a-z])(?:angle|theta|ang|deg|tilt)(?:[ _=(]|-(?=[-+\u2212]))?)?"
     r"(?P<mark>(?:minus|plus|neg|pos)[ _]?|[-+\u2013\u2212mnp])?"  # a hyphen, an en dash, a minus
@@ -63,8 +65,8 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     others = [[each["value"] for each in row if each is not its] for row, its in zip(numbers, chosen, strict=True)]
     if (
         words
-        and _count([each["value"] for each in chosen])
-        and any(len({*each}) > 1 and not _count(each) for each in zip(*others, strict=False))
+        and are_a_count([each["value"] for each in chosen])
+        and any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
     ):
         doubt = "the number beside the word counts the images, and another does not"
     elif not words and chosen[0].re is _NUMBER and (distinct[-1] > _TURN or not in_even_steps(distinct)):
@@ -113,7 +115,7 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
             what = mark if mark in "mn" else "hyphen"
             return degrees, f"the {what} before the number may be a minus sign, or separate"
     parts = [each["part"] or "" for each in chosen]
-    if _count(parts) or (_count(wholes) and len({*parts}) > 1):
+    if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
         return degrees, "one side of their point or comma counts the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
     for beside in (following, [_PRECEDING.search(text) for text in before]):
@@ -123,12 +125,6 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
     if len({re.sub(r"\d+", "", text) for text in before}) > 1:
         return degrees, "names differ before the angle, as by a sign that was replaced"
     return np.where(minus, -degrees, degrees), ""
-
-
-def _count(texts: Sequence[str]) -> bool:
-    """Whether texts are whole numbers from one on, without a gap."""
-    numbers = {int(text) for text in texts if text.isdigit()}
-    return len(numbers) == len(texts) == max(numbers, default=0) - min(numbers, default=1) + 1
 
 
 def in_even_steps(ascending: NDArray[Any]) -> bool:
