@@ -30,7 +30,16 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders
 from beamline.storage.readers.side_files import offered
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
+from beamline.storage.readers.tiff import (
+    SUFFIXES,
+    UNREADABLE,
+    image_of,
+    is_hidden,
+    opened,
+    read_image,
+    refuse_volume,
+    stated,
+)
 from beamline.storage.writers.rows import ScanEnding
 
 MOST_FILES = 100_000
@@ -66,13 +75,14 @@ class TiffSeriesSource(ScanSource):
             references, series = self._files[: images.references], self._files[images.references :]
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
+                self.used, self.not_used = stated(path, tif)
             some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         missing, gaps = _left_out(images)
-        self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
+        self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if two_orders(images.plain):
             self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
@@ -137,7 +147,7 @@ class TiffSeriesSource(ScanSource):
     def _tiff(self, name: str) -> Iterator[TiffFile]:
         """The head of an image, whose pixels are not read."""
         try:
-            with self._opened(name, LARGEST_IMAGE) as file, TiffFile(file) as tif:
+            with self._opened(name, LARGEST_IMAGE) as file, opened(file) as tif:
                 yield tif
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
@@ -183,7 +193,7 @@ class TiffSeriesSource(ScanSource):
         if not shape or math.prod(shape) == 0:
             raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
         if len(shape) != 2:
-            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
+            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file, or FILE --then FILE.")
         require_real(dtype, f"{name} in {self.path}")
         return shape
 
