@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import io
 import math
+import os
 import re
 import zipfile
 from collections.abc import Iterator
@@ -120,12 +121,13 @@ class TiffSeriesSource(ScanSource):
         if self._zip is not None:
             packed = (name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name)
             return [name for name in packed if not is_hidden(name)]
-        names = []
-        for n, item in enumerate(self.path.rglob("*")):
-            _refuse_more(self.path, n)
-            if not is_hidden(item.name) and item.is_file():
-                names.append(item.relative_to(self.path).as_posix())
-        return names
+        names, places = list[Path](), set[str]()
+        for folder, inner, files in os.walk(self.path, followlinks=True):
+            inner[:] = [] if (place := os.path.realpath(folder)) in places else inner  # a link to one that was seen
+            names += [] if place in places else [Path(folder, name) for name in files]
+            places.add(place)
+            _refuse_more(self.path, len(names) + len(places))
+        return [file.relative_to(self.path).as_posix() for file in names if not is_hidden(file.name) and file.is_file()]
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:

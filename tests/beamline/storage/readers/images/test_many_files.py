@@ -59,3 +59,17 @@ def test_a_folder_of_more_files_than_any_scan(tmp_path: Path, monkeypatch: pytes
         (tmp_path / f"{i}.tif").touch()
     with pytest.raises(DataError, match="holds more than 5 files"):
         open_scan(tmp_path)
+
+
+def test_links_to_folders_are_followed_once(tmp_path: Path) -> None:
+    for i in range(3):
+        (tmp_path / "store").mkdir(exist_ok=True)
+        tifffile.imwrite(tmp_path / f"store/s_{i}.tif", np.full((4, 6), i, np.uint16))
+    (tmp_path / "scan").mkdir()
+    tifffile.imwrite(tmp_path / "scan/dark_0.tif", np.full((4, 6), 9, np.uint16))
+    (tmp_path / "scan/proj").symlink_to("../store")
+    (tmp_path / "scan/again").symlink_to("../store")
+    (tmp_path / "store/up").symlink_to("../scan")
+    (tmp_path / "scan/lost").symlink_to("../gone")
+    with open_scan(tmp_path / "scan") as source:
+        np.testing.assert_array_equal(source.read(slice(None))[:, 0, 0], [9, 0, 1, 2])
