@@ -59,7 +59,12 @@ def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
 
 
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
-    """Groups of pages alike, without copies of reduced resolution, masks, and thumbnails."""
+    """Groups of pages alike, without copies of reduced resolution, masks, and thumbnails.
+
+    Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
+    that it has a header for the first alone.
+    """
+    tif.is_shaped = tif.is_shaped and '"truncated": true' in tif.pages.first.description
     return [part for part in tif.series if not part.keyframe.subfiletype & _NO_IMAGE] or [*tif.series]
 
 
@@ -88,7 +93,8 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[tuple[Used, ...], tuple[
         listed += math.prod(sizes.values())
         if len(sizes) > 1:
             raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, as one.")
-    turned, copies = orientation(tif), sum(len(part.levels) for part in tif.series) - len(images_of(tif))
+    images, turned = images_of(tif), orientation(tif)
+    copies = sum(len(part.levels) for part in tif.series) - len(images)
     used = (Used("orientation (tag 274)", str(turned), "images are turned upright"),) if turned != 1 else ()
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
@@ -105,8 +111,7 @@ def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
         claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
         if claimed > min(most, PACKED * stored):
             raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
-        images = tif.asarray(key=slice(None)) if pages_one_by_one(tif) else images_of(tif)[0].asarray()
-        return upright(np.asarray(images), orientation(tif))
+        return upright(images_of(tif)[0].asarray(), orientation(tif))
 
 
 def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -117,8 +122,7 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     first = images_of(tif)[0]
     if first.dtype is None:
         raise ValueError("its pixels are of an unknown type")
-    shape = (len(tif.pages), *first.shape) if pages_one_by_one(tif) else first.shape
-    return upright(np.broadcast_to(0, shape), orientation(tif)).shape, first.dtype
+    return upright(np.broadcast_to(0, first.shape), orientation(tif)).shape, first.dtype
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
@@ -137,20 +141,3 @@ def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
         raise DataError(
             f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
         )
-
-
-def appended(tif: tifffile.TiffFile) -> bool:
-    """Pages that tifffile appended one at a time, as the first of them says, which is a grey image."""
-    first = tif.pages.first
-    if not tif.is_shaped or first.ndim != 2:
-        return False
-    match = re.search(r'"shape": \[([\d, ]*)\]', first.description)
-    return match is not None and [int(n) for n in match[1].split(",") if n.strip()] == [*first.shape]
-
-
-def pages_one_by_one(tif: tifffile.TiffFile) -> bool:
-    """Combine pages that were appended one at a time, each a separate image to tifffile, but all alike, into one
-    stack."""
-    parts = images_of(tif)
-    alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
-    return len(parts) > 1 and alike and len(parts) == len(tif.pages)

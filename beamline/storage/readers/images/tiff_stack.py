@@ -18,19 +18,15 @@ from beamline.storage.readers.tiff import (
     SUFFIXES,
     UNREADABLE,
     Complaints,
-    appended,
     images_of,
     opened,
     orientation,
-    pages_one_by_one,
     refuse_packed,
     refuse_volume,
     stated,
     upright,
 )
 from drivers.base.frame import FrameKind
-
-MANY_PAGES = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
 
 
 class TiffStackSource(ScanSource):
@@ -66,29 +62,18 @@ class TiffStackSource(ScanSource):
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
         refuse_packed(self._tif)
-        self._pages, self._offset, self._orientation = self._tif.pages, None, 1
-        self._stored, self.dtype = self._pages.first.shape, np.dtype(self._pages.first.dtype)
-        n = len(self._pages)
-        if n <= MANY_PAGES or not appended(self._tif):
-            parts, one_by_one = images_of(self._tif), pages_one_by_one(self._tif)
-            series = parts[0]
-            if len(series.shape) not in (2, 3) or (len(parts) != 1 and not one_by_one):
-                shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
-                shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
-                raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
-            self.used, self.not_used = stated(self.path, self._tif)
-            self._stored, self.dtype, self._orientation = (
-                series.shape[-2:],
-                np.dtype(series.dtype),
-                orientation(self._tif),
-            )
-            if not one_by_one:
-                n = 1 if len(series.shape) == 2 else int(series.shape[0])
-                # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
-                self._pages, self._offset = series.pages, series.dataoffset
+        series, *others = parts = images_of(self._tif)
+        if len(series.shape) not in (2, 3) or others:
+            shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
+            shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
+            raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
+        self.used, self.not_used = stated(self.path, self._tif)
+        self._stored, self.dtype, self._orientation = series.shape[-2:], np.dtype(series.dtype), orientation(self._tif)
+        # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
+        self._pages, self._offset = series.pages, series.dataoffset
         self.shape = self._stored[::-1] if self._orientation >= 5 else self._stored
         require_real(self.dtype, str(self.path))
-        return n
+        return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)
@@ -107,7 +92,7 @@ class TiffStackSource(ScanSource):
     def _page(self, page: int) -> NDArray[Any]:
         """A page as it is stored."""
         if self._offset is None:
-            image = self._pages[page].asarray()
+            image = self._tif.pages.get(self._pages[page].index, aspage=True, cache=False).asarray()
             if (image.shape, image.dtype) != (self._stored, self.dtype):
                 raise ValueError(f"it is {image.dtype} {image.shape}, the first {self.dtype} {self._stored}")
             return np.asarray(image)
