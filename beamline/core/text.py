@@ -76,6 +76,28 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
     return text if len(groups) <= limit else f"{text}, ... ({len(indices)} in all)"
 
 
+def with_points(numbers: Sequence[str]) -> list[str]:
+    """Numbers of one file with a point before their decimals, where all of them have a comma there.
+
+    Raises:
+        ValueError: the commas may be of thousands, or separate numbers.
+    """
+    commas, points = ([text.strip() for text in numbers if mark in text] for mark in ",.")
+    thousands = all(re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", text) for text in commas)
+    if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
+        beside = f" beside {points[0]} with a point" if points else ""
+        raise ValueError(
+            f"{commas[0]} has a comma{beside}, which may be of decimals or not: write decimals with a point"
+        )
+    return [text.replace(",", ".") for text in numbers]
+
+
+def are_a_count(texts: Sequence[str]) -> bool:
+    """Whether texts are whole numbers from one on, without a gap, in any order."""
+    numbers = {int(text) for text in texts if text.isdigit()}
+    return len(numbers) == len(texts) == max(numbers, default=0) - min(numbers, default=1) + 1
+
+
 def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
     """Rows of cells as lines with aligned columns; `to`: "<" aligns left, ">" right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

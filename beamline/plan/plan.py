@@ -11,6 +11,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import are_a_count, with_points
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import TriggerTrain
 from recon.base.views import spread
@@ -255,7 +256,8 @@ def one_way(angles: NDArray[np.float64]) -> bool:
 
 
 def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
-    """Parse degrees, one per line, in the order of acquisition; # starts a comment, empty lines are ignored.
+    """Parse degrees, one per line, in the order of acquisition; # starts a comment, empty lines are ignored, decimals
+    follow a point or a comma.
 
     Args:
         unknown: lines may hold nan, as the log of a scan has it for darks and flats.
@@ -263,13 +265,18 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     Raises:
         ValueError: a line is not a finite number (the message names it), or the file has no line.
     """
+    words = [line.split("#", 1)[0].strip() for line in text.splitlines()]
+    columns = [*zip(*(word.split(",") for word in words if "," in word), strict=False)]
+    if any(map(are_a_count, columns)) and all(len({*column}) > 1 for column in columns):
+        raise ValueError(
+            f"it holds {words[-1]!r}, a number of the view and its angle, or decimals; expected one angle a line"
+        )
     degrees = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        word = line.split("#", 1)[0].strip()
+    for number, (word, plain) in enumerate(zip(words, with_points(words), strict=True), start=1):
         if not word:
             continue
         try:
-            value = float(word)
+            value = float(plain)
         except ValueError:
             value = math.nan
         if not (math.isfinite(value) or (unknown and word.lower() == "nan")):

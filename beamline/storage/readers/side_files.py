@@ -12,7 +12,6 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import SETTINGS, decoded, require_regular
+from beamline.core.text import with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
 from drivers.base.frame import FrameKind
@@ -223,34 +223,34 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
             values[f"{path}{key.lower()}"] = str(value)
 
 
-def _number(values: Mapping[str, str], key: str) -> float | None:
-    """The number that a text begins with; None where there is none."""
-    match = re.match(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?", values.get(key, "")) if key else None
+def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str, float | None]:
+    """The numbers that the texts of these keys begin with, by their names in MakerKeys; None where there is none."""
+    names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
+    texts = [values.get(getattr(keys, name), "") for name in names]
     try:
-        return None if match is None else float(match[0])
-    except ValueError:
-        return None
+        numbers = (re.match(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text) for text in with_points(texts))
+    except ValueError as error:
+        raise DataError(f"{path}: {error}.") from error
+    return {name: number and float(number[0]) for name, number in zip(names, numbers, strict=True)}
 
 
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
-    number = partial(_number, values)
+    number = _numbers(path, keys, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
         raise DataError(f"{path} says {other}: only scans on a circle are supported.")
-    scale = (number(keys.scale) or 1.0) if keys.scale else 1.0
-    given = {name: number(getattr(keys, name)) for name in ("sod", "sdd", "pixel", "count")}
-    if lacking := [getattr(keys, name) for name, value in given.items() if value is None or not value > 0]:
+    sod, sdd, pixel, count = (number[name] or 0.0 for name in ("sod", "sdd", "pixel", "count"))
+    if lacking := [getattr(keys, name) for name in ("sod", "sdd", "pixel", "count") if not (number[name] or 0) > 0]:
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
-    sod, sdd, pixel, count = (float(value or 0) for value in given.values())
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
-    n, span = int(count), number(keys.span) or _ROUND.get(keys.maker)
-    step = number(keys.step)
+    n, scale, span = int(count), number["scale"] or 1.0, number["span"] or _ROUND.get(keys.maker)
+    step = number["step"]
     if step is None and span is not None:
         step = span / n
     angles = _listed_angles(path, n) if keys.maker == "Nikon" else None
     if angles is None and step is not None:
-        angles = (number(keys.first) or 0.0) + step * np.arange(n, dtype=np.float64)
+        angles = (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)
     radians = None if angles is None else np.radians(angles)
-    return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number(keys.white))
+    return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number["white"])
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
@@ -261,6 +261,6 @@ def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
     try:
         rows = [line.split("\t") for line in _text(files[0]).splitlines()]
         listed = [row[1] for row in rows if len(row) >= 3 and row[0].strip().isdigit()]
-        return np.array(listed, np.float64) if len(listed) == n else None
+        return np.array(with_points(listed), np.float64) if len(listed) == n else None
     except (OSError, ValueError):
         return None

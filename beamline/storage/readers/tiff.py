@@ -9,7 +9,7 @@ import re
 import zipfile
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 import tifffile
@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.hdf5 import ALTERED
+from beamline.storage.readers.base import NotUsed, Used
 from beamline.storage.structure import PACKED
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
 UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile)
 """What tifffile, zipfile and their decoders raise for a file that they cannot read; none of ours is among them."""
+_NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
 
@@ -51,16 +53,65 @@ def is_hidden(name: str) -> bool:
     return name.rpartition("/")[2].startswith(".")
 
 
-def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
+def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
+    """A TIFF and the pages in it: where it is one of a set, its metadata list the pages of all files."""
+    return tifffile.TiffFile(file, is_ome=False, is_mmstack=False, is_ndtiff=False)
+
+
+def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
+    """Groups of pages alike, without copies of reduced resolution, masks, and thumbnails.
+
+    Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
+    that it has a header for the first alone.
+    """
+    tif.is_shaped = tif.is_shaped and '"truncated": true' in tif.pages.first.description
+    return [part for part in tif.series if not part.keyframe.subfiletype & _NO_IMAGE] or [*tif.series]
+
+
+def orientation(tif: tifffile.TiffFile) -> int:
+    """Which sides of an image its first row and column are: 1 to 8, as in tag 274 of TIFF 6.0."""
+    tag = images_of(tif)[0].keyframe.tags.get(274)
+    return int(tag.value) if tag is not None else 1
+
+
+def upright(images: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Images [..., row, col] with the first row at the top and the first column at the left."""
+    images = images.swapaxes(-1, -2) if orientation >= 5 else images
+    images = images[..., ::-1] if orientation in (2, 3, 6, 7) else images
+    return images[..., ::-1, :] if orientation in (3, 4, 7, 8) else images
+
+
+def stated(path: Path, tif: tifffile.TiffFile) -> tuple[tuple[Used, ...], tuple[NotUsed, ...]]:
+    """What a TIFF says of its orientation, and its copies that are not used.
+
+    Raises:
+        DataError: its OME metadata say that pages go along several axes, which of them the views are is not known.
+    """
+    listed, why = 0, "frames are the images of full resolution in this file"
+    for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
+        sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', pixels) if int(n) > 1}
+        listed += math.prod(sizes.values())
+        if len(sizes) > 1:
+            raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, as one.")
+    images, turned = images_of(tif), orientation(tif)
+    copies = sum(len(part.levels) for part in tif.series) - len(images)
+    used = (Used("orientation (tag 274)", str(turned), "images are turned upright"),) if turned != 1 else ()
+    notes = [("pages of other resolutions or masks", copies, False)] if copies else []
+    if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
+        notes += [("images of an OME set in other files", listed - len(tif.pages), True)]
+    return used, tuple(NotUsed(where, str(n), why, doubt) for where, n, doubt in notes)
+
+
+def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
     """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if it claims more bytes than allowed, or
     than it can contain.
     """
-    with tifffile.TiffFile(file) as tif:
+    with opened(file) as tif:
         refuse_packed(tif)
         claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
         if claimed > min(most, PACKED * stored):
             raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
-        return np.asarray(tif.asarray(key=slice(None)) if pages_one_by_one(tif) else tif.asarray())
+        return upright(images_of(tif)[0].asarray(), orientation(tif))
 
 
 def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -68,10 +119,10 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     type.
     """
     refuse_packed(tif)
-    first = tif.series[0]
+    first = images_of(tif)[0]
     if first.dtype is None:
         raise ValueError("its pixels are of an unknown type")
-    return ((len(tif.pages), *first.shape) if pages_one_by_one(tif) else first.shape), first.dtype
+    return upright(np.broadcast_to(0, first.shape), orientation(tif)).shape, first.dtype
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
@@ -90,20 +141,3 @@ def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
         raise DataError(
             f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
         )
-
-
-def appended(tif: tifffile.TiffFile) -> bool:
-    """Pages that tifffile appended one at a time, as the first of them says, which is a grey image."""
-    first = tif.pages.first
-    if not tif.is_shaped or first.ndim != 2:
-        return False
-    match = re.search(r'"shape": \[([\d, ]*)\]', first.description)
-    return match is not None and [int(n) for n in match[1].split(",") if n.strip()] == [*first.shape]
-
-
-def pages_one_by_one(tif: tifffile.TiffFile) -> bool:
-    """Combine pages that were appended one at a time, each a separate image to tifffile, but all alike, into one
-    stack."""
-    parts = tif.series
-    alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
-    return len(parts) > 1 and alike and len(parts) == len(tif.pages)

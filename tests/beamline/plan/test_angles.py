@@ -125,6 +125,13 @@ def test_file_round_trip(degrees: list[float]) -> None:
     np.testing.assert_array_equal(angles.from_text(text), np.deg2rad(degrees))
 
 
+@pytest.mark.parametrize("step", [0.25, 0.5, 1.25, 0.001, 12.345])
+def test_decimals_may_follow_a_comma(step: float) -> None:
+    degrees = np.round(step * np.arange(-20, 20), 3)
+    text = "\n".join(f"{each:.3f} # view".replace(".", ",") for each in degrees)
+    np.testing.assert_allclose(np.degrees(angles.from_text(text)), degrees)
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -132,6 +139,10 @@ def test_file_round_trip(degrees: list[float]) -> None:
         ("0\n1 2\n", "line 2 holds '1 2'"),
         ("0\n\nnan\n", "line 3 holds 'nan'"),
         ("# nothing\n\n", "no angle"),
+        ("0,5,1.0\n1,0,1.5", "0,1.5.*one angle a line"),
+        ("0,0\n1,2\n2,4", "a number of the view and its angle"),
+        ("0,0\n2,1\n4,2", "a number of the view and its angle"),
+        ("0,5\n1.0", "0,5 has a comma beside 1.0 with a point"),
     ],
 )
 def test_file_names_the_line(text: str, problem: str) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.storage.readers.images.image_angles import NamedAngles, angles_in, in_even_steps
 from drivers.base.frame import FrameKind
 
 _REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
@@ -19,12 +20,6 @@ _SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc)(?![a-z])")  # of neutron imaging: o
 _PLAIN = re.compile(  # words of references, and those that go with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
-_NUMBER = r"[-+]?\d+(?:\.\d+)?"
-_TAGGED = re.compile(rf"(?<![a-z])(?:angle|theta|ang|deg)[ _=-]?({_NUMBER})|({_NUMBER})[ _]?(?:deg|°)", re.IGNORECASE)
-_DEGREES_AND_THOUSANDTHS = re.compile(r"_(\d{3})_(\d{3})(?=_\d+$)")
-_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
-_FARTHEST = 3600.0  # degrees
-_EVEN = 0.8  # of the steps of a number that counts images are alike; some images may be lost
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
 
@@ -101,35 +96,6 @@ def _without_common_folder(names: Sequence[str]) -> list[str]:
     return ["/".join(each[n:]) for each in parts]
 
 
-def without_angle(name: str) -> str:
-    """A file's name without its angle, which differs in each file of a series."""
-    stem, dot, suffix = name.rpartition(".")
-    stem = _DEGREES_AND_THOUSANDTHS.sub("", stem)
-    return _TAGGED.sub("", stem).rstrip("_- =") + dot + suffix
-
-
-def angles_of(names: Sequence[str]) -> NDArray[np.float64] | None:
-    """Radians [file] if each name states its angle; None if not all do, or they are no angles of a scan.
-
-    As a number beside `angle`, `theta`, `ang` or `deg`, or by three digits of degrees and three of their thousandths
-    before the number of the frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
-    """
-    degrees = []
-    for name in names:
-        stem = name.rpartition("/")[2].rpartition(".")[0]
-        tagged, plain = _TAGGED.findall(stem), _DEGREES_AND_THOUSANDTHS.findall(stem)
-        if len(tagged) == 1:
-            degrees.append(float(tagged[0][0] or tagged[0][1]))
-        elif len(plain) == 1 and not tagged:
-            degrees.append(int(plain[0][0]) + int(plain[0][1]) / 1000)
-        else:
-            return None
-    angles = np.array(degrees)
-    if not angles.size or np.ptp(angles) < _LEAST_SPAN or np.abs(angles).max() > _FARTHEST:
-        return None
-    return np.radians(angles) if 2 * np.unique(angles).size > angles.size else None
-
-
 @dataclass(frozen=True, eq=False)
 class NamedImages:
     """The images of a scan ordered by their names: darks, flats, then the projections by number.
@@ -140,6 +106,8 @@ class NamedImages:
         angles: float64 [file] radians, NaN where the name says none.
         numbers: int64 [file], -1 of references that do not count with the series; None where files are not numbered.
         of_series: int64 [projection], the numbers of the series; None where they count no images.
+        plain: the names of the projections without their angles.
+        doubt: why angles in the names are not used; "" where they are, or there are none.
     """
 
     names: list[str]
@@ -147,6 +115,8 @@ class NamedImages:
     angles: NDArray[np.float64]
     numbers: NDArray[np.int64] | None
     of_series: NDArray[np.int64] | None
+    plain: list[str]
+    doubt: str
 
     @property
     def references(self) -> int:
@@ -168,34 +138,36 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
     series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
     if not series:
         raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
-    angles = angles_of(series)
-    plain = series if angles is None else [without_angle(name) for name in series]
-    taken = np.argsort(_places(path, plain, angles is not None, one_series=one_series), kind="stable")
-    series, angles = [series[i] for i in taken], None if angles is None else angles[taken]
+    stated = angles_in(series)
+    places = _places(path, stated, one_series=one_series)
+    taken = np.argsort(places, kind="stable") if stated.radians is None else np.lexsort((stated.radians, places))
     references = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
-    names = references + series
+    names, plain = references + [series[i] for i in taken], [stated.plain[i] for i in taken]
     of_angles = np.full(len(names), np.nan)
-    if angles is not None:
-        of_angles[len(references) :] = angles
-    together, of_series = _frame_numbers(names), _frame_numbers([plain[i] for i in taken])
+    if stated.radians is not None:
+        of_angles[len(references) :] = stated.radians[taken]
+    together, of_series = _frame_numbers(names), _frame_numbers(plain)
     if together is None and of_series is not None:
         together = np.concatenate([np.full(len(references), -1), of_series])
-    return NamedImages(names, np.array([kinds[name] for name in names], np.int32), of_angles, together, of_series)
+    of_kinds = np.array([kinds[name] for name in names], np.int32)
+    return NamedImages(names, of_kinds, of_angles, together, of_series, plain, stated.doubt)
 
 
-def _places(path: object, plain: list[str], angles_known: bool, *, one_series: bool) -> NDArray[np.int64]:
+def _places(path: object, stated: NamedAngles, *, one_series: bool) -> NDArray[np.int64]:
     """The number of each image of a series, by its name without an angle. DataError: there are several series."""
-    counted, several = _numbers(plain), len({_template(name) for name in plain}) > 1
+    plain = stated.plain
+    counted, several = _numbers(plain), len({_template(name, stated.doubt) for name in plain}) > 1
     if counted is not None and (one_series or not several):
         return counted
-    if len(plain) > 1 and (several or not angles_known):
+    if len(plain) > 1 and (several or (stated.radians is None and not stated.doubt)):
         raise DataError(_several_series(path, plain))
     ordered = {name: i for i, name in enumerate(natural_sorted(set(plain)))}
     return np.array([ordered[name] for name in plain], np.int64)
 
 
-def _template(name: str) -> str:
-    return re.sub(r"\d+", "", name)
+def _template(name: str, doubt: str = "") -> str:
+    """A name without its numbers; in doubt of their signs, without these."""
+    return re.sub(r"[-+_\d]+" if doubt else r"\d+", "", name)
 
 
 def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
@@ -209,8 +181,8 @@ def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
         of_template.setdefault(_template(name), []).append(i)
     for rows in of_template.values():
         digits = [re.findall(r"\d+", names[i]) for i in rows]
-        columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=True)]
-        if not columns:
+        columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
+        if not columns or len({len(each) for each in digits}) > 1:
             return None
         varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
         counting = [n for n in varying if len(set(columns[n])) == len(rows)]
@@ -236,8 +208,7 @@ def two_orders(names: Sequence[str]) -> bool:
     orders = set()
     for column in zip(*digits, strict=True):
         numbers = np.array([int(each[-18:]) for each in column], np.int64)
-        steps = np.diff(np.sort(numbers))
-        if steps.all() and np.mean(steps == np.median(steps)) > _EVEN:
+        if in_even_steps(np.sort(numbers)):
             orders.add(tuple(np.argsort(numbers)))
     return len(orders) > 1
 
@@ -251,5 +222,5 @@ def _several_series(path: object, names: Sequence[str]) -> str:
     return (
         f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, flat_0001.tif), or "
         "give the folder of the projections, and the others apart, with --darks and --flats. Where all are one series, "
-        "say which images are which: --frames darks=0:5,flats=5:10."
+        "say which images are which: --frames darks=0:5,flats=5:10. Angles in names are read as in a_angle-12.5_01.tif."
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import io
 import math
+import os
 import re
 import zipfile
 from collections.abc import Iterator
@@ -28,9 +29,18 @@ from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
+from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders
 from beamline.storage.readers.side_files import offered
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
+from beamline.storage.readers.tiff import (
+    SUFFIXES,
+    UNREADABLE,
+    image_of,
+    is_hidden,
+    opened,
+    read_image,
+    refuse_volume,
+    stated,
+)
 from beamline.storage.writers.rows import ScanEnding
 
 MOST_FILES = 100_000
@@ -66,18 +76,21 @@ class TiffSeriesSource(ScanSource):
             references, series = self._files[: images.references], self._files[images.references :]
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
+                self.used, self.not_used = stated(path, tif)
             some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         missing, gaps = _left_out(images)
-        self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
-        if two_orders([without_angle(name) for name in series]):
+        self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
+        if two_orders(images.plain):
             self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
+        if images.doubt:
+            self.facts |= {"angles": images.doubt}
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
@@ -108,12 +121,13 @@ class TiffSeriesSource(ScanSource):
         if self._zip is not None:
             packed = (name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name)
             return [name for name in packed if not is_hidden(name)]
-        names = []
-        for n, item in enumerate(self.path.rglob("*")):
-            _refuse_more(self.path, n)
-            if not is_hidden(item.name) and item.is_file():
-                names.append(item.relative_to(self.path).as_posix())
-        return names
+        names, places = list[Path](), set[str]()
+        for folder, inner, files in os.walk(self.path, followlinks=True):
+            inner[:] = [] if (place := os.path.realpath(folder)) in places else inner  # a link to one that was seen
+            names += [] if place in places else [Path(folder, name) for name in files]
+            places.add(place)
+            _refuse_more(self.path, len(names) + len(places))
+        return [file.relative_to(self.path).as_posix() for file in names if not is_hidden(file.name) and file.is_file()]
 
     def _bytes(self, name: str, most: int) -> bytes:
         try:
@@ -135,7 +149,7 @@ class TiffSeriesSource(ScanSource):
     def _tiff(self, name: str) -> Iterator[TiffFile]:
         """The head of an image, whose pixels are not read."""
         try:
-            with self._opened(name, LARGEST_IMAGE) as file, TiffFile(file) as tif:
+            with self._opened(name, LARGEST_IMAGE) as file, opened(file) as tif:
                 yield tif
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
@@ -181,7 +195,7 @@ class TiffSeriesSource(ScanSource):
         if not shape or math.prod(shape) == 0:
             raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
         if len(shape) != 2:
-            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
+            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file, or FILE --then FILE.")
         require_real(dtype, f"{name} in {self.path}")
         return shape
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
@@ -19,14 +18,15 @@ from beamline.storage.readers.tiff import (
     SUFFIXES,
     UNREADABLE,
     Complaints,
-    appended,
-    pages_one_by_one,
+    images_of,
+    opened,
+    orientation,
     refuse_packed,
     refuse_volume,
+    stated,
+    upright,
 )
 from drivers.base.frame import FrameKind
-
-MANY_PAGES = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
 
 
 class TiffStackSource(ScanSource):
@@ -39,7 +39,7 @@ class TiffStackSource(ScanSource):
         complaints = Complaints()
         with complaints:
             try:
-                self._tif = tifffile.TiffFile(path)
+                self._tif = opened(path)
             except UNREADABLE as error:
                 raise DataError(f"{path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
             try:
@@ -56,32 +56,23 @@ class TiffStackSource(ScanSource):
         self.angles = np.full(n, np.nan)
         self.exposures = np.full(n, np.nan)
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
-        self.not_used = offered(self)
+        self.not_used += offered(self)
 
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
         refuse_packed(self._tif)
-        if len(self._tif.pages) > MANY_PAGES and appended(self._tif):
-            first = self._tif.pages.first
-            self.shape, self.dtype = (int(first.imagelength), int(first.imagewidth)), np.dtype(first.dtype)
-            self._offset = None
-            require_real(self.dtype, str(self.path))
-            return len(self._tif.pages)
-        series = self._tif.series[0]
-        one_by_one = pages_one_by_one(self._tif)
-        if len(series.shape) not in (2, 3) or (len(self._tif.series) != 1 and not one_by_one):
-            shapes = ", ".join(str(part.shape) for part in self._tif.series[:6])
-            shapes += f", ... ({len(self._tif.series)} in all)" if len(self._tif.series) > 6 else ""
+        series, *others = parts = images_of(self._tif)
+        if len(series.shape) not in (2, 3) or others:
+            shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
+            shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
-        self.shape = (int(series.shape[-2]), int(series.shape[-1]))
-        self.dtype = np.dtype(series.dtype)
-        require_real(self.dtype, str(self.path))
+        self.used, self.not_used = stated(self.path, self._tif)
+        self._stored, self.dtype, self._orientation = series.shape[-2:], np.dtype(series.dtype), orientation(self._tif)
         # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
-        self._offset = None if one_by_one else series.dataoffset
-        self._stored = self.dtype.newbyteorder(self._tif.byteorder)
-        if one_by_one:
-            return len(self._tif.pages)
+        self._pages, self._offset = series.pages, series.dataoffset
+        self.shape = self._stored[::-1] if self._orientation >= 5 else self._stored
+        require_real(self.dtype, str(self.path))
         return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
@@ -90,29 +81,33 @@ class TiffStackSource(ScanSource):
         out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)
         for i, page in enumerate(indices):
             try:
-                self._fill(out[i], int(page), rows)
+                if self._offset is not None and self._orientation == 1 and rows.step in (None, 1):
+                    self._fill(out[i], int(page), rows.indices(self.shape[0])[0])
+                else:
+                    out[i] = upright(self._page(int(page)), self._orientation)[rows]
             except UNREADABLE as error:
                 raise UnreadableError(f"Page {page} of {self.path} cannot be read ({hdf5.reason(error)}).") from error
         return out
 
-    def _fill(self, out: NDArray[Any], page: int, rows: slice) -> None:
+    def _page(self, page: int) -> NDArray[Any]:
+        """A page as it is stored."""
         if self._offset is None:
-            image = self._tif.pages[page].asarray()
-            if (image.shape, image.dtype) != (self.shape, self.dtype):
-                raise ValueError(f"it is {image.dtype} {image.shape}, the first {self.dtype} {self.shape}")
-            out[...] = image[rows]
-        elif rows.step not in (None, 1):
-            whole = np.empty(self.shape, self.dtype)
-            self._fill(whole, page, WHOLE)
-            out[...] = whole[rows]
-        else:
-            first = rows.indices(self.shape[0])[0]
-            self._tif.filehandle.seek(self._offset + (page * self.shape[0] + first) * self.shape[1] * out.itemsize)
-            n = self._tif.filehandle.readinto(out)
-            if n != out.nbytes:
-                raise EOFError(f"{n} of {out.nbytes} bytes are there")
-            if not self._stored.isnative:
-                out.byteswap(inplace=True)
+            image = self._tif.pages.get(self._pages[page].index, aspage=True, cache=False).asarray()
+            if (image.shape, image.dtype) != (self._stored, self.dtype):
+                raise ValueError(f"it is {image.dtype} {image.shape}, the first {self.dtype} {self._stored}")
+            return np.asarray(image)
+        whole = np.empty(self._stored, self.dtype)
+        self._fill(whole, page, 0)
+        return whole
+
+    def _fill(self, out: NDArray[Any], page: int, first: int) -> None:
+        """Fill `out` with the rows of a page from the first on."""
+        self._tif.filehandle.seek(self._offset + (page * self._stored[0] + first) * self._stored[1] * out.itemsize)
+        n = self._tif.filehandle.readinto(out)
+        if n != out.nbytes:
+            raise EOFError(f"{n} of {out.nbytes} bytes are there")
+        if not self.dtype.newbyteorder(self._tif.byteorder).isnative:
+            out.byteswap(inplace=True)
 
     def close(self) -> None:
         self._tif.close()

@@ -73,6 +73,35 @@ def images(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("name", ["s.log", "s.xtekct", "s.pca"])
+def test_decimal_commas_are_read(images: Path, name: str) -> None:
+    text = FILES[name][0].replace("=60\n", "=60.5\n").replace("60.000", "60.500").replace("=0.04", "=0.0417")
+    (images / name).write_text(text)
+    expected = read_side_file(images / name)
+    (images / name).write_text(text.replace(".", ","))
+    side = read_side_file(images / name)
+    assert (side.cone, side.pixel_mm, side.white) == (expected.cone, expected.pixel_mm, expected.white)
+    assert side.cone[0] == 60.5
+    np.testing.assert_array_equal(side.angles, expected.angles)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("60.000", "60,000", "60,000 has a comma beside 300.000 with a point"),
+        ("=60.000", "=1,165.25", "1,165.25 has a comma"),
+        (".000", ",000", "60,000 has a comma beside 40.00 with a point"),
+    ],
+)
+def test_commas_that_may_be_of_thousands_are_refused(images: Path, old: str, new: str, why: str) -> None:
+    (images / "s.log").write_text(SKYSCAN.replace(old, new))
+    with pytest.raises(DataError, match=why):
+        read_side_file(images / "s.log")
+    (images / "s.log").write_text(SKYSCAN.replace(".000", ",000").replace("40.00", "40"))
+    with pytest.raises(DataError, match="60,000 has a comma, which may be of decimals or not"):
+        read_side_file(images / "s.log")
+
+
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
 def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding: str) -> None:

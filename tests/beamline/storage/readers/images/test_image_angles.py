@@ -1,0 +1,102 @@
+"""Angles in names are judged over the whole series: read as they were written, or asked for; never mirrored or cut."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.images.image_angles import angles_in
+from beamline.storage.readers.images.image_names import in_order
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.angles import angles_known
+
+UP, BOTH, FINE = np.arange(0, 180, 2.0), np.arange(-90, 90, 2.0), np.arange(0, 180, 1.25)
+GOLDEN = np.round((np.arange(90) * 111.246) % 180, 3)
+Name = Callable[[float, int], str]
+
+
+def _named(degrees: NDArray[np.float64], name: Name) -> list[str]:
+    return [f"{name(float(a), i)}.tif" for i, a in enumerate(degrees)]
+
+
+READ: dict[str, tuple[NDArray[np.float64], Name]] = {
+    "a hyphen separates": (UP, lambda a, i: f"bone-{a:06.2f}deg-{i:04d}"),
+    "a hyphen after the word separates": (UP, lambda a, i: f"bone_angle-{a:06.2f}_{i:04d}"),
+    "hyphens everywhere": (UP, lambda a, i: f"2024-01-15-{a:05.1f}deg-{i:04d}"),
+    "a full turn": (np.arange(0, 360, 4.0), lambda a, i: f"scan-{a:05.1f}deg_{i:04d}"),
+    "plus and minus": (BOTH, lambda a, i: f"bone_angle{a:+06.1f}_{i:04d}"),
+    "a hyphen of some is a sign": (BOTH, lambda a, i: f"bone_angle{a:.1f}_{i:04d}"),
+    "a hyphen of some, before deg": (BOTH, lambda a, i: f"bone_20.5keV_{a:.1f}deg_{i:04d}"),
+    "a minus": (BOTH, lambda a, i: f"bone_angle{a:.1f}_{i:04d}".replace("-", "\u2212")),
+    "downwards from 0": (-UP.astype(int), lambda a, i: f"bone_angle{a:.0f}_{i:04d}".replace("-0_", "0_")),
+    "n and p": (BOTH, lambda a, i: f"bone_{'n' if a < 0 else 'p'}{abs(a):04.1f}deg_{i:04d}"),
+    "n and p alone": (BOTH, lambda a, i: f"bone{'n' if a < 0 else 'p'}{abs(a):02.0f}"),
+    "m, and p for the point": (BOTH + 0.5, lambda a, i: f"bone_{'m' * (a < 0)}{abs(a):.1f}".replace(".", "p")),
+    "neg": (BOTH, lambda a, i: f"bone_{'neg' * (a < 0)}{abs(a):03.0f}_{i:04d}"),
+    "an index and a tilt": (BOTH, lambda a, i: f"TS_{i + 1:03d}_{a:.1f}"),
+    "tilt as a word": (BOTH, lambda a, i: f"_{i + 1:03d}_{a:.0f}tilt_"),
+    "a decimal comma": (FINE, lambda a, i: f"bone_angle_{a:06.2f}_{i:04d}".replace(".", ",")),
+    "p for the point": (FINE, lambda a, i: f"bone_{a:06.2f}deg_{i:04d}".replace(".", "p")),
+    "golden angles with commas": (GOLDEN - 90, lambda a, i: f"bone_ang{a:.3f}_{i:04d}".replace(".", ",")),
+    "powers of ten": (BOTH + 1e-14, lambda a, i: f"bone_{a}deg_{i:04d}"),
+    "the end of a word": (UP, lambda a, i: f"scan{a:.0f}deg_{i:04d}"),
+}
+ASKED: dict[str, tuple[NDArray[np.float64], Name, str]] = {
+    "a hyphen, and no 0": (UP + 1, lambda a, i: f"bone-{a:03.0f}deg", "hyphen"),
+    "a hyphen, and no zeros before": (UP, lambda a, i: f"bone_angle-{a:.1f}-{i}", "hyphen"),
+    "minus 0": (-UP, lambda a, i: f"bone_{a:.1f}deg_{i:04d}", "hyphen"),
+    "n": (UP, lambda a, i: f"bone_n{a:.0f}deg_{i:04d}", "the n before"),
+    "an underscore for minus": (BOTH, lambda a, i: f"bone_angle{'_' * (a < 0)}{abs(a):.0f}_{i:04d}", "replaced"),
+    "another separator for plus": (BOTH, lambda a, i: f"a{'-' if a < 0 else '_'}{abs(a):.1f}deg_{i}", "replaced"),
+    "no sign at all": (BOTH, lambda a, i: f"bone_{abs(a):.1f}deg_{i:04d}", "90 names give 46"),
+    "an underscore for the point": (FINE, lambda a, i: f"a_angle_{a:06.2f}_{i:04d}".replace(".", "_"), "decimals"),
+    "the decimals beside the unit": (GOLDEN, lambda a, i: f"a_{a:07.3f}deg_{i:04d}".replace(".", "_"), "decimals"),
+    "the counter after a point": (UP, lambda a, i: f"bone_angle{a:03.0f}.{i:04d}", "counts"),
+    "the counter after the word": (FINE, lambda a, i: f"angle_{i:04d}_{a:.2f}", "another"),
+    "a sign in uneven steps": ((UP / 18) ** 2 - 50, lambda a, i: f"S_{i:03d}_{a:.1f}", "even"),
+}
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_a_series_is_read_as_it_was_written(kind: str) -> None:
+    degrees, name = READ[kind]
+    names = _named(degrees, name)
+    images = in_order("scan", names[::2] + names[1::2])
+    rows = [names.index(each) for each in images.names]
+    np.testing.assert_allclose(np.degrees(images.angles), degrees[rows], atol=1e-9)
+    assert sorted(rows) == list(range(degrees.size)) == (rows if images.numbers is not None else sorted(rows))
+
+
+@pytest.mark.parametrize("kind", ASKED)
+def test_what_may_be_read_in_two_ways_is_asked_for(kind: str) -> None:
+    degrees, name, why = ASKED[kind]
+    images = in_order("scan", _named(degrees, name))
+    assert np.isnan(images.angles).all()
+    assert "angles in names such as" in images.doubt
+    assert why in images.doubt
+
+
+def test_the_sentence_asks_for_angles_and_those_given_are_taken(tmp_path: Path) -> None:
+    for i, name in enumerate(_named(UP, lambda a, i: f"bone-{a:.1f}deg-{i}")):
+        tifffile.imwrite(tmp_path / name, np.full((4, 6), i, np.uint16))
+    with open_scan(tmp_path) as source:
+        (finding,) = angles_known(source)
+        assert (
+            "the hyphen before the number may be a minus sign, or separate. Give them with --angles" in finding.message
+        )
+    with open_scan(SourceOptions(tmp_path, angles=np.radians(UP))) as source:
+        np.testing.assert_allclose(np.degrees(source.angles), UP)
+        np.testing.assert_array_equal(source.read([1, 10])[:, 0, 0], [1, 10])
+
+
+@pytest.mark.parametrize("names", [["a.tif", "a1.tif", "1a.tif"], ["deg.tif", "1deg.tif"]])
+def test_names_with_numbers_here_and_there_are_several_series(names: list[str]) -> None:
+    assert angles_in(names).radians is None
+    with pytest.raises(DataError, match="several series"):
+        in_order("scan", names)
