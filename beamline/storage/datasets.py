@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.text import printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
+from beamline.storage.structure import drawn_on, plain_name
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -82,8 +83,8 @@ def is_foreign(item: h5py.Dataset) -> bool:
 def file_of(item: h5py.Dataset) -> str:
     """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
     source."""
-    sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
-    return next((name for name in sources if name != "."), str(item.file.filename))
+    sources = drawn_on(item.id.get_create_plist()) if item.is_virtual else ()
+    return next((name for name, _ in sources if name != "."), str(item.file.filename))
 
 
 _HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's number of it
@@ -249,13 +250,14 @@ def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
         return []
     folder, lost = Path(item.file.filename).parent, set()
     for source in item.virtual_sources():
-        if source.file_name == ".":
-            drawn = dataset(item.file, source.dset_name)
+        name, where = plain_name(source.file_name), plain_name(source.dset_name)
+        if name == ".":
+            drawn = dataset(item.file, where)
             whole = not source.src_space.shape
             if drawn is None or not (_fills(drawn, source) if whole else drawn.shape[1:] == source.src_space.shape[1:]):
-                lost.add(source.dset_name)
-        elif not _is_there(folder / source.file_name, source, within):
-            lost.add(str(folder / source.file_name))
+                lost.add(where)
+        elif not _is_there(folder / name, source, within):
+            lost.add(str(folder / name))
     return sorted(lost)
 
 
@@ -265,7 +267,7 @@ def _is_there(path: Path, source: Any, within: int) -> bool:
         return False
     try:
         with open_hdf5(path) as file:
-            drawn = dataset(file, source.dset_name)
+            drawn = dataset(file, plain_name(source.dset_name))
             return drawn is not None and _holds(drawn, source) and not missing_links(drawn, within - 1)
     except (DataError, OSError):
         return False
