@@ -205,6 +205,12 @@ def broken_link(path: Path) -> str:
     return ""
 
 
+def no_file(path: Path) -> str:
+    """A sentence on a path that names no regular file."""
+    kind = "is a folder, a device or a pipe, and a file is expected" if path.exists() else "does not exist"
+    return broken_link(path) or f"{path} {kind}."
+
+
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 

@@ -19,7 +19,7 @@ import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
 
 from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import is_link, same_file
+from beamline.core.files import is_link, no_file, same_file
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
@@ -44,7 +44,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
-        raise (NotReadyError if follow else DataError)(f"{path} does not exist.")
+        raise (NotReadyError if follow else DataError)(no_file(path))
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):

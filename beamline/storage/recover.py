@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, same_file, whole_file
+from beamline.core.files import no_file, refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
@@ -95,7 +95,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             10 s: then nothing is changed. Or a disk that does not take it: then it can be run again.
     """
     if not path.is_file():
-        raise DataError(f"{path} does not exist. Nothing was changed.")
+        raise DataError(f"{no_file(path)} Nothing was changed.")
     if held(path):
         raise DataError(
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "

@@ -188,7 +188,7 @@ def _measured(
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    number = f"{np.ravel(datasets.first_of(item))[0]:.6g}"
+    number = datasets.text_of(item)
     source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 

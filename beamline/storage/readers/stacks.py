@@ -167,7 +167,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
         stated = unit or datasets.attribute(item, "units")
-        if stated.lower() not in datasets.ANGLE_UNITS:
+        if datasets.factor_of(stated, datasets.ANGLE_UNITS) is None:
             problem = f"the units {stated!r}" if stated else "no attribute `units`"
             raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
         return datasets.radians(item, unit)

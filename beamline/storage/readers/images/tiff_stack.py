@@ -23,6 +23,7 @@ from beamline.storage.readers.tiff import (
     pages_one_by_one,
     refuse_packed,
     refuse_volume,
+    require_possible,
 )
 from drivers.base.frame import FrameKind
 
@@ -62,6 +63,7 @@ class TiffStackSource(ScanSource):
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
         refuse_packed(self._tif)
+        require_possible(self._tif)
         if len(self._tif.pages) > MANY_PAGES and appended(self._tif):
             first = self._tif.pages.first
             self.shape, self.dtype = (int(first.imagelength), int(first.imagewidth)), np.dtype(first.dtype)
