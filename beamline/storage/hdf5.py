@@ -85,19 +85,33 @@ def _unopened(
     """Why none of the ways opened a file."""
     if follow:
         return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
-    if head is not None and head.missing:
+    cut = re.search(r"truncated file: eof = (\d+),.* stored_eof = (\d+)", str(problems[0]))
+    missing = int(cut[2]) - int(cut[1]) if cut else head.missing if head is not None else 0
+    if missing:
+        rescue = f"`beamline recover {path}` rescues its frames" if _ours(path, head) else "nothing else brings it back"
         return DataError(
-            f"{path} is cut off: the last {head.missing} bytes are missing. Copy it again, or use the original. If the "
-            "disk was full, `beamline recover` rescues its frames. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original: if there is "
+            f"no other, {rescue}. Nothing was read."
         )
     if _being_written(head):
         return DataError(
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
-            "writer died, `beamline recover` clears the mark; nothing was read."
+            f"writer died, `beamline recover {path}` clears the mark; nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(held_sentence(path))
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
+
+
+def _ours(path: Path, head: Superblock | None) -> bool:
+    """Whether this program wrote a file that is not whole."""
+    from beamline.storage.writers.layout import COMMITTED  # which imports this module
+
+    with suppress(*ALTERED):
+        if head is not None:
+            with h5py.File(GrowingFile(path, head), "r") as file:
+                return COMMITTED in file
+    return False
 
 
 def grows_here(path: Path) -> bool:

@@ -208,9 +208,10 @@ def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
         )
     angles = datasets.radians(theta, default="degrees")
     if angles.size != n_views or n_views not in (1, *theta.shape):
+        way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
-            f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, "
-            f"shape {theta.shape}; expected one angle for each."
+            f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
+            f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"
         )
     return angles
 

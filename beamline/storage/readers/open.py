@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import refuse_instead
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -277,6 +278,8 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
+    if path.is_file() and not opening.follow:
+        refuse_instead(path)
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):
