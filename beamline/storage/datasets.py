@@ -39,6 +39,7 @@ def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
 _PIECE = 2**31  # bytes of a chunk of frames
+NAME = 1000  # letters of a name or a title
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 
 

@@ -213,7 +213,7 @@ class NXtomoSource(ScanSource):
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
-            value = datasets.text_at(entry, where)
+            value = datasets.text_at(entry, where)[: datasets.NAME]
             if value:
                 facts[name] = value
         for name, where, units in NUMBERS:

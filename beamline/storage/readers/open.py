@@ -230,7 +230,7 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
             return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
-    return open_stacks(path, data, options.darks_path, options.flats_path)
+    return open_stacks(path, data, options.darks_path, options.flats_path, options.angles_path)
 
 
 def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:

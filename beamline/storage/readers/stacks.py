@@ -53,10 +53,23 @@ def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
     """
     names = [axis.strip().lower() for axis in axes]
     cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith("col")]
-    rows = [i for i, name in enumerate(names) if name[:1] in ("y", "v") or name.startswith("row")]
+    rows = [i for i, name in enumerate(names) if name[:1] == "y" or (name.startswith(("v", "row")) and name != "view")]
     if len(names) != 3 or len(cols) != 1 or len(rows) != 1:
         return None
     return 3 - cols[0] - rows[0], rows[0], cols[0]
+
+
+USUAL = (0, 1, 2)
+
+
+def in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
+    """A dataset as frames [frame, row, col]; DataError for one that is refused whatever its order."""
+    if order == USUAL or item.ndim != 3:
+        return item
+    datasets.require_possible(item)
+    if lost := datasets.missing_links(item):
+        raise DataError(f"{item.file.filename} draws its frames from {lost[0]}, which is not there or differs.")
+    return TurnedFrames(item, order)
 
 
 _LISTED = 10  # datasets of a file that an error names
@@ -135,21 +148,66 @@ class StacksSource(ScanSource):
         self._file.close()
 
 
-def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> StacksSource:
+def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
     """The scan whose datasets have these paths in an HDF5 file. A dark or flat may be a single image [row, col].
 
-    DataError where one is not there, or is no stack of frames; the message names the datasets that the file has.
+    Args:
+        data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
+            flats are in the same order.
+        angles: of their angles, whose number helps to tell which dimension is that of the views.
+
+    Raises:
+        DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
-        given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats), (FrameKind.PROJECTION, data))
-        stacks = []
-        for kind, where in given:
-            if where is not None:
-                item = dataset_at(file, where)
-                image = item.ndim == 2 and kind != FrameKind.PROJECTION
-                stacks.append(FrameStack(kind, where, item[()][None] if image else item))
-        return StacksSource(path, file, stacks, format="hdf5_stacks", facts={"data": data})
+        views, where, order = _named_order(file, data)
+        given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
+        references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
+        n_angles = None if angles is None else dataset_at(file, angles).size
+        order = order or _order_of(views, [item.shape for *_, item in references], n_angles)
+        stacks = [FrameStack(kind, name, _frames(item, order)) for kind, name, item in references]
+        stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
+        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL]
+        facts = {"data": where, "dimensions": ",".join(names)}
+        return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
+
+
+def _named_order(file: h5py.File, data: str) -> tuple[h5py.Dataset, str, tuple[int, int, int] | None]:
+    """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
+    where, colon, names = data.rpartition(":")
+    if not colon or datasets.dataset(file, data) is not None:
+        return dataset_at(file, data), data, None
+    if (order := dimensions(names.split(","))) is None:
+        raise DataError(f"The dimensions of {where} are given as {names}; expected three, such as frame,row,col.")
+    return dataset_at(file, where), where, order
+
+
+def _order_of(views: h5py.Dataset, references: list[tuple[int, ...]], n_angles: int | None) -> tuple[int, int, int]:
+    """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
+
+    MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
+    views in the middle are sinograms, as ASTRA has them, with columns first.
+    """
+    if views.ndim != 3:
+        return USUAL
+    images = [(*views.shape[:axis], *views.shape[axis + 1 :]) for axis in USUAL]
+    fitting = [
+        axis
+        for axis in USUAL
+        if all(images[axis] in (shape, (*shape[:axis], *shape[axis + 1 :])) for shape in references)
+    ]
+    frames = next((axis for axis in fitting if views.shape[axis] == n_angles), fitting[0] if fitting else 0)
+    rows, cols = (axis for axis in USUAL if axis != frames)
+    return (frames, cols, rows) if "MATLAB_class" in views.attrs and frames != 1 else (frames, rows, cols)
+
+
+def _frames(item: h5py.Dataset, order: tuple[int, int, int]) -> Any:
+    """Darks or flats as frames [frame, row, col]; also of one image, which has no dimension of frames."""
+    if item.ndim != 2:
+        return in_order(item, order)
+    image = np.asarray(datasets.values_of(item))
+    return (image.T if order[1] > order[2] else image)[None]
 
 
 def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:

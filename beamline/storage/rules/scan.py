@@ -156,8 +156,25 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "axis",
             f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
-            "the rotation axis were horizontal; it is expected along the columns. If it is, say --horizontal-axis.",
+            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(source)}If it is "
+            "horizontal, say --horizontal-axis.",
         )
+
+
+def _exchanged(source: ScanSource) -> str:
+    """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
+
+    MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
+    """
+    facts, named = source.attributes, ""
+    data, dimensions = facts.get("data"), str(facts.get("dimensions", "frame,row,col"))
+    if source.format == "data_exchange":
+        data, named = "exchange/data", " --angles-path exchange/theta --darks-path exchange/data_dark --flats-path "
+        named += "exchange/data_white"
+    swapped = {"row": "col", "col": "row"}
+    order = ",".join(swapped.get(axis, axis) for axis in dimensions.split(","))
+    other = f"--data-path {data}:{order}{named}"
+    return "" if data is None else f"If rows and columns are exchanged, as MATLAB writes them, say {other}. "
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
