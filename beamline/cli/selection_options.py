@@ -56,8 +56,8 @@ scan_options = together(
     option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout, or of several detectors: its projections: /raw/images, or, where dimensions "
-        "are in another order, /raw/images:frame,col,row.",
+        help="For an HDF5 file of any layout, or of several detectors: its projections, /raw/images, or with their "
+        "dimensions, /raw/images:frame,col,row.",
     ),
     option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
