@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -270,37 +271,24 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
             made.write(values)
 
 
-def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
+def missing_links(item: h5py.Dataset) -> list[str]:
     """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
-    Virtual sources are followed through `within` files at most.
     """
-    if not item.is_virtual:
-        return []
-    folder, lost = Path(item.file.filename).parent, set()
-    for source in item.virtual_sources():
+    lost = set()
+    for source in item.virtual_sources() if item.is_virtual else ():
         name, where = plain_name(source.file_name), plain_name(source.dset_name)
-        if name == ".":
-            drawn = dataset(item.file, where)
-            whole = not source.src_space.shape
-            if drawn is None or not (_fills(drawn, source) if whole else drawn.shape[1:] == source.src_space.shape[1:]):
-                lost.add(where)
-        elif not _is_there(folder / name, source, within):
-            lost.add(str(folder / name))
+        path = Path(item.file.filename).parent / name
+        try:
+            with nullcontext(item.file) if name == "." else open_hdf5(path) as file:
+                drawn = dataset(file, where)
+                whole = drawn is not None and _holds(drawn, source) and not missing_links(drawn)
+        except (DataError, OSError):
+            whole = False
+        if not whole:
+            lost.add(where if name == "." else str(path))
     return sorted(lost)
-
-
-def _is_there(path: Path, source: Any, within: int) -> bool:
-    """Whether another file has the frames, of their shape, that a source of a virtual dataset names."""
-    if within == 0:
-        return False
-    try:
-        with open_hdf5(path) as file:
-            drawn = dataset(file, plain_name(source.dset_name))
-            return drawn is not None and _holds(drawn, source) and not missing_links(drawn, within - 1)
-    except (DataError, OSError):
-        return False
 
 
 def _holds(drawn: h5py.Dataset, source: Any) -> bool:

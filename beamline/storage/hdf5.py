@@ -6,7 +6,6 @@ import atexit
 import errno
 import os
 import re
-import stat
 import struct
 import sys
 import zlib
@@ -19,8 +18,8 @@ import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
 
 from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import is_link, no_file, same_file
-from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
+from beamline.core.files import no_file, same_file
+from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
@@ -117,46 +116,13 @@ def _ours(path: Path, head: Superblock | None) -> bool:
 def grows_here(path: Path) -> bool:
     """Whether this program has the file open through HDF5's own driver, for writing or following it."""
     here = path.stat()
-    for file in _open_by_name().values():
-        with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            if file.get_intent() != h5py.h5f.ACC_RDONLY and same_file(here, Path(os.fsdecode(file.name)).stat()):
-                return True
-    return False
-
-
-def _open_by_name() -> dict[int, Any]:
-    """The files of this program that HDF5 has opened itself, by their names, and its numbers of them."""
-    files = {}
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            if file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver:
-                files[file.id] = file
-    return files
-
-
-@contextmanager
-def opened_itself(path: Path) -> Iterator[None]:
-    """Check that the block opened the regular file of this name, and not the target of a link that replaced it.
-
-    For files in another user's folder, as HDF5 opens by name. On Windows, where its handles cannot be looked at, a link
-    that still stands there is found.
-
-    Raises:
-        DataError: it is something else.
-    """
-    by_name, others = {*_open_by_name()}, {*UnderHdf5.opened}
-    yield
-    try:
-        here = os.lstat(path)
-        opened = [file.stat() for file in {*UnderHdf5.opened} - others if file.path == path]
-        for number, file in _open_by_name().items() if os.name == "posix" else ():
-            if number not in by_name and os.fsdecode(file.name) == str(path):
-                opened.append(os.fstat(file.get_vfd_handle()))
-        itself = stat.S_ISREG(here.st_mode) and not is_link(path) and all(same_file(here, each) for each in opened)
-    except (OSError, ValueError):  # it is gone, or was closed
-        itself = False
-    if not itself:
-        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself.")
+            by_name = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
+            writes = by_name and file.get_intent() != h5py.h5f.ACC_RDONLY
+            if writes and same_file(here, Path(os.fsdecode(file.name)).stat()):
+                return True
+    return False
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:

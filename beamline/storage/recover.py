@@ -111,14 +111,13 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         if head.open_for_writing and (cleared := _of_others(path, head)) is not None:
             cleared.carry_out()
             return Recovered(path, True, None, 0, None)
-        if head.open_for_writing or head.missing or not _finished(path):
-            try:
-                done, mended = _mended(path, head)
-            except DataError as error:
-                return _rescued(path, head, error, say)
-        else:
-            done, mended = _as_it_is(path), Overlay(path)
-        return _with_view(done, mended, say)
+        if not (head.open_for_writing or head.missing) and (done := _as_it_is(path)) is not None:
+            return _with_view(done, Overlay(path), say)
+        try:
+            mended = _mended(path, head)
+        except DataError as error:
+            return _rescued(path, head, error, say)
+        return _with_view(*mended, say)
     finally:
         if lock is not None:
             lock.release()
@@ -163,14 +162,12 @@ def _of_others(path: Path, head: Superblock) -> Overlay | None:
     return None
 
 
-def _finished(path: Path) -> bool:
+def _as_it_is(path: Path) -> Recovered | None:
+    """A file that is in order; None where its end is missing."""
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
         _require_ours(path, file)
-        return bool(file[layout.FINISHED][()])
-
-
-def _as_it_is(path: Path) -> Recovered:
-    with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
+        if not file[layout.FINISHED][()]:
+            return None
         require_joined(file)
         frames = int(file[layout.COMMITTED][()])
         return Recovered(path, False, frames, 0, None, altered=_altered(file, frames))

@@ -26,7 +26,6 @@ from beamline.core.files import require_regular
 MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
 _NESTED = 8  # virtual datasets of which each draws on the next; HDF5 crashes where there is no end to them
 CLAIMED = 1e9  # bytes
-_HEAD = 4096  # bytes that tell text
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
@@ -176,29 +175,17 @@ def _refuse_empty_claim(dataset: Any, made: Any, what: str) -> None:
 
 def _refuse_foreign_bytes(dataset: Any, made: Any, path: Path, name: str) -> None:
     """DataError for values in a file of any kind (HDF5's external storage), unless they are numbers, and that file is
-    below the folder of this one, is not hidden and is no text: so it may hold images, and it is no file of others."""
+    below the folder of this one and not hidden."""
     for i in range(made.get_external_count()):
         other, root = os.fsdecode(made.get_external(i)[0]), path.resolve().parent
         for place in _places(other, path):
             within = place.resolve()
             inside = root in within.parents and not any(part.startswith(".") for part in within.relative_to(root).parts)
-            if dataset.dtype.kind not in "uif" or not inside or _is_text(within):
+            if dataset.dtype.kind not in "uif" or not inside:
                 raise DataError(
                     f"{path} keeps the values of {name} in the file {other}. Only numbers are read from such a file, "
-                    "one that lies below the folder of the scan and is no text. Nothing was read."
+                    "and one that lies below the folder of the scan. Nothing was read."
                 )
-
-
-def _is_text(path: Path) -> bool:
-    """Whether a regular file begins as text does; pixels hardly ever do."""
-    try:
-        require_regular(path)
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-        text = head.decode("utf-8") if len(head) < _HEAD else head[: head.rfind(b"\n") + 1].decode("utf-8")
-    except (OSError, UnicodeDecodeError):
-        return False
-    return bool(text) and all(c.isprintable() or c.isspace() for c in text)
 
 
 def drawn_on(made: Any) -> Iterator[tuple[str, str]]:

@@ -27,14 +27,14 @@ class TurnedFrames:
 
     def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
         """`order`: which dimensions of `item` are frames, rows and columns."""
-        self._item, self._order = item, order
+        self.item, self._order = item, order
         self.shape = tuple(item.shape[axis] for axis in order)
-        self.dtype, self.ndim, self.name, self.file = item.dtype, 3, item.name, item.file
+        self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
 
     @property
     def frame_bytes(self) -> int:
         """Bytes that are decompressed to read a frame."""
-        return bytes_unpacked(self._item, self._order[0])
+        return bytes_unpacked(self.item, self._order[0])
 
     def __len__(self) -> int:
         return int(self.shape[0])
@@ -43,7 +43,7 @@ class TurnedFrames:
         stored = [slice(None)] * 3
         for axis, part in zip(self._order, wanted, strict=False):
             stored[axis] = part
-        return np.asarray(self._item[tuple(stored)]).transpose(self._order)
+        return np.asarray(self.item[tuple(stored)]).transpose(self._order)
 
 
 def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
@@ -63,13 +63,8 @@ USUAL = (0, 1, 2)
 
 
 def in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
-    """A dataset as frames [frame, row, col]; DataError for one that is refused whatever its order."""
-    if order == USUAL or item.ndim != 3:
-        return item
-    datasets.require_possible(item)
-    if lost := datasets.missing_links(item):
-        raise DataError(f"{item.file.filename} draws its frames from {lost[0]}, which is not there or differs.")
-    return TurnedFrames(item, order)
+    """A dataset as frames [frame, row, col]."""
+    return item if order == USUAL or item.ndim != 3 else TurnedFrames(item, order)
 
 
 _LISTED = 10  # datasets of a file that an error names
@@ -117,10 +112,10 @@ class StacksSource(ScanSource):
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
-            if isinstance(stack.frames, h5py.Dataset):
+            item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
+            if isinstance(item, h5py.Dataset):
                 datasets.require_possible(stack.frames)
-                lost = datasets.missing_links(stack.frames)
-                if lost:
+                if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
             raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")

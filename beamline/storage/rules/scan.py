@@ -161,20 +161,21 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
         )
 
 
+_EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
+
+
 def _exchanged(source: ScanSource) -> str:
     """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
 
     MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
     """
-    facts, named = source.attributes, ""
-    data, dimensions = facts.get("data"), str(facts.get("dimensions", "frame,row,col"))
+    data, dimensions = source.attributes.get("data"), str(source.attributes.get("dimensions", "frame,row,col"))
+    others = ""
     if source.format == "data_exchange":
-        data, named = "exchange/data", " --angles-path exchange/theta --darks-path exchange/data_dark --flats-path "
-        named += "exchange/data_white"
-    swapped = {"row": "col", "col": "row"}
-    order = ",".join(swapped.get(axis, axis) for axis in dimensions.split(","))
-    other = f"--data-path {data}:{order}{named}"
-    return "" if data is None else f"If rows and columns are exchanged, as MATLAB writes them, say {other}. "
+        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
+    order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
+    say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
+    return "" if data is None else say
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
