@@ -56,7 +56,8 @@ scan_options = together(
     option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout, or of several detectors: its projections [frame, row, col]: /raw/images.",
+        help="For an HDF5 file of any layout, or of several detectors: its projections, /raw/images, or with their "
+        "dimensions, /raw/images:frame,col,row.",
     ),
     option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),

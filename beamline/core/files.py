@@ -94,6 +94,22 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
 _DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF file", b"PK\3\4": "a .zip or .npz file"}
 
 
+_INSTEAD = {
+    b"version https://git-lfs": "a pointer of Git LFS in its place: `git lfs pull` fetches the file",
+    b"\x1f\x8b": "packed by gzip: `gunzip` unpacks it",
+    b"<!doctype html": "a page of the web, as of a login, in its place: download the file again",
+    b"<html": "a page of the web, as of a login, in its place: download the file again",
+}
+
+
+def refuse_instead(path: Path) -> None:
+    """Raise DataError for a file that is empty, packed as a whole, or stands for the data elsewhere."""
+    with path.open("rb") as file:
+        head = file.read(64).lower()
+    if why := "empty" if not head else next((why for begin, why in _INSTEAD.items() if head.startswith(begin)), ""):
+        raise DataError(f"{path} is {why}. Nothing was read.")
+
+
 def kind_of_data(path: Path) -> str | None:
     """The kind of data in a file, judged by its first bytes, for a sentence; None if unknown."""
     try:
@@ -205,6 +221,12 @@ def broken_link(path: Path) -> str:
         if place.is_symlink() and not place.exists():
             return f"{place} is a link to {place.readlink()}, which is not there: is its disk mounted?"
     return ""
+
+
+def no_file(path: Path) -> str:
+    """A sentence on a path that names no regular file."""
+    kind = "is a folder, a device or a pipe, and a file is expected" if path.exists() else "does not exist"
+    return broken_link(path) or f"{path} {kind}."
 
 
 _BESIDE = 44  # bytes by which names of temporary files and of what lies beside a volume are longer than its own

@@ -32,6 +32,8 @@ def rounded(value: float, *, up: bool = False) -> float:
 
 def printable(text: str) -> str:
     """The text for a terminal: control characters become `\\x1b`, except line ends and tabs, so that none acts."""
+    if text.isprintable():  # also where it has 50 MB
+        return text
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -45,8 +45,7 @@ class Recording:
         self.path = path
         if not alone and path.is_file() and path.stat().st_size and not hdf5.is_hdf5(path):
             raise _foreign(path)
-        with hdf5.opened_itself(path) if alone else nullcontext():
-            self._file = hdf5.open_hdf5(path, follow=True)
+        self._file = hdf5.open_hdf5(path, follow=True)
         with hdf5.closed_on_error(self), hdf5.readable(path):
             if alone:
                 require_inside(self._file)

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -187,10 +187,9 @@ class Reader:
             before, self._volume = self._volume, None
             if before is not None:
                 before.close()
-            with ExitStack() as first, hdf5.opened_itself(file.path):
-                require_inside(first.enter_context(hdf5.open_hdf5(file.path)))
-                volume = ShownVolume(file.path)
-            self._volume, self._volume_file = volume, file
+            with hdf5.open_hdf5(file.path) as opened:
+                require_inside(opened)
+                self._volume, self._volume_file = ShownVolume(file.path), file
             self._thread.submit(self._read_more)
         return self._volume
 

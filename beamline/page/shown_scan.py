@@ -83,7 +83,8 @@ class ShownScan:
 
     def __init__(self, source: ScanSource) -> None:
         self._source, self._views = source, _OverFlats(source)
-        self._degrees = np.degrees(source.angles[self._views.frames])
+        degrees = np.degrees(source.angles[self._views.frames])
+        self._degrees = np.where(np.isfinite(degrees), degrees, np.nan)
         record = bare_record(source.path, self._views)
         self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
         self._correction: ScanCorrection | None = None
@@ -198,10 +199,12 @@ class ShownScan:
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
             raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
-        if self._correction is None:
-            self._correction = ScanCorrection(self._source, Selection(), lambda _: None)
         some, band = spread_views(self._source.angles[frames], _VIEWS, frames), range(max(near, 0), min(far + 1, rows))
-        corrected = self._correction.at_once(some, slice(band.start, band.stop))
+        try:
+            self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None)
+            corrected = self._correction.at_once(some, slice(band.start, band.stop))
+        except ValueError as error:
+            raise DataError(f"The views cannot be corrected: {error}.") from error
         self._lines, self._ids = corrected.data, corrected.view_ids
         self._row, self._beside, self._band = row, beside, band
 

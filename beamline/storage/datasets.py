@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import h5py
-import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.text import printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
+from beamline.storage.structure import drawn_on, plain_name
 
+_JOULE = 1 / 1.602176634e-16  # keV
 DEGREE = np.pi / 180
-ANGLE_UNITS = {
-    "deg": DEGREE,
-    "degree": DEGREE,
-    "degrees": DEGREE,
-    "°": DEGREE,
-    "rad": 1.0,
-    "radian": 1.0,
-    "radians": 1.0,
-}
+ANGLE_UNITS = {"deg": DEGREE, "degree": DEGREE, "°": DEGREE, "rad": 1.0, "radian": 1.0, "mrad": 1e-3}
 LENGTH_UNITS = {  # mm
-    "m": 1e3, "metre": 1e3, "meter": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3,
-    "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "micrometre": 1e-3, "nm": 1e-6,
+    "m": 1e3, "meter": 1e3, "cm": 10.0, "centimeter": 10.0, "mm": 1.0, "millimeter": 1.0, "um": 1e-3, "µm": 1e-3,
+    "μm": 1e-3, "micron": 1e-3, "micrometer": 1e-3, "nm": 1e-6, "nanometer": 1e-6,
 }  # fmt: skip
-ENERGY_UNITS = {"ev": 1e-3, "kev": 1.0}  # keV
-WAVELENGTH_UNITS = {"angstrom": 1.0, "angstroms": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "pm": 0.01, "m": 1e10}  # Å
-TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
+ENERGY_UNITS = {"ev": 1e-3, "electronvolt": 1e-3, "kev": 1.0, "kiloelectronvolt": 1.0, "j": _JOULE, "joule": _JOULE}
+WAVELENGTH_UNITS = {"angstrom": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "nanometer": 10.0, "pm": 0.01, "m": 1e10}  # Å
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6}  # s
+_WRITTEN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(.*)", re.I)  # a number, and perhaps its unit
+
+
+def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
+    """The factor of a unit, also in capitals, in the plural or with a full stop; None if it is unknown."""
+    name = unit.strip(" .").lower().replace("metre", "meter")
+    return units.get(name, units.get(name[:-1]) if name.endswith("s") and len(name) > 3 else None)
 
 
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
@@ -40,14 +42,21 @@ _DEEPEST = 12  # groups within another that are looked into
 _CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _PIECE = 2**31  # bytes of a chunk of frames
 HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
+NAME = 1000  # letters of a name or a title
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 
 
 def text(value: Any) -> str:
-    """A string from HDF5's representations: str, bytes, or an array of one of these; without control characters."""
+    """A string from HDF5's representations: str, bytes, UTF-8 or Latin-1, or an array of one of these; without control
+    characters.
+    """
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size else ""
-    return printable(value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value))
+    raw = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
+    try:
+        return printable(raw.decode())
+    except UnicodeDecodeError:
+        return printable(raw.decode("latin-1"))
 
 
 def attribute(item: h5py.HLObject, name: str) -> str:
@@ -84,8 +93,8 @@ def is_foreign(item: h5py.Dataset) -> bool:
 def file_of(item: h5py.Dataset) -> str:
     """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
     source."""
-    sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
-    return next((name for name in sources if name != "."), str(item.file.filename))
+    sources = drawn_on(item.id.get_create_plist()) if item.is_virtual else ()
+    return next((name for name, _ in sources if name != "."), str(item.file.filename))
 
 
 _HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's number of it
@@ -202,42 +211,65 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """A number in the unit of this program; None if it is absent, not finite, or its unit is unknown or missing."""
+    """The first number in the unit of this program; None as `in_units`, and if it is not finite."""
     item = dataset(group, path)
-    factor = None if item is None else units.get(attribute(item, "units").lower())
-    if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
-        return None
-    value = float(np.ravel(first_of(item))[0]) * factor
-    return value if np.isfinite(value) else None
+    values = None if item is None else _converted(item, units, first_of)
+    return float(values[0]) if values is not None and values.size and np.isfinite(values[0]) else None
 
 
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
-    """Numbers in the unit of this program, as a list; None if there is no dataset of real numbers, or its unit is
-    unknown.
+    """Numbers in the unit of this program, as a list, also where they are written as text, such as "6.5 um".
+
+    None if there is no dataset of real numbers, or if its unit is unknown or missing.
     """
-    factor = None if item is None else units.get(attribute(item, "units").lower())
-    if item is None or factor is None or item.dtype.kind not in "uif":
-        return None
-    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
+    return None if item is None else _converted(item, units, values_of)
+
+
+def _converted(
+    item: h5py.Dataset, units: Mapping[str, float], read: Callable[[h5py.Dataset], Any]
+) -> NDArray[np.float64] | None:
+    values, stated = _numbers(item, read)
+    factors = {factor_of(unit, units) for unit in stated or {""}}
+    factor = factors.pop() if len(factors) == 1 else None  # an attribute and a text that disagree say nothing
+    return None if values is None or factor is None else values * factor
+
+
+def _numbers(item: h5py.Dataset, read: Callable[[h5py.Dataset], Any]) -> tuple[NDArray[np.float64] | None, set[str]]:
+    """What is read of a dataset, as a list, None where it is no numbers; and the units that its attribute and its text
+    state."""
+    stated = {attribute(item, "units")} - {""}
+    if item.dtype.kind in "uif":
+        return np.ravel(np.asarray(read(item), np.float64)), stated
+    if item.dtype.kind not in "SO" or is_foreign(item):
+        return None, stated
+    written = [_WRITTEN.fullmatch(text(each).strip()) for each in np.ravel(read(item))]
+    numbers = [match for match in written if match is not None]
+    values = np.array([float(match[1]) for match in numbers])
+    return values if len(numbers) == len(written) else None, stated | {match[2] for match in numbers} - {""}
 
 
 def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> NDArray[np.float64]:
     """Angles in radians; a column becomes a list.
 
     Args:
-        unit: whatever the attribute `units` says; None: that, or `default` if it is missing.
+        unit: whatever the file says; None: what its attribute `units` and its text say, or `default` if they do not.
     """
-    unit = unit or attribute(item, "units") or default
-    factor = ANGLE_UNITS.get(unit.lower())
-    if factor is None:
-        raise DataError(
-            f"{item.name} in {item.file.filename} has {f'the units {unit!r}' if unit else 'no units attribute'}; "
-            "expected degrees or radians. Set the attribute, or give --angles FILE (degrees, one a line)."
-        )
-    require_real(item.dtype, f"{item.name} in {item.file.filename}")
     if lost := missing_links(item):
         raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
-    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
+    where = f"{item.name} in {item.file.filename}"
+    angles, stated = _numbers(item, values_of)
+    if angles is None:
+        raise DataError(
+            f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected numbers. Give --angles FILE."
+        )
+    unit = unit or " and ".join(sorted(stated)) or default
+    factor = factor_of(unit, ANGLE_UNITS)
+    if factor is None:
+        raise DataError(
+            f"{where} has {f'the units {unit!r}' if unit else 'no units attribute'}; expected degrees or radians. Set "
+            "the attribute, or give --angles FILE (degrees, one a line)."
+        )
+    return angles * factor
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
@@ -251,36 +283,24 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
             made.write(values)
 
 
-def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
+def missing_links(item: h5py.Dataset) -> list[str]:
     """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
-    Virtual sources are followed through `within` files at most.
     """
-    if not item.is_virtual:
-        return []
-    folder, lost = Path(item.file.filename).parent, set()
-    for source in item.virtual_sources():
-        if source.file_name == ".":
-            drawn = dataset(item.file, source.dset_name)
-            whole = not source.src_space.shape
-            if drawn is None or not (_fills(drawn, source) if whole else drawn.shape[1:] == source.src_space.shape[1:]):
-                lost.add(source.dset_name)
-        elif not _is_there(folder / source.file_name, source, within):
-            lost.add(str(folder / source.file_name))
+    lost = set()
+    for source in item.virtual_sources() if item.is_virtual else ():
+        name, where = plain_name(source.file_name), plain_name(source.dset_name)
+        path = Path(item.file.filename).parent / name
+        try:
+            with nullcontext(item.file) if name == "." else open_hdf5(path) as file:
+                drawn = dataset(file, where)
+                whole = drawn is not None and _holds(drawn, source) and not missing_links(drawn)
+        except (DataError, OSError):
+            whole = False
+        if not whole:
+            lost.add(where if name == "." else str(path))
     return sorted(lost)
-
-
-def _is_there(path: Path, source: Any, within: int) -> bool:
-    """Whether another file has the frames, of their shape, that a source of a virtual dataset names."""
-    if within == 0:
-        return False
-    try:
-        with open_hdf5(path) as file:
-            drawn = dataset(file, source.dset_name)
-            return drawn is not None and _holds(drawn, source) and not missing_links(drawn, within - 1)
-    except (DataError, OSError):
-        return False
 
 
 def _holds(drawn: h5py.Dataset, source: Any) -> bool:

@@ -12,8 +12,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from io import SEEK_CUR, SEEK_END, SEEK_SET, FileIO
 from pathlib import Path
-from typing import Any, ClassVar, Literal
-from weakref import WeakSet
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +34,9 @@ class UnderHdf5:
     HDF5 shares nothing between two of these, even for the same file.
     """
 
-    opened: ClassVar[WeakSet[UnderHdf5]] = WeakSet()
-
     def __init__(self, path: Path, mode: str, length: int = 0) -> None:
         self.path, self._file = path, FileIO(path, mode)
         self._at, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
-        self.opened.add(self)
 
     def __del__(self) -> None:
         if file := vars(self).get("_file"):
@@ -48,10 +44,6 @@ class UnderHdf5:
 
     def __repr__(self) -> str:
         return str(self.path)  # which is the name of the file for HDF5
-
-    def stat(self) -> os.stat_result:
-        """Status of the open file, even if its name now belongs to another file."""
-        return os.fstat(self._file.fileno())
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
         self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._size}[whence]

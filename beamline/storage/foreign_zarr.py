@@ -5,7 +5,6 @@ Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; transl
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -17,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import TEXT, bytes_below, require_below
+from beamline.core.files import TEXT, require_below
 from beamline.core.machine import free_memory
 from beamline.storage.structure import numbers_of, shape_of
 
 _METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _FACTS = (*_METADATA, ".zattrs", ".zmetadata")
-_SHAPES = "shape", "chunks", "chunk_shape"
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -122,10 +120,7 @@ def _regular_files(path: Path) -> Any:
 
     def look_at(key: str) -> None:
         with suppress(FileNotFoundError, NotADirectoryError):  # a chunk of the fill value
-            if key.rpartition("/")[2] in _FACTS:
-                _refuse_truths(json.loads(bytes_below(path, key, TEXT)))
-            else:
-                require_below(path, key, math.inf)
+            require_below(path, key, TEXT if key.rpartition("/")[2] in _FACTS else math.inf)
 
     class RegularFiles(LocalStore):
         async def get(self, key: str, *args: Any, **options: Any) -> Any:
@@ -143,14 +138,6 @@ def _regular_files(path: Path) -> Any:
             return await super().get_partial_values(prototype, parts)
 
     return RegularFiles(path, read_only=True)
-
-
-def _refuse_truths(said: Any, key: str = "") -> None:
-    """ValueError where a shape or a chunk has true or false for a number, which the library takes for 1 or 0."""
-    if isinstance(said, list) and key in _SHAPES and any(isinstance(n, bool) for n in said):
-        raise ValueError(f"its {key} is {said}; expected whole numbers")
-    for name, each in said.items() if isinstance(said, dict) else ():
-        _refuse_truths(each, name)
 
 
 def _image(root: Any) -> Mapping[str, Any]:

@@ -6,7 +6,6 @@ import atexit
 import errno
 import os
 import re
-import stat
 import struct
 import sys
 import zlib
@@ -19,8 +18,8 @@ import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
 
 from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import is_link, same_file
-from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
+from beamline.core.files import no_file, same_file
+from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
@@ -44,8 +43,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
-        what = "is no file, but a folder, a device or a pipe" if path.exists() else "does not exist"
-        raise (NotReadyError if follow else DataError)(f"{path} {what}.")
+        raise (NotReadyError if follow else DataError)(no_file(path))
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):
@@ -86,64 +84,45 @@ def _unopened(
     """Why none of the ways opened a file."""
     if follow:
         return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
-    if head is not None and head.missing:
+    cut = re.search(r"truncated file: eof = (\d+),.* stored_eof = (\d+)", str(problems[0]))
+    missing = int(cut[2]) - int(cut[1]) if cut else head.missing if head is not None else 0
+    if missing:
+        rescue = f"`beamline recover {path}` rescues its frames" if _ours(path, head) else "nothing else brings it back"
         return DataError(
-            f"{path} is cut off: the last {head.missing} bytes are missing. Copy it again, or use the original. If the "
-            "disk was full, `beamline recover` rescues its frames. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original: if there is "
+            f"no other, {rescue}. Nothing was read."
         )
     if _being_written(head):
         return DataError(
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
-            "writer died, `beamline recover` clears the mark; nothing was read."
+            f"writer died, `beamline recover {path}` clears the mark; nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(held_sentence(path))
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 
-def grows_here(path: Path) -> bool:
-    """Whether this program has the file open through HDF5's own driver, for writing or following it."""
-    here = path.stat()
-    for file in _open_by_name().values():
-        with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            if file.get_intent() != h5py.h5f.ACC_RDONLY and same_file(here, Path(os.fsdecode(file.name)).stat()):
-                return True
+def _ours(path: Path, head: Superblock | None) -> bool:
+    """Whether this program wrote a file that is not whole."""
+    from beamline.storage.writers.layout import COMMITTED  # which imports this module
+
+    with suppress(*ALTERED):
+        if head is not None:
+            with h5py.File(GrowingFile(path, head), "r") as file:
+                return COMMITTED in file
     return False
 
 
-def _open_by_name() -> dict[int, Any]:
-    """The files of this program that HDF5 has opened itself, by their names, and its numbers of them."""
-    files = {}
+def grows_here(path: Path) -> bool:
+    """Whether this program has the file open through HDF5's own driver, for writing or following it."""
+    here = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            if file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver:
-                files[file.id] = file
-    return files
-
-
-@contextmanager
-def opened_itself(path: Path) -> Iterator[None]:
-    """Check that the block opened the regular file of this name, and not the target of a link that replaced it.
-
-    For files in another user's folder, as HDF5 opens by name. On Windows, where its handles cannot be looked at, a link
-    that still stands there is found.
-
-    Raises:
-        DataError: it is something else.
-    """
-    by_name, others = {*_open_by_name()}, {*UnderHdf5.opened}
-    yield
-    try:
-        here = os.lstat(path)
-        opened = [file.stat() for file in {*UnderHdf5.opened} - others if file.path == path]
-        for number, file in _open_by_name().items() if os.name == "posix" else ():
-            if number not in by_name and os.fsdecode(file.name) == str(path):
-                opened.append(os.fstat(file.get_vfd_handle()))
-        itself = stat.S_ISREG(here.st_mode) and not is_link(path) and all(same_file(here, each) for each in opened)
-    except (OSError, ValueError):  # it is gone, or was closed
-        itself = False
-    if not itself:
-        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself.")
+            by_name = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
+            writes = by_name and file.get_intent() != h5py.h5f.ACC_RDONLY
+            if writes and same_file(here, Path(os.fsdecode(file.name)).stat()):
+                return True
+    return False
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:

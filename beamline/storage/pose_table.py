@@ -246,7 +246,7 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         if item is None:
             continue
         datasets.require_real(item.dtype, f"{item.name} in {path}")
-        unit = datasets.LENGTH_UNITS.get(datasets.attribute(item, "units").lower())
+        unit = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
         values = np.ravel(np.asarray(datasets.values_of(item), np.float64))
         if unit is None or values.size not in (1, keys.size):
             raise _NoPosesError(

@@ -10,7 +10,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, same_file, whole_file
+from beamline.core.files import no_file, refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
@@ -50,7 +50,7 @@ class Recovered:
 
     Attributes:
         changed: whether the file was changed.
-        frames: committed, and kept.
+        frames: committed, and kept; None of the file of another program, of which only the mark is cleared.
         dropped: frames at the end that were not committed when the writer died, and are cut off.
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
@@ -61,7 +61,7 @@ class Recovered:
 
     path: Path
     changed: bool
-    frames: int
+    frames: int | None
     dropped: int
     missing: int | None
     lost: tuple[int, ...] = ()
@@ -71,6 +71,8 @@ class Recovered:
 
     def in_words(self) -> str:
         """The result as one line of text."""
+        if self.frames is None:
+            return f"{self.path}: the mark of its writer is cleared, and what it had written can be read."
         wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
@@ -95,7 +97,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             10 s: then nothing is changed. Or a disk that does not take it: then it can be run again.
     """
     if not path.is_file():
-        raise DataError(f"{path} does not exist. Nothing was changed.")
+        raise DataError(f"{no_file(path)} Nothing was changed.")
     if held(path):
         raise DataError(
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
@@ -105,24 +107,30 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
     with suppress(OSError):  # a file that nobody can write to may be in order
         lock = WriterLock(path, exclusive=True)
     try:
-        head = _checked(path)
-        if head.open_for_writing or head.missing or not _finished(path):
-            try:
-                done, mended = _mended(path, head)
-            except DataError as error:
-                return _rescued(path, head, error, say)
-        else:
-            done, mended = _as_it_is(path), Overlay(path)
-        return _with_view(done, mended, say)
+        head = _checked(path, say)
+        if head.open_for_writing and (cleared := _of_others(path, head)) is not None:
+            cleared.carry_out()
+            return Recovered(path, True, None, 0, None)
+        if not (head.open_for_writing or head.missing) and (done := _as_it_is(path)) is not None:
+            return _with_view(done, Overlay(path), say)
+        try:
+            mended = _mended(path, head)
+        except DataError as error:
+            return _rescued(path, head, error, say)
+        return _with_view(*mended, say)
     finally:
         if lock is not None:
             lock.release()
 
 
-def _checked(path: Path) -> Superblock:
+def _checked(path: Path, say: Callable[[str], None]) -> Superblock:
     head = superblock(path)
     if head is None or not head.intact:
         raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
+    changed = path.stat().st_mtime
+    if head.open_for_writing and not head.grows and 0 <= (age := _now_beside(path) - changed) < QUIET:
+        say(f"{path} changed {age:.0f} s ago: whether it still does is seen in {QUIET - age:.0f} s.")
+        time.sleep(QUIET - age)
     if head.open_for_writing and abs(age := _now_beside(path) - path.stat().st_mtime) < QUIET:
         raise DataError(
             f"{path} changed {max(age, 0):.0f} s ago and is marked as being written. If its writer is dead, try again "
@@ -131,14 +139,35 @@ def _checked(path: Path) -> Superblock:
     return head
 
 
-def _finished(path: Path) -> bool:
+def _of_others(path: Path, head: Superblock) -> Overlay | None:
+    """The file of another program without the mark of its writer; None for a file of ours, or one that is damaged.
+
+    DataError: something in it cannot be read, or it may be growing.
+    """
+    overlay = Overlay(path, max(head.end, head.size))
+    overlay.put(0, head.closed(max(head.end, head.size)).head)
+    with suppress(*hdf5.ALTERED), h5py.File(overlay, "r") as file:
+        require_harmless(file)
+        if layout.COMMITTED in file:
+            return None
+        if head.grows:
+            raise DataError(
+                f"{path} is of another program and can be read as it is. `h5clear -s {path}` clears its mark, once its "
+                "writer has surely ended. Nothing was changed."
+            )
+        for item in _datasets_in(file):
+            if item.shape and len(item) and not _reads(item, len(item) - 1):
+                raise DataError(f"{path} is damaged: the end of {item.name} cannot be read. Nothing was changed.")
+        return overlay
+    return None
+
+
+def _as_it_is(path: Path) -> Recovered | None:
+    """A file that is in order; None where its end is missing."""
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
         _require_ours(path, file)
-        return bool(file[layout.FINISHED][()])
-
-
-def _as_it_is(path: Path) -> Recovered:
-    with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
+        if not file[layout.FINISHED][()]:
+            return None
         require_joined(file)
         frames = int(file[layout.COMMITTED][()])
         return Recovered(path, False, frames, 0, None, altered=_altered(file, frames))
@@ -291,12 +320,19 @@ def _reads(item: h5py.Dataset, rows: slice | int) -> bool:
 
 def _read(file: h5py.File) -> None:
     """Read all of the file except its pixels, so that HDF5's errors come now."""
+    for item in _datasets_in(file):
+        if item.name not in (layout.DATA, layout.PREVIEW):
+            item[()]
+
+
+def _datasets_in(file: h5py.File) -> Iterator[h5py.Dataset]:
+    """Each dataset with values of its own; the attributes of all objects are read meanwhile."""
     names: list[str] = []
     file.visit(names.append)
     for item in (file[name] for name in names):
         dict(item.attrs)
-        if isinstance(item, h5py.Dataset) and not item.is_virtual and item.name not in (layout.DATA, layout.PREVIEW):
-            item[()]
+        if isinstance(item, h5py.Dataset) and not item.is_virtual:
+            yield item
 
 
 def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:

@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,36 +24,67 @@ from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 
 MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
+_NESTED = 8  # virtual datasets of which each draws on the next; HDF5 crashes where there is no end to them
 CLAIMED = 1e9  # bytes
-_HEAD = 4096  # bytes that tell text
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
 def require_harmless(file: h5py.File) -> None:
     """Raise DataError for a file with more objects or deeper groups than any scan has, for one that refers to a path
-    without a file, and for one that claims more data than it has.
+    without a file, for one that claims more data than it has, and for a virtual dataset that draws on itself.
 
     Files that it draws on are looked at, too, and those that they draw on.
     """
     path = Path(file.filename)
-    seen, waiting = {path.resolve()}, _looked_at(file, path)
-    while waiting:
-        path = waiting.pop()
-        if path.resolve() in seen:
-            continue
-        seen.add(path.resolve())
-        if len(seen) > FILES:
-            raise DataError(
-                f"{file.filename} links to more than {FILES} files, directly or through others. Nothing was read."
-            )
-        with suppress(*_DAMAGED), h5py.File(path, "r", locking=False) as other:
-            waiting += _looked_at(other, path)
+    opened, virtual = {_number_of(path): file}, list[h5py.Dataset]()
+    waiting = _looked_at(file, path, virtual)
+    with ExitStack() as files:
+        while waiting:
+            path = waiting.pop()
+            if (number := _number_of(path)) in opened:
+                continue
+            if len(opened) >= FILES:
+                raise DataError(
+                    f"{file.filename} links to more than {FILES} files, directly or through others. Nothing was read."
+                )
+            opened[number] = None
+            with suppress(*_DAMAGED):
+                opened[number] = files.enter_context(h5py.File(path, "r", locking=False))
+                waiting += _looked_at(opened[number], path, virtual)
+        for _ in range(_NESTED):
+            virtual = [*dict(_virtual_sources(virtual, opened)).values()]
+    if virtual:
+        raise DataError(
+            f"{file.filename}: a virtual dataset draws on itself, or on more than {_NESTED} others one after the "
+            "other. Nothing was read."
+        )
+
+
+def _number_of(path: Path) -> tuple[int, int]:
+    """What tells a file from all others, under whatever name."""
+    status = path.stat()
+    return status.st_dev, status.st_ino
+
+
+def _virtual_sources(
+    virtual: list[h5py.Dataset], opened: dict[tuple[int, int], Any]
+) -> Iterator[tuple[tuple[int, int], h5py.Dataset]]:
+    """The virtual datasets that others draw on, by their places, as far as their files are open."""
+    for item in virtual:
+        path = Path(item.file.filename)
+        for name, where in drawn_on(item.id.get_create_plist()):
+            for place in [path] if name == "." else _places(name, path):
+                with suppress(*_DAMAGED):
+                    source = opened[_number_of(place)][where]
+                    if isinstance(source, h5py.Dataset) and source.is_virtual:
+                        known = h5py.h5o.get_info(source.id)
+                        yield (known.fileno, known.addr), source
 
 
 def require_inside(file: h5py.File) -> None:
     """Raise DataError if a file links to one outside of its folder."""
     path = Path(file.filename)
-    for other in _looked_at(file, path):
+    for other in _looked_at(file, path, []):
         if path.resolve().parent not in other.resolve().parents:
             raise DataError(
                 f"{path} links to {other}, outside of its folder. Name the file itself to have that read, too."
@@ -68,10 +99,11 @@ def _places(name: str, path: Path) -> Iterator[Path]:
                 yield place
 
 
-def _looked_at(file: h5py.File, path: Path) -> list[Path]:
-    """The regular files that a file draws on; DataError where one is something else."""
+def _looked_at(file: h5py.File, path: Path, virtual: list[h5py.Dataset]) -> list[Path]:
+    """The regular files that a file draws on; DataError where one is something else. Its virtual datasets are added to
+    `virtual`."""
     files = dict[Path, None]()
-    for name in dict.fromkeys(_names(file, path)):
+    for name in dict.fromkeys(_names(file, path, virtual)):
         for place in _places(name, path):
             with suppress(ValueError):
                 if place.is_dir():
@@ -86,7 +118,7 @@ def _looked_at(file: h5py.File, path: Path) -> list[Path]:
     return [*files]
 
 
-def _names(file: h5py.File, path: Path) -> Iterator[str]:
+def _names(file: h5py.File, path: Path, virtual: list[h5py.Dataset]) -> Iterator[str]:
     """The other files that links and datasets name."""
     groups, known = [(h5py.h5g.open(file.id, b"/"), 0)], set[tuple[int, int]]()
     while groups:
@@ -115,7 +147,11 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                         made, text = dataset.get_create_plist(), name.decode("utf-8", "replace")
                         _refuse_empty_claim(dataset, made, f"{path}: {text}")
                         _refuse_foreign_bytes(dataset, made, path, text)
-                        yield from _drawn_on(made)
+                        if made.get_layout() == h5py.h5d.VIRTUAL:
+                            virtual.append(h5py.Dataset(dataset))
+                            yield from (other for other, _ in drawn_on(made) if other != ".")
+                        for i in range(made.get_external_count()):
+                            yield os.fsdecode(made.get_external(i)[0])
 
 
 def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
@@ -131,50 +167,57 @@ def _refuse_empty_claim(dataset: Any, made: Any, what: str) -> None:
     n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
     if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
         return
-    if n > PACKED * (stored := dataset.get_storage_size()):
+    chunk = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else ()
+    piece, stored = math.prod(chunk) * dataset.dtype.itemsize, dataset.get_storage_size()
+    if n > PACKED * stored or is_blank(n, stored, piece):
         raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
 def _refuse_foreign_bytes(dataset: Any, made: Any, path: Path, name: str) -> None:
     """DataError for values in a file of any kind (HDF5's external storage), unless they are numbers, and that file is
-    below the folder of this one, is not hidden and is no text: so it may hold images, and it is no file of others."""
+    below the folder of this one and not hidden."""
     for i in range(made.get_external_count()):
         other, root = os.fsdecode(made.get_external(i)[0]), path.resolve().parent
         for place in _places(other, path):
             within = place.resolve()
             inside = root in within.parents and not any(part.startswith(".") for part in within.relative_to(root).parts)
-            if dataset.dtype.kind not in "uif" or not inside or _is_text(within):
+            if dataset.dtype.kind not in "uif" or not inside:
                 raise DataError(
                     f"{path} keeps the values of {name} in the file {other}. Only numbers are read from such a file, "
-                    "one that lies below the folder of the scan and is no text. Nothing was read."
+                    "and one that lies below the folder of the scan. Nothing was read."
                 )
 
 
-def _is_text(path: Path) -> bool:
-    """Whether a regular file begins as text does; pixels hardly ever do."""
-    try:
-        require_regular(path)
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
-        text = head.decode("utf-8") if len(head) < _HEAD else head[: head.rfind(b"\n") + 1].decode("utf-8")
-    except (OSError, UnicodeDecodeError):
-        return False
-    return bool(text) and all(c.isprintable() or c.isspace() for c in text)
+def drawn_on(made: Any) -> Iterator[tuple[str, str]]:
+    """(file, dataset) of each source of a virtual dataset; "." is its own file."""
+    for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
+        yield plain_name(made.get_virtual_filename(i)), plain_name(made.get_virtual_dsetname(i))
 
 
-def _drawn_on(made: Any) -> Iterator[str]:
-    if made.get_layout() == h5py.h5d.VIRTUAL:
-        for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
-            if (name := made.get_virtual_filename(i)) != ".":
-                yield name
-    for i in range(made.get_external_count()):
-        yield os.fsdecode(made.get_external(i)[0])
+def plain_name(written: str) -> str:
+    """The name of a source of a virtual dataset, where %% stands for %. DataError for %b, a number to be filled in."""
+    if "%b" in written.replace("%%", ""):
+        raise DataError(
+            f"A virtual dataset draws on a numbered series, {written}, which is not read. Copy its values to a "
+            "dataset that holds them. Nothing was read."
+        )
+    return written.replace("%%", "%")
 
 
 PACKED = 1e5
 """No file of images holds so many times its own size: zeros come to 1000 times (deflate), and 20 000 (Zstandard)."""
+_BLANK, _LARGE = 500, 2**28
 _REAL = re.compile(r"[<>=|]?(u1|i1|[uif][248])|u?int(8|16|32|64)|float(16|32|64)")
 _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far beyond any volume
+
+
+def is_blank(unpacked: int, stored: int, piece: int) -> bool:
+    """Whether so many bytes of images, of which a large piece is unpacked at once, take less than a 500th of them.
+
+    Shot noise of one count in a hundred pixels takes 0.08 of their 16 bits, a 200th: what is packed closer than that
+    holds no image, and may be made to fill the memory.
+    """
+    return piece > _LARGE and unpacked > _BLANK * stored
 
 
 def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:

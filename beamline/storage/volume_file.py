@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.core.files import RECON
+from beamline.core.files import RECON, no_file, require_regular
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
-from beamline.storage.structure import PACKED, require_npy
+from beamline.storage.readers.tiff import require_possible
+from beamline.storage.structure import require_npy
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
 """mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
@@ -45,7 +46,7 @@ def read_volume(
     if path.is_dir():
         return _from_folder(path), None
     if not path.is_file():
-        raise DataError(f"{path} does not exist.")
+        raise DataError(no_file(path))
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
@@ -89,12 +90,11 @@ def _is_numpy(path: Path) -> bool:
 
 
 def _from_tiff(path: Path) -> NDArray[np.generic]:
+    require_regular(path)
     with tifffile.TiffFile(path) as tif:
+        require_possible(tif)
         series = tif.series[0]
-        n = math.prod(series.shape) * np.dtype(series.dtype).itemsize
-        _check_size(path, n)
-        if n > PACKED * path.stat().st_size:
-            raise DataError(f"{path} claims to hold {n / 1e9:.3g} GB in {path.stat().st_size} bytes: it is damaged.")
+        _check_size(path, math.prod(series.shape) * np.dtype(series.dtype).itemsize)
         return tif.asarray()
 
 
@@ -204,8 +204,9 @@ def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tupl
         if isinstance(loaded, np.ndarray):
             return loaded, None
         with loaded:
-            _check_size(path, sum(member.file_size for member in loaded.zip.infolist()))
-            arrays = {key: loaded[key] for key in loaded.files}
+            members = [member for member in loaded.zip.infolist() if member.filename.endswith(".npy")]
+            _check_size(path, sum(member.file_size for member in members))
+            arrays = {key: loaded[key] for key in (member.filename.removesuffix(".npy") for member in members)}
     name = _only(path, {key: array.ndim for key, array in arrays.items()}) if name is None else name
     if name not in arrays:
         raise DataError(f"{path} has no array {name!r}; it has {', '.join(arrays)}.")

@@ -66,7 +66,7 @@ def angle_units(places: Places) -> Iterator[Finding]:
     """Angles have a unit: readers differ in their default."""
     if places.angle is not None:
         unit = datasets.attribute(places.angle, "units")
-        if unit.lower() not in datasets.ANGLE_UNITS:
+        if datasets.factor_of(unit, datasets.ANGLE_UNITS) is None:
             units = f"the units {unit!r}" if unit else "no units attribute"
             yield Finding("error", "angle-units", f"{places.angle.name} has {units}; expected degree or rad.")
 

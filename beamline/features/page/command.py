@@ -241,7 +241,8 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
         if path.is_file() and not path.name.lower().endswith(SUFFIXES):
             raise
         return None
-    if (source.image_key != 0).any() or (source.angles == source.angles).any():
+    is_zip = path.suffix.lower() == ".zip"  # which no volume is
+    if is_zip or (source.image_key != 0).any() or (source.angles == source.angles).any():
         return source
     source.close()
     return None

@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import FrameStack, StacksSource, TurnedFrames, dimensions
+from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
 from beamline.storage.readers.stated import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
@@ -26,7 +26,6 @@ from beamline.storage.readers.stated import (
 )
 from drivers.base.frame import FrameKind
 
-_USUAL = (0, 1, 2)
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
 _DETECTOR = "measurement/instrument/detector"
 _FLATS = "process/acquisition/flat_fields"
@@ -48,9 +47,9 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
-        items = ((kind, where, datasets.dataset(file, where, (order or _USUAL)[0])) for kind, where in PLACES)
+        items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0])) for kind, where in PLACES)
         stacks = [
-            FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
+            FrameStack(kind, where, in_order(item, _order(item) or order or USUAL))
             for kind, where, item in items
             if item is not None
         ]
@@ -173,15 +172,6 @@ def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
     return dimensions(_axes(item))
 
 
-def _in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
-    if order == _USUAL or item.ndim != 3:
-        return item
-    datasets.require_possible(item)
-    if lost := datasets.missing_links(item):
-        raise DataError(f"{item.file.filename} draws its frames from {lost[0]}, which is not there or differs.")
-    return TurnedFrames(item, order)
-
-
 def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
     """Pixel size and energy; what the file says of them in a unit that cannot be joins `not_used`."""
     pixel = file.attrs.get("pixel_size_mm")
@@ -205,7 +195,7 @@ def _measured(
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    number = f"{np.ravel(datasets.first_of(item))[0]:.6g}"
+    number = datasets.text_of(item)
     source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 
@@ -225,9 +215,10 @@ def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
         )
     angles = datasets.radians(theta, default="degrees")
     if angles.size != n_views or n_views not in (1, *theta.shape):
+        way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
-            f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, "
-            f"shape {theta.shape}; expected one angle for each."
+            f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
+            f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"
         )
     return angles
 
@@ -241,7 +232,7 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
             facts[name] = " ".join(datasets.text(part) for part in np.ravel(value))
     for name, where in TEXTS.items():
         if datasets.dataset(file, where) is not None:
-            facts[name] = datasets.text_at(file, where)
+            facts[name] = datasets.text_at(file, where)[: datasets.NAME]
     facts["theta_units"] = datasets.attribute(file["exchange"].get("theta", file), "units") or "not given"
     return facts
 

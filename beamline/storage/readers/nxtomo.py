@@ -43,6 +43,7 @@ from beamline.storage.readers.nexus import (
     require_order,
 )
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
+from beamline.storage.structure import drawn_on
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
 from drivers.base.frame import FrameKind
@@ -211,7 +212,7 @@ class NXtomoSource(ScanSource):
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
-            value = datasets.text_at(entry, where)
+            value = datasets.text_at(entry, where)[: datasets.NAME]
             if value:
                 facts[name] = value
         for name, where, units in NUMBERS:
@@ -225,7 +226,7 @@ class NXtomoSource(ScanSource):
         if self._places.angle_problem:
             facts["angles"] = f"unknown: {self._places.angle_problem}"
         if self._places.data.is_virtual:
-            facts["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
+            facts["parts"] = ", ".join(name for name, _ in drawn_on(self._places.data.id.get_create_plist()))
         if self._ours:
             ending = ending_in(self._file)
             facts |= {"status": ending.status, "missing_triggers": len(ending.missing)}

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import refuse_instead
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -229,7 +230,7 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
             return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
-    return open_stacks(path, data, options.darks_path, options.flats_path)
+    return open_stacks(path, data, options.darks_path, options.flats_path, options.angles_path)
 
 
 def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:
@@ -277,6 +278,8 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
+    if path.is_file() and not opening.follow:
+        refuse_instead(path)
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):

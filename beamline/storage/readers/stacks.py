@@ -27,14 +27,14 @@ class TurnedFrames:
 
     def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
         """`order`: which dimensions of `item` are frames, rows and columns."""
-        self._item, self._order = item, order
+        self.item, self._order = item, order
         self.shape = tuple(item.shape[axis] for axis in order)
-        self.dtype, self.ndim, self.name, self.file = item.dtype, 3, item.name, item.file
+        self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
 
     @property
     def frame_bytes(self) -> int:
         """Bytes that are decompressed to read a frame."""
-        return bytes_unpacked(self._item, self._order[0])
+        return bytes_unpacked(self.item, self._order[0])
 
     def __len__(self) -> int:
         return int(self.shape[0])
@@ -43,7 +43,7 @@ class TurnedFrames:
         stored = [slice(None)] * 3
         for axis, part in zip(self._order, wanted, strict=False):
             stored[axis] = part
-        return np.asarray(self._item[tuple(stored)]).transpose(self._order)
+        return np.asarray(self.item[tuple(stored)]).transpose(self._order)
 
 
 def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
@@ -53,10 +53,18 @@ def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
     """
     names = [axis.strip().lower() for axis in axes]
     cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith("col")]
-    rows = [i for i, name in enumerate(names) if name[:1] in ("y", "v") or name.startswith("row")]
+    rows = [i for i, name in enumerate(names) if name[:1] == "y" or (name.startswith(("v", "row")) and name != "view")]
     if len(names) != 3 or len(cols) != 1 or len(rows) != 1:
         return None
     return 3 - cols[0] - rows[0], rows[0], cols[0]
+
+
+USUAL = (0, 1, 2)
+
+
+def in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
+    """A dataset as frames [frame, row, col]."""
+    return item if order == USUAL or item.ndim != 3 else TurnedFrames(item, order)
 
 
 _LISTED = 10  # datasets of a file that an error names
@@ -104,10 +112,10 @@ class StacksSource(ScanSource):
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
-            if isinstance(stack.frames, h5py.Dataset):
+            item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
+            if isinstance(item, h5py.Dataset):
                 datasets.require_possible(stack.frames)
-                lost = datasets.missing_links(stack.frames)
-                if lost:
+                if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
             raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
@@ -135,21 +143,66 @@ class StacksSource(ScanSource):
         self._file.close()
 
 
-def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> StacksSource:
+def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
     """The scan whose datasets have these paths in an HDF5 file. A dark or flat may be a single image [row, col].
 
-    DataError where one is not there, or is no stack of frames; the message names the datasets that the file has.
+    Args:
+        data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
+            flats are in the same order.
+        angles: of their angles, whose number helps to tell which dimension is that of the views.
+
+    Raises:
+        DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
-        given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats), (FrameKind.PROJECTION, data))
-        stacks = []
-        for kind, where in given:
-            if where is not None:
-                item = dataset_at(file, where)
-                image = item.ndim == 2 and kind != FrameKind.PROJECTION
-                stacks.append(FrameStack(kind, where, item[()][None] if image else item))
-        return StacksSource(path, file, stacks, format="hdf5_stacks", facts={"data": data})
+        views, where, order = _named_order(file, data)
+        given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
+        references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
+        n_angles = None if angles is None else dataset_at(file, angles).size
+        order = order or _order_of(views, [item.shape for *_, item in references], n_angles)
+        stacks = [FrameStack(kind, name, _frames(item, order)) for kind, name, item in references]
+        stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
+        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL]
+        facts = {"data": where, "dimensions": ",".join(names)}
+        return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
+
+
+def _named_order(file: h5py.File, data: str) -> tuple[h5py.Dataset, str, tuple[int, int, int] | None]:
+    """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
+    where, colon, names = data.rpartition(":")
+    if not colon or datasets.dataset(file, data) is not None:
+        return dataset_at(file, data), data, None
+    if (order := dimensions(names.split(","))) is None:
+        raise DataError(f"The dimensions of {where} are given as {names}; expected three, such as frame,row,col.")
+    return dataset_at(file, where), where, order
+
+
+def _order_of(views: h5py.Dataset, references: list[tuple[int, ...]], n_angles: int | None) -> tuple[int, int, int]:
+    """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
+
+    MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
+    views in the middle are sinograms, as ASTRA has them, with columns first.
+    """
+    if views.ndim != 3:
+        return USUAL
+    images = [(*views.shape[:axis], *views.shape[axis + 1 :]) for axis in USUAL]
+    fitting = [
+        axis
+        for axis in USUAL
+        if all(images[axis] in (shape, (*shape[:axis], *shape[axis + 1 :])) for shape in references)
+    ]
+    frames = next((axis for axis in fitting if views.shape[axis] == n_angles), fitting[0] if fitting else 0)
+    rows, cols = (axis for axis in USUAL if axis != frames)
+    return (frames, cols, rows) if "MATLAB_class" in views.attrs and frames != 1 else (frames, rows, cols)
+
+
+def _frames(item: h5py.Dataset, order: tuple[int, int, int]) -> Any:
+    """Darks or flats as frames [frame, row, col]; also of one image, which has no dimension of frames."""
+    if item.ndim != 2:
+        return in_order(item, order)
+    image = np.asarray(datasets.values_of(item))
+    return (image.T if order[1] > order[2] else image)[None]
 
 
 def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
@@ -167,7 +220,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
         stated = unit or datasets.attribute(item, "units")
-        if stated.lower() not in datasets.ANGLE_UNITS:
+        if datasets.factor_of(stated, datasets.ANGLE_UNITS) is None:
             problem = f"the units {stated!r}" if stated else "no attribute `units`"
             raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
         return datasets.radians(item, unit)

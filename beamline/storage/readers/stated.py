@@ -24,12 +24,7 @@ Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 """Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
 
 EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
-EXCHANGE_ENERGY_UNITS = {
-    **datasets.ENERGY_UNITS,
-    "j": 1 / 1.602176634e-16,
-    "joule": 1 / 1.602176634e-16,
-    "": 1 / 1.602176634e-16,
-}
+EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
 EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
 _UNKNOWN = "nothing reads this name"
 _MOST = 40  # fields of unknown names
@@ -78,8 +73,10 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
             unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
-        elif field.units is not None and unit.lower() not in field.units and _true(value, item, source):
+        elif field.units is not None and datasets.in_units(item, field.units) is None and _states(value, item, source):
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+            if value.dtype.kind not in "uifb":
+                why = "it is text; expected a number, and a known unit behind it or as its attribute `units`"
             unused.append(NotUsed(field.where, _text(value, unit), why, True))
         elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
@@ -92,7 +89,10 @@ def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detect
     unused, used = {field.where for field in source.not_used}, []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
-        if item is not None and item.dtype.kind in "uif" and item.ndim <= 1 and 0 < item.size * 8 <= datasets.BRIEF:
+        if item is None or not 0 < item.size * 8 <= datasets.BRIEF:
+            continue
+        in_text = field.units is not None and datasets.in_units(item, field.units) is not None
+        if (item.dtype.kind in "uif" or in_text) and (item.ndim <= 1 or item.size == 1):
             text = _text(np.asarray(datasets.values_of(item)), datasets.attribute(item, "units"))
             used.append(Used(field.where, text, field.use))
     return tuple(used)
@@ -160,13 +160,17 @@ def _text(value: NDArray[Any], units: str) -> str:
     return printable(f"{text} {units}".strip())
 
 
+def _states(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    return bool(datasets.text(value)) if value.dtype.kind in "SO" else _true(value, item, source)
+
+
 def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     return value.dtype.kind in "uifb" and bool(np.nan_to_num(value.astype(np.float64)).any())
 
 
 def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
-    factor = datasets.LENGTH_UNITS.get(datasets.attribute(item, "units").lower())
+    factor = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
     if value.dtype.kind not in "uif" or value.size != source.image_key.size:
         return False
     places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)

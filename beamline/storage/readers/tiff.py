@@ -7,6 +7,7 @@ import lzma
 import math
 import re
 import zipfile
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
@@ -18,8 +19,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage.hdf5 import ALTERED
 from beamline.storage.readers.base import NotUsed, Used
-from beamline.storage.structure import PACKED
+from beamline.storage.structure import PACKED, is_blank
 
+_MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
 UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile)
@@ -108,9 +110,7 @@ def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
     """
     with opened(file) as tif:
         refuse_packed(tif)
-        claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
-        if claimed > min(most, PACKED * stored):
-            raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
+        require_possible(tif, most)
         return upright(images_of(tif)[0].asarray(), orientation(tif))
 
 
@@ -119,10 +119,25 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     type.
     """
     refuse_packed(tif)
+    require_possible(tif)
     first = images_of(tif)[0]
     if first.dtype is None:
         raise ValueError("its pixels are of an unknown type")
     return upright(np.broadcast_to(0, first.shape), orientation(tif)).shape, first.dtype
+
+
+def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
+    """Raise ValueError for more pages than any scan has, or for more bytes than allowed, or than the file can contain.
+
+    Pages are told without a look at each: tifffile takes minutes for a million.
+    """
+    with suppress(IndexError):
+        tif.pages.get(_MOST_PAGES)
+        raise ValueError(f"it has more than {_MOST_PAGES} pages")
+    first, stored = tif.pages.first, tif.filehandle.size
+    claimed = first.nbytes * len(tif.pages)
+    if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
+        raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:

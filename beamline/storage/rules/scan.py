@@ -156,8 +156,26 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "axis",
             f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
-            "the rotation axis were horizontal; it is expected along the columns. If it is, say --horizontal-axis.",
+            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(source)}If it is "
+            "horizontal, say --horizontal-axis.",
         )
+
+
+_EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
+
+
+def _exchanged(source: ScanSource) -> str:
+    """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
+
+    MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
+    """
+    data, dimensions = source.attributes.get("data"), str(source.attributes.get("dimensions", "frame,row,col"))
+    others = ""
+    if source.format == "data_exchange":
+        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
+    order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
+    say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
+    return "" if data is None else say
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:

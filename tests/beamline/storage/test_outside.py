@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 
 import h5py
@@ -14,7 +12,6 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe
-from beamline.storage.hdf5 import opened_itself
 from beamline.storage.readers.open import open_scan
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
@@ -107,23 +104,3 @@ def test_text_beside_frames_and_numbers_beside_the_scan_are_read(tmp_path: Path)
     with open_scan(path) as source:
         assert source.attributes["sample"] == "cathode"
         np.testing.assert_allclose(np.degrees(source.angles[np.isfinite(source.angles)]), theta)
-
-
-@pytest.mark.skipif(os.name != "posix", reason="handles of HDF5 are looked at there alone")
-@pytest.mark.parametrize("swapped_back", [False, True])
-def test_a_link_that_is_put_in_the_place_of_a_file_while_it_is_opened_is_found(
-    tmp_path: Path, swapped_back: bool
-) -> None:
-    """HDF5 opens by name: what was looked at before need not be what it opens."""
-    path, secret, aside = tmp_path / "scan.h5", tmp_path / "secret.h5", tmp_path / "aside.h5"
-    for each in (path, secret):
-        with h5py.File(each, "w") as file:
-            file["a"] = 1
-    with opened_itself(path), h5py.File(path):
-        pass
-    with ExitStack() as opened, pytest.raises(DataError, match="it was opened"), opened_itself(path):
-        path.rename(aside)
-        path.symlink_to(secret)
-        opened.enter_context(h5py.File(path))
-        if swapped_back:
-            aside.replace(path)

@@ -23,6 +23,7 @@ from beamline.storage.readers.tiff import (
     orientation,
     refuse_packed,
     refuse_volume,
+    require_possible,
     stated,
     upright,
 )
@@ -62,6 +63,7 @@ class TiffStackSource(ScanSource):
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
         refuse_packed(self._tif)
+        require_possible(self._tif)
         series, *others = parts = images_of(self._tif)
         if len(series.shape) not in (2, 3) or others:
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
