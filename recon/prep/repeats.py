@@ -80,8 +80,9 @@ def _sums(
 ) -> Iterator[tuple[F64, F64, float, float, int]]:
     """Of each band of rows: normal equations of the changes; squares of the difference and of the structure; pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
-    beside = data[[first, later, max(later - 1, 0), min(later + 1, len(data) - 1)]]
-    view, seen, before, after = (
+    at = min(later, len(data) - 2)
+    beside = data[[first, later, at - 1, at, at + 1]]
+    view, seen, before, near, after = (
         gaussian_filter(image.astype(np.float64), _SMOOTH, mode="nearest") for image in bin_views(beside, side)
     )
     cols = np.arange(view.shape[1], dtype=np.float64)
@@ -92,7 +93,8 @@ def _sums(
         known &= (across >= 0) & (across <= cols.size - 1)
     mean, heights = (view + seen) / 2, np.arange(len(view))[:, None] - (len(view) - 1) / 2
     down, along = np.gradient(mean)
-    parts = [-down, mean, -(cols - axis) * along, -heights * down, along, after - before, np.ones_like(mean)]
+    turned = along, after - before, after - 2 * near + before, np.ones_like(mean)
+    parts = [-down, mean, -(cols - axis) * along, -heights * down, *turned]
     for rows in np.array_split(np.arange(len(view)), _BANDS):
         shown, change = (
             np.stack([part[rows][:, known].ravel() for part in parts]),
