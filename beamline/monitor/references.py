@@ -237,8 +237,8 @@ def full_scale(largest: float) -> float:
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
     written = all(map(_of_one_number, flats))
-    if written and (all(map(_of_one_number, darks or ())) or not flats[0].rounding):
-        return None  # not exposed: the number that stands for all light, such as the full scale of 16 bits
+    if written and all(map(_of_one_number, darks or ())) and not (flats[0].saturated and level(darks or flats)):
+        return None  # not exposed: the number that stands for all light, such as the full scale of 16 bits beside 0
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score, limit = float(np.median([flat.saturated for flat in flats])) - hot, saturation_limit(flats[0], limits)
     if score > limit:
@@ -274,7 +274,9 @@ def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refe
     change = np.abs(np.diff(blocks, axis=0))
     varied = change[change > 0]  # blocks at the end of the counts do not; a few that differ are damage
     noise = median_deviation(varied) / 2**0.5 * flats[0].block if varied.size > BY_CHANCE else 0.0
-    if not CLIPPED_NOISE <= noise <= limits.uneven * flats[0].largest:  # one that is damaged or moved varies by more
+    if (
+        not max(CLIPPED_NOISE * (flats[0].rounding > 0), 1e-30) <= noise <= limits.uneven * flats[0].largest
+    ):  # one that is damaged or moved varies by more
         return None
     sentence = (
         f"{score:.2%} of their pixels hold {flats[0].largest:g}, the largest count but for a few, though pixels vary "

@@ -22,11 +22,13 @@ from beamline.storage.rules import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
+from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.units import look_negative
 from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
+from recon.prep.repeats import changes_seen
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import covers_the_circle
 
@@ -56,6 +58,8 @@ _INVERTED = (
     "Where the sample is, the views are brighter than the air beside it, and line integrals are below 0: were images "
     "stored with dark and bright exchanged, or of flats with another sample? Give them as the camera wrote them."
 )
+_REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0  # in a scan; 600 at rest: 5.2 sigmas
+_COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 _EVEN, _STEP, _IN_TURN = 0.5, 0.8, -0.5  # shares that a line and a step explain of a change of mass; from view to view
 
 
@@ -85,24 +89,33 @@ class Law:
 def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, warn: Warn) -> dict[str, str]:
     """Warn of consistency conditions that the views violate; returns the residual of each in words, by name.
 
-    Angles, heights, turned frames, masses and an axis that moments of the views disagree with. The laws hold for a
-    parallel beam and a sample within the field; other scans are passed over. So is a part of the rows: those of Diamond
+    Angles, heights, turned frames, masses and an axis that moments of the views disagree with, which hold for a
+    parallel beam and a sample within the field; and for others, whether views of the same rays agree. Moments of a part
+    of the rows are passed over: those of Diamond
     24737 above its metal seem to turn by 14 % more, for a reason that is not known.
     """
     geometry, data = prepared.geometry, prepared.projections.data
-    wide = geometry.is_off_middle and covers_the_circle(geometry.angles)
-    whole = geometry.rows_show_slices and not geometry.shifts.any() and not wide
     known = prepared.measured is None and prepared.emission is None and prepared.projections.floored <= _FLOORED
-    if not whole or len(data) < _LEAST_VIEWS or not known:
+    if geometry.shifts.any() or not geometry.is_straight or len(data) < _LEAST_VIEWS or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
     edges = FieldEdges.of(data, geometry)
-    if edges.beyond() or edges.passing() or _air_is_off(data, some):
-        frames = prepared.projections.view_ids[some]
-        laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
-        return _reported(laws, warn)
-    if data.shape[1] < _LEAST_ROWS or selection.rows is not None:
-        return {}
+    wide, air_is_off = edges.beyond() or edges.passing(), _air_is_off(data, some)
+    laws = list[Law]()
+    if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
+        if wide or air_is_off:
+            frames = prepared.projections.view_ids[some]
+            laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
+        elif data.shape[1] >= _LEAST_ROWS and selection.rows is None:
+            laws = _laws_within_the_field(prepared, selection, some)
+    if (wide or not air_is_off) and not any(law.broken for law in laws):
+        laws.append(_at_rest(data, geometry, prepared.projections.view_ids))
+    return _reported(laws, warn)
+
+
+def _laws_within_the_field(prepared: PreparedProjections, selection: Selection, some: NDArray[np.intp]) -> list[Law]:
+    """Laws of parallel views that show the whole sample, by some of the views."""
+    geometry, data = prepared.geometry, prepared.projections.data
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
@@ -114,7 +127,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         laws += [_angles(shown, geometry.angles)] if near else []
         laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
         laws += [_axis(shown, geometry.axis_col, selection)]
-    return _reported(laws, warn)
+    return laws
 
 
 def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
@@ -326,6 +339,24 @@ def _turned(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:
     tolerance = float(np.degrees(max(_TURNED, _TURNED_SIGMAS * shown.turned_sigma)))
     known = np.isfinite(shown.turned_sigma) and shown.turned_left < _TURNED_LEFT  # else other angles explain nothing
     return Law("moments, angle of each view", size if known else np.nan, tolerance, "degrees", sentence)
+
+
+def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64]) -> Law:
+    """Views of the same rays, early and late, show one sample, in any beam and however wide it is."""
+    worst, sentence = np.nan, ""
+    for (first, later), between, change, sigma in changes_seen(data, geometry):
+        off = np.where(np.abs(change) > _REPEATED_SIGMAS * sigma, np.abs(change) / (_REPEATED * between), 0.0)
+        sizes = f"{abs(change[0]):.1f} rows", *(f"{abs(share):.1%}" for share in change[1:])
+        words = [f"{size} {way[int(by > 0)]}" for size, way, by in zip(sizes, _COMPARED, change, strict=True)]
+        if not off.max() <= worst:
+            worst = float(off.max())
+            sentence = (
+                f"Frames {frames[first]} and {frames[later]}, as others that see the same rays at two times, show "
+                f"another sample: it becomes {', '.join(np.array(words)[off > 1])}. One volume blurs what changes: "
+                "give --time N for several in time, --calibrate shifts where the sample moved as a whole, or --views "
+                "for a part of the scan."
+            )
+    return Law("views of the same rays", worst, 1.0, "of what is told", sentence)
 
 
 def _axis(shown: ViewMoments, used: float, selection: Selection) -> Law:

@@ -130,7 +130,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     yield from _counts_cut(source, groups, accepted)
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
-    if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
+    if not dark.any() and _change(source, groups) and not counts_photons(source):
         yield Finding(
             "warning",
             "light",
@@ -156,27 +156,36 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
 
 
 def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> Iterator[Finding]:
-    """Flats of one number stand for all light, unless the air of the views has it without the noise of the sample.
+    """Counts do not end in the air of the views, and flats of one number stand for all light.
 
-    Counts then end there. Beside a number that stands for a transmission of 1, half of the air lies below it, or no
-    image has noise.
+    Counts end at a number that air has without the noise of the sample, or of the flats. Beside a number that stands
+    for a transmission of 1, half of the air lies below it, or no image has noise.
     """
-    dark, flat = (np.stack(cells_of(source, np.concatenate(rows))) for rows in (groups.darks, groups.flats))
-    if np.ptp(dark) or np.ptp(flat):
-        return
+    rows = np.concatenate(groups.darks), np.concatenate(groups.flats)
+    dark, flat = (np.stack(cells_of(source, some)) for some in rows)
     some = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
-    views, end = read_known(source, some, _middle(source)).astype(np.float64), float(flat.flat[0])
-    noise = _white_noise(views, end)
-    at = views >= end
+    views, written = read_known(source, some, _middle(source)).astype(np.float64), not (np.ptp(dark) or np.ptp(flat))
+    end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
+    air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
+    noise = _white_noise(views, end) or (_change(source, groups) if not written else 0.0)
+    at = (views >= end) & (read_known(source, rows[0][:1], _middle(source)) < end)
     around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
-    if noise > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
+    refused = written and not accepted
+    if noise > 0 and around.size and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
         sentence = (
-            f"Every pixel of the flats, and {at.mean():.0%} of those of the views looked at, hold {end:g} without the "
-            f"noise of the others ({noise:.3g} from pixel to pixel): counts end there, and the light is not known. "
-            "Shorten the exposure or add a filter."
+            f"{'Every pixel of the flats, and ' * written}{at.mean():.0%} of the pixels of the views looked at hold "
+            f"{end:g} without the noise of the others ({noise:.3g} from pixel to pixel): counts end there, they are "
+            "saturated, and the light is not known. Shorten the exposure or add a filter."
         )
-        sentence += "" if accepted else " --references accept uses these as they are."
-        yield Finding("warning" if accepted else "error", "light", sentence)
+        sentence += " --references accept uses these as they are." if refused else ""
+        yield Finding("error" if refused else "warning", "light", sentence)
+    elif written and dark.any() and source.dtype.kind in "ui" and abs(air / end - 1) > NEAR:
+        sentence = (
+            f"Every pixel of the darks holds {dark.flat[0]:g} and every pixel of the flats {end:g}, which no camera "
+            f"gives; the views reach {air:.5g}. Right if both numbers are known for all pixels; else the flats are "
+            "saturated or were never exposed: give others with --flats."
+        )
+        yield Finding("warning", "light", sentence)
 
 
 def _white_noise(views: F64, end: float) -> float:
@@ -195,9 +204,10 @@ def _middle(source: ScanSource) -> slice:
     return slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
 
 
-def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
-    """Frames are no image that was written for them all; a single one does not tell."""
-    return rows.size > 1 and bool(np.ptp(read_known(source, rows[:2]), axis=0).any())
+def _change(source: ScanSource, groups: ReferenceGroups) -> float:
+    """Noise of a pixel of the flats: 0 of an image that was written for them all, and where a group is a single one."""
+    two = read_known(source, max(groups.flats, key=len)[:2]).astype(np.float64)
+    return median_deviation(np.diff(two - np.median(two, axis=(1, 2), keepdims=True), axis=0)) if len(two) > 1 else 0.0
 
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
