@@ -113,7 +113,7 @@ class TableLayout:
 
     def marked(self, table: TrialTable) -> list[Outcome]:
         """The rows that stand out."""
-        return [table.compared[i] for i in table.front(TIME)] if self.front else []
+        return table.front(TIME) if self.front else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +241,7 @@ def write_table(folder: Path, table: TrialTable, layout: TableLayout) -> None:
         "notes": list(table.notes),
         "rows": records(table, layout),
         "trials": [outcome.as_record() for outcome in table.outcomes],
-        **{f"front_{cost.name}": [table.compared[i].trial.label for i in table.front(cost)] for cost in (TIME, MEMORY)},
+        **{f"front_{cost.name}": [o.trial.label for o in table.front(cost)] for cost in (TIME, MEMORY)},
     }
     words = json.dumps(to_jsonable_python(record, inf_nan_mode="null"), indent=1, ensure_ascii=False)
     write_whole(folder / f"{layout.name}.json", words, replace=True)

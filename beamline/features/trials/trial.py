@@ -282,42 +282,34 @@ class TrialTable:
         return tuple(o for o in self.outcomes if o.status == "done")
 
     @property
-    def qualities(self) -> list[float]:
-        """dB of each trial in `compared`."""
-        return [outcome.quality(self.by) for outcome in self.compared]
-
-    @property
     def todo(self) -> list[int]:
         """Numbers of the trials that are not left out."""
         return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
 
-    def costs(self, cost: TrialCost) -> list[float]:
-        """The cost of each trial in `compared`."""
-        return [cost.of(outcome) for outcome in self.compared]
-
-    def front(self, cost: TrialCost) -> list[int]:
-        """Positions in `compared` of the trials on the front of quality and `cost`.
+    def front(self, cost: TrialCost) -> list[Outcome]:
+        """The trials on the front of quality and `cost`, by rising cost.
 
         Costs are compared to 1 %: smaller differences between two trials are chance. A trial that costs more is on the
         front where its gain is above `chance`.
         """
-        qualities = self.qualities
+        compared = self.compared
+        costs, qualities = [rounded(cost.of(o)) for o in compared], [o.quality(self.by) for o in compared]
 
         def better(i: int, j: int) -> bool:
-            return qualities[i] - qualities[j] > self.chance(i, j)
+            return qualities[i] - qualities[j] > self.chance(compared[i], compared[j])
 
-        return front([rounded(value) for value in self.costs(cost)], qualities, better)
+        return [compared[i] for i in front(costs, qualities, better)]
 
-    def chance(self, i: int, j: int) -> float:
-        """dB between two trials in `compared` that chance may reach.
+    def chance(self, one: Outcome, other: Outcome) -> float:
+        """dB between two trials that chance may reach.
 
         Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
         noise of a view is in both of its residuals, and so not in their difference.
         """
-        squared = [np.asarray(self.compared[k].squared_residuals) for k in (i, j)]
-        if self.by != HELD_OUT or min(each.size for each in squared) < 2 or squared[0].size != squared[1].size:
+        first, second = (np.asarray(each.squared_residuals) for each in (one, other))
+        if self.by != HELD_OUT or min(first.size, second.size) < 2 or first.size != second.size:
             return LEAST_GAIN
-        apart, level = squared[0] - squared[1], (squared[0].mean() + squared[1].mean()) / 2
+        apart, level = first - second, (first.mean() + second.mean()) / 2
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
