@@ -20,6 +20,7 @@ Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 _NAMES = ("materials", "states")  # settings that are several names
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
+_WITH_HALVES = 3  # reconstructions of a trial with its half-set resolution
 _ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
@@ -175,6 +176,7 @@ class Outcome:
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         squared_residuals: of each view held out.
         reached: how far it came, such as "212 steps, 8 sweeps"; empty for a direct method.
+        wall: s, from before its process began to after its end.
     """
 
     trial: Trial
@@ -189,6 +191,13 @@ class Outcome:
     cpu_seconds: float = math.nan
     squared_residuals: Sequence[float] = ()
     reached: str = ""
+    wall: float = math.nan
+
+    @property
+    def working(self) -> float:
+        """s of `wall` that grow with the work, half-set resolution included; 0 without figures."""
+        seconds = self.seconds * (_WITH_HALVES if self.trial.halves else 1)
+        return min(self.wall, seconds) if math.isfinite(seconds) else 0.0
 
     def quality(self, by: str) -> float:
         """dB, more is better, by the metric of this name, of `QUALITIES`; NaN where it is not known."""
@@ -287,18 +296,18 @@ class TrialTable:
         return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
 
     def front(self, cost: TrialCost) -> list[Outcome]:
-        """The trials on the front of quality and `cost`, by rising cost.
+        """The trials that no other one beats, by rising cost, and so by rising quality; of equal ones the first.
 
-        Costs are compared to 1 %: smaller differences between two trials are chance. A trial that costs more is on the
-        front where its gain is above `chance`.
+        A trial is beaten by one of at most its cost and at least its quality. Costs are compared to 1 %: smaller
+        differences between two trials are chance. A trial that costs more is on the front where its gain is above
+        `chance`.
         """
-        compared = self.compared
-        costs, qualities = [rounded(cost.of(o)) for o in compared], [o.quality(self.by) for o in compared]
-
-        def better(i: int, j: int) -> bool:
-            return qualities[i] - qualities[j] > self.chance(compared[i], compared[j])
-
-        return [compared[i] for i in front(costs, qualities, better)]
+        kept: list[Outcome] = []
+        known = [o for o in self.compared if math.isfinite(cost.of(o)) and math.isfinite(o.quality(self.by))]
+        for each in sorted(known, key=lambda o: (rounded(cost.of(o)), -o.quality(self.by))):
+            if not kept or each.quality(self.by) - kept[-1].quality(self.by) > self.chance(each, kept[-1]):
+                kept.append(each)
+        return kept
 
     def chance(self, one: Outcome, other: Outcome) -> float:
         """dB between two trials that chance may reach.
@@ -320,23 +329,3 @@ def rounded(cost: float) -> float:
         return cost
     step = math.log(1.01)
     return math.exp(round(math.log(cost) / step) * step)
-
-
-def front(
-    costs: Sequence[float], qualities: Sequence[float], better: Callable[[int, int], bool] | None = None
-) -> list[int]:
-    """Positions of the points that no other point beats, by rising cost (and so by rising quality).
-
-    A point is beaten by one with at most its cost and at least its quality, and better in one of the two. Of equal
-    points the first stays. Points with a value that is not finite are left out.
-
-    Args:
-        better: whether the quality of the first point is clearly above that of the second, which costs less. Where it
-            is not, the second one beats the first. None: by any difference.
-    """
-    finite = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
-    kept: list[int] = []
-    for i in sorted(finite, key=lambda i: (costs[i], -qualities[i], i)):
-        if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
-            kept.append(i)
-    return kept
