@@ -195,7 +195,7 @@ def _compare(
         table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
         answer.lines = text(table, layout), f"\n{'report':<10}{scan.folder / layout.page}"
     if table.stopped:
-        counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
+        counts = f"{len(table.compared)} of {len(table.todo)} {layout.unit}"
         raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {scan.folder}.")
 
 

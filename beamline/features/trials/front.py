@@ -26,7 +26,7 @@ from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.assess.time_model import duration_text
-from recon.methods import names
+from recon.methods import by_name, names
 
 if TYPE_CHECKING:
     from matplotlib import figure as drawing
@@ -78,7 +78,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
         pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
     if labels := slices.labels():
         caption = "The same slice by each method with its usual settings, all in the grey window of the first."
-        if any(outcome.trial.several for outcome in table.outcomes):
+        if any(by_name(outcome.trial.method).traits.several for outcome in table.outcomes):
             caption += " Of several volumes, the one that the middle view shows, by its time or energy."
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     return pictures

@@ -189,7 +189,12 @@ def run_comparison(
         compile_kernels(trials, work, max(rig.seconds, 0.0) * _COMPILING)
         table = _run_all(table, layout, rig, scan.folder)
     write_page(scan.folder, table, layout, slices)
-    summary = {"output": scan.folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
+    summary = {
+        "output": scan.folder,
+        layout.unit: len(table.todo),
+        "done": len(table.compared),
+        "stopped": table.stopped,
+    }
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
@@ -215,11 +220,11 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) ->
             outcome, _ = rig.run(trial, seconds, trial.title * (trial.group in _SHOWN))
             timed.append(replace(outcome, wall=rig.now() - started))
             table = whole.with_outcome(index, timed[-1])
-            if table.n_done:
+            if table.compared:
                 write_table(folder, table, layout)
             rig.emit(event_of(table, layout, n + 1, len(todo), outcome))
     except KeyboardInterrupt:
-        if not table.n_done:
+        if not table.compared:
             raise
         table = replace(table, stopped=True)
     write_table(folder, table, layout)

@@ -51,11 +51,6 @@ class Trial:
     choice: ViewChoice | None = None
 
     @property
-    def several(self) -> bool:
-        """Its method makes several volumes; each view shows one of them, or a mixture."""
-        return by_name(self.method).traits.several
-
-    @property
     def left_out(self) -> bool:
         """The scan has not the views that it asks for."""
         return self.choice is not None and self.choice.groups is None
@@ -64,11 +59,6 @@ class Trial:
     def frames(self) -> int:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
-
-    @property
-    def window(self) -> int:
-        """Views of the scan that are averaged into each of its views."""
-        return 1 if self.choice is None else self.choice.window
 
     @property
     def facts(self) -> Mapping[str, float]:
@@ -117,7 +107,9 @@ class Trial:
         if self.group == "method":
             return by_name(self.method).label
         parts = [f"{self.parts} parts"] if self.parts > 1 else []
-        return ", ".join([self.method, *parts, *(self._settings_in_words if self.several else [])])
+        return ", ".join(
+            [self.method, *parts, *(self._settings_in_words if by_name(self.method).traits.several else [])]
+        )
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table, JSON or an event."""
@@ -264,16 +256,6 @@ class TrialTable:
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         """The table with this outcome in place of the one of this number."""
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
-
-    @property
-    def n_done(self) -> int:
-        """Trials that have a volume."""
-        return sum(outcome.status == "done" for outcome in self.outcomes)
-
-    @property
-    def timed(self) -> bool:
-        """Trials end when their time is over."""
-        return any(outcome.trial.seconds_asked is not None for outcome in self.outcomes)
 
     @property
     def dose(self) -> TrialCost:
