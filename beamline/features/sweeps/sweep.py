@@ -125,11 +125,11 @@ def _middle(trial: ReconOptions, halo: int) -> Selection:
     selection = trial.selection
     with trial.source.open() as source:
         rows, n = rows_of(source, selection), selection.binning
-        whole = selection.rows is not None or cone_of(source, selection) is not None
+        if selection.rows is not None or cone_of(source, selection) is not None:
+            return selection
     height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
     first = rows.start + (rows.stop - rows.start - height) // 2
-    slab = replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))
-    return selection if whole else slab
+    return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))
 
 
 def sweep_slices(
