@@ -23,7 +23,6 @@ from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import WIDTH, new_figure, png, show_grey
 from beamline.report.metrics import METRICS
-from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import ONE_IN
@@ -118,17 +117,16 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo, cut = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials), []
-    for trial in trials:
-        with trial.source.open() as source:
-            cut.append(replace(trial, selection=_middle(source, trial.selection, halo)))
-    return cut
+    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
+    return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
 
 
-def _middle(source: ScanSource, selection: Selection, halo: int) -> Selection:
-    rows, n = rows_of(source, selection), selection.binning
-    if selection.rows is not None or cone_of(source, selection) is not None:
-        return selection
+def _middle(trial: ReconOptions, halo: int) -> Selection:
+    selection = trial.selection
+    with trial.source.open() as source:
+        rows, n = rows_of(source, selection), selection.binning
+        if selection.rows is not None or cone_of(source, selection) is not None:
+            return selection
     height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
     first = rows.start + (rows.stop - rows.start - height) // 2
     return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))

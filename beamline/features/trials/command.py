@@ -43,7 +43,6 @@ from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 if TYPE_CHECKING:
     from beamline.features.trials.launch import ComparedScan
     from beamline.features.trials.layout import Plan, TableLayout
-    from beamline.projections.scan_statistics import LightAsked
 
 
 def listed(value: str) -> tuple[str, ...]:
@@ -163,11 +162,11 @@ def tradeoff(request: TradeoffRequest) -> None:
         if request.spectra is not None:
             files = scans_of(files, Warnings(sink, SystemClock()))
         (source, selection), *others = (chosen(path, request.seed, request.values) for path in files)
-        scans = None
-        if request.spectra is not None:
-            scans = EnergyScans((source, *(each for each, _ in others)), read_spectra(request.spectra))
+        every = (source, *(each for each, _ in others))
+        scans = None if request.spectra is None else EnergyScans(every, read_spectra(request.spectra))
         scan = ComparedScan(
-            source, selection, folder, request.methods or (), request.truth, _light(request), request.seconds,
+            source, selection, folder, request.methods or (), request.truth,
+            light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds,
             request.max_seconds, request.seed, repeating(context, files, folder),
         )  # fmt: skip
         plan = partial(
@@ -179,10 +178,6 @@ def tradeoff(request: TradeoffRequest) -> None:
             states=names_in(request.states),
         )
     _compare(scan, TRADEOFF, plan, dry=request.dry, as_json=request.as_json, begun=begun)
-
-
-def _light(request: TradeoffRequest | StudyRequest) -> LightAsked | None:
-    return light_asked(request.values["photons_per_count"], request.values["dose_in"])
 
 
 def _compare(
@@ -201,7 +196,7 @@ def _compare(
         table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
         answer.lines = text(table, layout), f"\n{'report':<10}{scan.folder / layout.page}"
     if table.stopped:
-        counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
+        counts = f"{len(table.compared)} of {len(table.todo)} {layout.unit}"
         raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {scan.folder}.")
 
 
@@ -280,7 +275,8 @@ def study(request: StudyRequest) -> None:
     source, selection = chosen(request.file, request.seed, request.values)
     folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
     scan = ComparedScan(
-        source, selection, folder, methods, request.truth, _light(request), request.seconds, seed=request.seed,
+        source, selection, folder, methods, request.truth,
+        light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds, seed=request.seed,
         command=repeating(context, request.file, folder),
     )  # fmt: skip
     asked = STUDIES[request.which]

@@ -26,7 +26,7 @@ from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.assess.time_model import duration_text
-from recon.methods import names
+from recon.methods import by_name, names
 
 if TYPE_CHECKING:
     from matplotlib import figure as drawing
@@ -78,7 +78,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
         pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
     if labels := slices.labels():
         caption = "The same slice by each method with its usual settings, all in the grey window of the first."
-        if any(outcome.trial.several for outcome in table.outcomes):
+        if any(by_name(outcome.trial.method).traits.several for outcome in table.outcomes):
             caption += " Of several volumes, the one that the middle view shows, by its time or energy."
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     return pictures
@@ -94,59 +94,55 @@ def _duration(seconds: float) -> str:
 
 def conclusions(table: TrialTable) -> list[str]:
     """Sentences: the time of each further dB along the front."""
-    compared, qualities, seconds = table.compared, table.qualities, table.costs(TIME)
-    kept = table.front(TIME)
-    out = [f"Quality: {QUALITIES[table.by][0]}, dB."]
+    by, kept, quality = table.by, table.front(TIME), f"Quality: {QUALITIES[table.by][0]}, dB."
     if not kept:
-        return [*out, "No trial has both a time and a quality."]
-    first, best, pick = compared[kept[0]], compared[kept[-1]], kept[worth_its_time(table) or 0]
-    words = f"Best for its time: {compared[pick].trial.label}: {qualities[pick]:.2f} dB in {_duration(seconds[pick])}"
-    if pick != kept[-1]:
-        gain, more = qualities[kept[-1]] - qualities[pick], _duration(best.seconds - seconds[pick])
-        words += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
-    out = [f"{words}.", *out]
-    out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
-    for i, j in pairwise(kept):
-        rise, cost = qualities[j] - qualities[i], seconds[j] - seconds[i]
-        chance = f" ± {table.chance(j, i):.2f}" * (table.by == HELD_OUT)
+        return [quality, "No trial has both a time and a quality."]
+    fastest, best, pick = kept[0], kept[-1], worth_its_time(kept, by)
+    out = [_told("Best for its time", pick, by), quality, f"{_told('Fastest', fastest, by)}."]
+    if pick is not best:
+        gain, more = best.quality(by) - pick.quality(by), _duration(best.seconds - pick.seconds)
+        out[0] += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
+    out[0] += "."
+    for before, after in pairwise(kept):
+        rise, cost = after.quality(by) - before.quality(by), after.seconds - before.seconds
+        chance = f" ± {table.chance(after, before):.2f}" * (by == HELD_OUT)
         price = f"{_duration(cost)} more ({_duration(cost / rise)} a dB)"
-        out.append(f"+{rise:.2f}{chance} dB for {price}: {compared[j].trial.label}.")
-    out += _level(table, kept[-1])
-    if any("resolution" in outcome.metrics for outcome in compared):
-        out.append(_FSC)
-    return out
+        out.append(f"+{rise:.2f}{chance} dB for {price}: {after.trial.label}.")
+    out += _level(table, best)
+    return [*out, _FSC] if any("resolution" in outcome.metrics for outcome in table.compared) else out
 
 
-def worth_its_time(table: TrialTable) -> int | None:
-    """Number on the front of time of the quickest trial within `_NEAR` of the best one; None without a front."""
-    front, qualities = table.front(TIME), table.qualities
-    near = [n for n, i in enumerate(front) if qualities[i] >= qualities[front[-1]] - _NEAR]
-    return near[0] if near else None
+def _told(what: str, outcome: Outcome, by: str) -> str:
+    return f"{what}: {outcome.trial.label}: {outcome.quality(by):.2f} dB in {_duration(outcome.seconds)}"
 
 
-def _level(table: TrialTable, last: int) -> list[str]:
+def worth_its_time(front: Sequence[Outcome], by: str) -> Outcome:
+    """The quickest trial of the front within `_NEAR` of its best one."""
+    return next(outcome for outcome in front if outcome.quality(by) >= front[-1].quality(by) - _NEAR)
+
+
+def _level(table: TrialTable, last: Outcome) -> list[str]:
     """A sentence where a trial that costs more seems better than the last one of the front, by chance."""
-    qualities = table.qualities
-    best = max(range(len(qualities)), key=lambda i: qualities[i] if math.isfinite(qualities[i]) else -math.inf)
-    gain, chance = qualities[best] - qualities[last], table.chance(best, last)
-    if best == last or gain < LEAST_GAIN:
+    known = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
+    best = max(known, key=lambda outcome: outcome.quality(table.by))
+    gain = best.quality(table.by) - last.quality(table.by)
+    if best is last or gain < LEAST_GAIN:
         return []
-    more = table.compared[best].seconds - table.compared[last].seconds
     return [
-        f"There it ends: the best figure, +{gain:.2f} dB for {_duration(more)} more "
-        f"({table.compared[best].trial.label}), is within chance (± {chance:.2f} dB)."
+        f"There it ends: the best figure, +{gain:.2f} dB for {_duration(best.seconds - last.seconds)} more "
+        f"({best.trial.label}), is within chance (± {table.chance(best, last):.2f} dB)."
     ]
 
 
 def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
-    points = zip(table.compared, table.costs(cost), table.qualities, strict=True)
+    front, compared = table.front(cost), table.compared
     return pareto_plot(
-        [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],
-        table.front(cost),
+        [(outcome.trial, cost.of(outcome) * cost.scale, outcome.quality(table.by)) for outcome in compared],
+        [compared.index(outcome) for outcome in front],
         cost.axis,
         QUALITIES[table.by][1],
         cost.unit,
-        worth_its_time(table) if cost is TIME else None,
+        front.index(worth_its_time(front, table.by)) if cost is TIME else None,
     )
 
 

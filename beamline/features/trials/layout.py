@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -113,7 +114,7 @@ class TableLayout:
 
     def marked(self, table: TrialTable) -> list[Outcome]:
         """The rows that stand out."""
-        return [table.compared[i] for i in table.front(TIME)] if self.front else []
+        return table.front(TIME) if self.front else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,8 @@ def known(table: TrialTable, figures: Mapping[str, Figure]) -> dict[str, Figure]
 
 def columns(table: TrialTable, layout: TableLayout) -> dict[str, TableColumn]:
     """What is shown of every row, by name as in `values_of`."""
-    facts, timed = dict.fromkeys(name for o in table.outcomes for name in o.trial.facts), table.timed
+    trials = [outcome.trial for outcome in table.outcomes]
+    facts, timed = dict.fromkeys(chain(*(each.facts for each in trials))), any(each.seconds_asked for each in trials)
     shown = {
         **{name: TableColumn(name, name, 11, "{:.4g}".format) for name in facts},
         "seconds_asked": TableColumn("s asked" * (timed and not layout.front), "s asked", words="{:g}".format),
@@ -168,7 +170,8 @@ def values_of(table: TrialTable, layout: TableLayout, outcome: Outcome) -> dict[
     every = [each.trial for each in table.outcomes]
     return {
         "row": (trial.choice or trial).label,
-        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "window", "frames")},
+        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "frames")},
+        "window": 1 if trial.choice is None else trial.choice.window,
         **{name: trial.settings.get(name) for each in every for name in each.settings},
         **({} if light is None else light.of(trial.frames)),
         **{name: trial.facts.get(name) for each in every for name in each.facts},
@@ -241,7 +244,7 @@ def write_table(folder: Path, table: TrialTable, layout: TableLayout) -> None:
         "notes": list(table.notes),
         "rows": records(table, layout),
         "trials": [outcome.as_record() for outcome in table.outcomes],
-        **{f"front_{cost.name}": [table.compared[i].trial.label for i in table.front(cost)] for cost in (TIME, MEMORY)},
+        **{f"front_{cost.name}": [o.trial.label for o in table.front(cost)] for cost in (TIME, MEMORY)},
     }
     words = json.dumps(to_jsonable_python(record, inf_nan_mode="null"), indent=1, ensure_ascii=False)
     write_whole(folder / f"{layout.name}.json", words, replace=True)
@@ -271,7 +274,7 @@ def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: Sli
 def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture]) -> str:
     """The table and its pictures as an HTML page."""
     marked = layout.marked(table)
-    counts = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
+    counts = f"{len(table.compared)} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(
         "trials.html",
         title=layout.title,

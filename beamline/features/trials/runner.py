@@ -43,28 +43,6 @@ _SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the pag
 Expected = Callable[[Trial], float | None]
 """s of a trial; None: not known."""
 
-_WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
-
-
-@dataclass(frozen=True)
-class Timed:
-    """A finished trial, and how its time was spent.
-
-    Attributes:
-        wall: s, from before its process began to after its end.
-        working: s of these that it reconstructed, which grow with the work; the rest is the same for all.
-    """
-
-    trial: Trial
-    wall: float
-    working: float
-
-    @classmethod
-    def of(cls, outcome: Outcome, wall: float) -> Timed:
-        """One without figures has 0 s of work."""
-        seconds = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
-        return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
-
 
 def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
     """s that a trial on some of these views reconstructs, at most.
@@ -93,7 +71,7 @@ def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
     return of_trial
 
 
-def trials_left(done: Sequence[Timed], trials: Sequence[Trial], expected: Expected) -> float | None:
+def trials_left(done: Sequence[Outcome], trials: Sequence[Trial], expected: Expected) -> float | None:
     """s that the trials to come will take, from those done; None before the first.
 
     Each takes the same time to start and measure, and what is expected of it, at the pace of its method's trials that
@@ -115,7 +93,7 @@ def trials_left(done: Sequence[Timed], trials: Sequence[Trial], expected: Expect
     return total
 
 
-def _pace(done: Sequence[Timed], expected: Expected) -> float | None:
+def _pace(done: Sequence[Outcome], expected: Expected) -> float | None:
     """What trials took over what was expected of them; None where nothing was."""
     told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
     return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None
@@ -211,7 +189,12 @@ def run_comparison(
         compile_kernels(trials, work, max(rig.seconds, 0.0) * _COMPILING)
         table = _run_all(table, layout, rig, scan.folder)
     write_page(scan.folder, table, layout, slices)
-    summary = {"output": scan.folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
+    summary = {
+        "output": scan.folder,
+        layout.unit: len(table.todo),
+        "done": len(table.compared),
+        "stopped": table.stopped,
+    }
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
@@ -222,7 +205,7 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) ->
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
     """
-    begin, timed, todo = rig.now(), list[Timed](), table.todo
+    begin, timed, todo = rig.now(), list[Outcome](), table.todo
     try:
         for n, index in enumerate(todo):
             trial, seconds = table.outcomes[index].trial, rig.seconds
@@ -235,13 +218,13 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) ->
             started, whole = rig.now(), table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             outcome, _ = rig.run(trial, seconds, trial.title * (trial.group in _SHOWN))
-            table = whole.with_outcome(index, outcome)
-            timed.append(Timed.of(outcome, rig.now() - started))
-            if table.n_done:
+            timed.append(replace(outcome, wall=rig.now() - started))
+            table = whole.with_outcome(index, timed[-1])
+            if table.compared:
                 write_table(folder, table, layout)
             rig.emit(event_of(table, layout, n + 1, len(todo), outcome))
     except KeyboardInterrupt:
-        if not table.n_done:
+        if not table.compared:
             raise
         table = replace(table, stopped=True)
     write_table(folder, table, layout)

@@ -20,6 +20,7 @@ Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 _NAMES = ("materials", "states")  # settings that are several names
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
+_WITH_HALVES = 3  # reconstructions of a trial with its half-set resolution
 _ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
@@ -50,11 +51,6 @@ class Trial:
     choice: ViewChoice | None = None
 
     @property
-    def several(self) -> bool:
-        """Its method makes several volumes; each view shows one of them, or a mixture."""
-        return by_name(self.method).traits.several
-
-    @property
     def left_out(self) -> bool:
         """The scan has not the views that it asks for."""
         return self.choice is not None and self.choice.groups is None
@@ -63,11 +59,6 @@ class Trial:
     def frames(self) -> int:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
-
-    @property
-    def window(self) -> int:
-        """Views of the scan that are averaged into each of its views."""
-        return 1 if self.choice is None else self.choice.window
 
     @property
     def facts(self) -> Mapping[str, float]:
@@ -116,7 +107,9 @@ class Trial:
         if self.group == "method":
             return by_name(self.method).label
         parts = [f"{self.parts} parts"] if self.parts > 1 else []
-        return ", ".join([self.method, *parts, *(self._settings_in_words if self.several else [])])
+        return ", ".join(
+            [self.method, *parts, *(self._settings_in_words if by_name(self.method).traits.several else [])]
+        )
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table, JSON or an event."""
@@ -175,6 +168,7 @@ class Outcome:
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         squared_residuals: of each view held out.
         reached: how far it came, such as "212 steps, 8 sweeps"; empty for a direct method.
+        wall: s, from before its process began to after its end.
     """
 
     trial: Trial
@@ -189,6 +183,13 @@ class Outcome:
     cpu_seconds: float = math.nan
     squared_residuals: Sequence[float] = ()
     reached: str = ""
+    wall: float = math.nan
+
+    @property
+    def working(self) -> float:
+        """s of `wall` that grow with the work, half-set resolution included; 0 without figures."""
+        seconds = self.seconds * (_WITH_HALVES if self.trial.halves else 1)
+        return min(self.wall, seconds) if math.isfinite(seconds) else 0.0
 
     def quality(self, by: str) -> float:
         """dB, more is better, by the metric of this name, of `QUALITIES`; NaN where it is not known."""
@@ -257,16 +258,6 @@ class TrialTable:
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
 
     @property
-    def n_done(self) -> int:
-        """Trials that have a volume."""
-        return sum(outcome.status == "done" for outcome in self.outcomes)
-
-    @property
-    def timed(self) -> bool:
-        """Trials end when their time is over."""
-        return any(outcome.trial.seconds_asked is not None for outcome in self.outcomes)
-
-    @property
     def dose(self) -> TrialCost:
         """The dose as a cost. Each frame of the scan that several views share is counted once."""
         light, scale, axis, unit = self.light, 1.0, "dose: frames that were exposed", "frames"
@@ -282,42 +273,34 @@ class TrialTable:
         return tuple(o for o in self.outcomes if o.status == "done")
 
     @property
-    def qualities(self) -> list[float]:
-        """dB of each trial in `compared`."""
-        return [outcome.quality(self.by) for outcome in self.compared]
-
-    @property
     def todo(self) -> list[int]:
         """Numbers of the trials that are not left out."""
         return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
 
-    def costs(self, cost: TrialCost) -> list[float]:
-        """The cost of each trial in `compared`."""
-        return [cost.of(outcome) for outcome in self.compared]
+    def front(self, cost: TrialCost) -> list[Outcome]:
+        """The trials that no other one beats, by rising cost, and so by rising quality; of equal ones the first.
 
-    def front(self, cost: TrialCost) -> list[int]:
-        """Positions in `compared` of the trials on the front of quality and `cost`.
-
-        Costs are compared to 1 %: smaller differences between two trials are chance. A trial that costs more is on the
-        front where its gain is above `chance`.
+        A trial is beaten by one of at most its cost and at least its quality. Costs are compared to 1 %: smaller
+        differences between two trials are chance. A trial that costs more is on the front where its gain is above
+        `chance`.
         """
-        qualities = self.qualities
+        kept: list[Outcome] = []
+        known = [o for o in self.compared if math.isfinite(cost.of(o)) and math.isfinite(o.quality(self.by))]
+        for each in sorted(known, key=lambda o: (rounded(cost.of(o)), -o.quality(self.by))):
+            if not kept or each.quality(self.by) - kept[-1].quality(self.by) > self.chance(each, kept[-1]):
+                kept.append(each)
+        return kept
 
-        def better(i: int, j: int) -> bool:
-            return qualities[i] - qualities[j] > self.chance(i, j)
-
-        return front([rounded(value) for value in self.costs(cost)], qualities, better)
-
-    def chance(self, i: int, j: int) -> float:
-        """dB between two trials in `compared` that chance may reach.
+    def chance(self, one: Outcome, other: Outcome) -> float:
+        """dB between two trials that chance may reach.
 
         Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
         noise of a view is in both of its residuals, and so not in their difference.
         """
-        squared = [np.asarray(self.compared[k].squared_residuals) for k in (i, j)]
-        if self.by != HELD_OUT or min(each.size for each in squared) < 2 or squared[0].size != squared[1].size:
+        first, second = (np.asarray(each.squared_residuals) for each in (one, other))
+        if self.by != HELD_OUT or min(first.size, second.size) < 2 or first.size != second.size:
             return LEAST_GAIN
-        apart, level = squared[0] - squared[1], (squared[0].mean() + squared[1].mean()) / 2
+        apart, level = first - second, (first.mean() + second.mean()) / 2
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
@@ -328,23 +311,3 @@ def rounded(cost: float) -> float:
         return cost
     step = math.log(1.01)
     return math.exp(round(math.log(cost) / step) * step)
-
-
-def front(
-    costs: Sequence[float], qualities: Sequence[float], better: Callable[[int, int], bool] | None = None
-) -> list[int]:
-    """Positions of the points that no other point beats, by rising cost (and so by rising quality).
-
-    A point is beaten by one with at most its cost and at least its quality, and better in one of the two. Of equal
-    points the first stays. Points with a value that is not finite are left out.
-
-    Args:
-        better: whether the quality of the first point is clearly above that of the second, which costs less. Where it
-            is not, the second one beats the first. None: by any difference.
-    """
-    finite = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
-    kept: list[int] = []
-    for i in sorted(finite, key=lambda i: (costs[i], -qualities[i], i)):
-        if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
-            kept.append(i)
-    return kept

@@ -83,7 +83,7 @@ def test_each_further_decibel_is_told_with_its_price() -> None:
 def test_a_held_out_residual_is_told_in_decibels_below_the_data() -> None:
     judged = Outcome(BASE, "done", 1.0, None, {"residual_held_out": 0.1})
     table = _table(judged, by="residual_held_out")
-    assert table.qualities == [pytest.approx(20.0)]
+    assert judged.quality(table.by) == pytest.approx(20.0)
     assert "−20 log₁₀ of the held-out residual" in conclusions(table)[1]
     row = next(line for line in text(table, TRADEOFF).splitlines() if line.startswith("* fbp"))
     assert row.split()[-4:] == ["1.00", "n/a", "–", "0.1000"]  # s, CPU s, MB, residual: two are not known

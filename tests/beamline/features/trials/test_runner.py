@@ -136,7 +136,7 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> N
     made_up(interrupted)
     events: list[Event] = []
     table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
-    assert table.stopped and table.n_done == 3
+    assert table.stopped and len(table.compared) == 3
     rows = _rows(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] * 3 + ["interrupted"] + ["not run"] * (len(rows) - 4)
     assert "interrupted: ended before it was done" in text(table, TRADEOFF)
@@ -174,7 +174,7 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
         with pytest.raises(DataError, match=rf"{re.escape(name)} could"):
             run_tradeoff(options, lambda e: None, SystemClock())
     assert left(tmp_path) == {"scan.h5"}
-    assert run_tradeoff(options, lambda e: None, SystemClock()).n_done
+    assert run_tradeoff(options, lambda e: None, SystemClock()).compared
 
 
 def test_a_disk_that_is_full_later_keeps_the_trials_written(
@@ -246,7 +246,7 @@ def test_a_limit_of_time_bounds_reading_compiling_and_the_page(
     assert not any(each.halves for each in done)
     left_out = [outcome for outcome in table.outcomes if outcome.status == "not run" and outcome.message]
     assert left_out and any("not begun: it would take about" in outcome.message for outcome in left_out)
-    assert len(left_out) == len(table.outcomes) - table.n_done  # each that is left out says so
+    assert len(left_out) == len(table.outcomes) - len(table.compared)  # each that is left out says so
 
 
 def test_the_time_that_passed_before_the_run_counts(tmp_path: Path, made_up: Any) -> None:

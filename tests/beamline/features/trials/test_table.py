@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from beamline.core.machine import machine
 from beamline.features.trials.front import conclusions
-from beamline.features.trials.runner import Timed, trials_left
+from beamline.features.trials.runner import trials_left
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time, quick_first
-from beamline.features.trials.trial import LEAST_GAIN, MEMORY, TIME, Outcome, Trial, TrialTable, front, rounded
+from beamline.features.trials.trial import LEAST_GAIN, MEMORY, TIME, Outcome, Trial, TrialTable, rounded
 from recon.base.method import BoundedMethod
 from recon.methods import by_name, names_of_one_volume
 
@@ -28,8 +28,8 @@ def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
         for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
     ]
     table = TrialTable(tuple(outcomes), "psnr", "mm", machine(), {}, "")
-    assert table.front(TIME) == [0, 1]
-    assert table.front(MEMORY) == [1]
+    assert table.front(TIME) == outcomes
+    assert table.front(MEMORY) == outcomes[1:]
 
 
 def _judged(*trials: tuple[float, list[float]]) -> TrialTable:
@@ -46,7 +46,7 @@ def test_a_gain_within_the_scatter_of_the_views_is_none() -> None:
     """The third trial leaves 1 % less on average, but more of half of the views; the second leaves less of each."""
     slow, fast = [0.9, 1.1, 0.9, 1.1], [1.0, 1.0, 1.0, 1.02]
     table = _judged((1.0, [4.0, 4.1, 3.9, 4.0]), (2.0, fast), (9.0, [left * 0.99 for left in slow]))
-    assert table.front(TIME) == [0, 1]
+    assert table.front(TIME) == list(table.outcomes[:2])
     assert conclusions(table)[-1].startswith(
         "There it ends: the best figure, +0.07 dB for 7 s more (fbp, 12 views), is"
     )
@@ -56,8 +56,8 @@ def test_a_gain_in_every_view_is_one_however_much_views_differ() -> None:
     """The noise of a view is in both residuals: it does not hide a small difference in all views."""
     views = np.random.default_rng(0).uniform(1, 9, 16)
     table = _judged((1.0, (views + 0.05).tolist()), (2.0, views.tolist()))
-    assert table.front(TIME) == [0, 1]
-    assert table.chance(0, 1) == LEAST_GAIN
+    assert table.front(TIME) == list(table.outcomes)
+    assert table.chance(*table.outcomes) == LEAST_GAIN
 
 
 def test_chance_is_that_of_repeated_noise() -> None:
@@ -66,13 +66,23 @@ def test_chance_is_that_of_repeated_noise() -> None:
     for _ in range(300):
         first, second = rng.normal(5, 0.3, (2, 16))
         table = _judged((1.0, first.tolist()), (2.0, second.tolist()))
-        beyond += abs(np.diff(table.qualities)[0]) > table.chance(0, 1)
+        one, other = table.outcomes
+        beyond += abs(one.quality(table.by) - other.quality(table.by)) > table.chance(one, other)
     assert beyond / 300 == pytest.approx(0.06, abs=0.03)
 
 
-# Few distinct values, so that ties happen.
-VALUES = st.one_of(st.integers(-5, 5).map(float), st.floats(-1e6, 1e6), st.just(math.nan), st.just(math.inf))
+# Few distinct values, so that ties happen; they differ by more than chance.
+VALUES = st.one_of(st.integers(1, 9).map(float), st.just(math.nan), st.just(math.inf))
 POINTS = st.lists(st.tuples(VALUES, VALUES), max_size=30)
+
+
+def _front(points: list[tuple[float, float]]) -> list[int]:
+    """Numbers of the points, of so many seconds and dB, that are on the front."""
+    outcomes = [
+        Outcome(Trial("method", "fbp", n), "done", cost, metrics={"psnr": db}) for n, (cost, db) in enumerate(points)
+    ]
+    table = TrialTable(tuple(outcomes), "psnr", "mm", {}, {}, "")
+    return [outcome.trial.views for outcome in table.front(TIME)]
 
 
 def _finite(point: tuple[float, float]) -> bool:
@@ -85,8 +95,7 @@ def _beats(a: tuple[float, float], b: tuple[float, float]) -> bool:
 
 @given(POINTS)
 def test_exactly_the_points_that_nothing_beats_are_kept(points: list[tuple[float, float]]) -> None:
-    costs, qualities = [p[0] for p in points], [p[1] for p in points]
-    kept = front(costs, qualities)
+    kept = _front(points)
     finite = [p for p in points if _finite(p)]
     unbeaten = {p for p in finite if not any(_beats(other, p) for other in finite)}
     assert len(kept) == len(set(kept)) == len(unbeaten)
@@ -97,14 +106,13 @@ def test_exactly_the_points_that_nothing_beats_are_kept(points: list[tuple[float
 
 @given(POINTS)
 def test_the_best_of_each_axis_is_on_it_and_both_rise_along_it(points: list[tuple[float, float]]) -> None:
-    costs, qualities = [p[0] for p in points], [p[1] for p in points]
-    kept = front(costs, qualities)
+    kept = [points[i] for i in _front(points)]
     finite = [p for p in points if _finite(p)]
     assert bool(kept) == bool(finite)
     if finite:
-        assert costs[kept[0]] == min(p[0] for p in finite)
-        assert qualities[kept[-1]] == max(p[1] for p in finite)
-    assert all(costs[a] < costs[b] and qualities[a] < qualities[b] for a, b in pairwise(kept))
+        assert kept[0][0] == min(p[0] for p in finite)
+        assert kept[-1][1] == max(p[1] for p in finite)
+    assert all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(kept))
 
 
 @given(st.floats(1e-9, 1e12), st.floats(1e-9, 1e12))
@@ -158,7 +166,7 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
                 continue
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
-    started = [Timed(trials[0], 2.0 + seconds, seconds)] * done
+    started = [Outcome(trials[0], "done", seconds, wall=2.0 + seconds)] * done
     left = trials_left(started, [trials[0]] * 3, lambda trial: None)
     assert (left is None) == (not done)
     assert left is None or left == pytest.approx(3 * (2.0 + seconds))
@@ -200,7 +208,7 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
     def steps(trial: Trial) -> float | None:
         return float(trial.settings["steps"] or 0) if "steps" in trial.settings else None
 
-    one = Timed(base, start + speed * 100, speed * 100)
+    one = Outcome(base, "done", speed * 100, wall=start + speed * 100)
     assert trials_left([one], left, steps) == pytest.approx(n * start + speed * 100 * n * (n + 1) / 2)
     assert trials_left([one], [], steps) == 0
     assert trials_left([], left, steps) is None
@@ -208,7 +216,7 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
     varied = [replace(each, group="steps") for each in left]
     assert quick_first([*varied[::-1], base], steps) == (base, *varied)
     # Of a method never tried nothing better is known than the mean of what was.
-    done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
+    done = [Outcome(base, "done", 4.0, wall=7.0), Outcome(base, "done", 8.0, wall=11.0)]
     other = Trial("method", "fbp", 60)
     assert trials_left(done, [other], steps) == pytest.approx(3 + 6)
     assert trials_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
@@ -216,11 +224,11 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
 
 def test_where_the_time_of_a_trial_went() -> None:
     trial = Trial("steps", "r2", 60, settings={"steps": 100, "gaussians": 1000})
-    assert Timed.of(Outcome(trial, "done", 4.0), 7.0) == Timed(trial, 7.0, 4.0)
+    assert Outcome(trial, "done", 4.0, wall=7.0).working == 4.0
     base = replace(trial, group="method", halves=True)
-    assert Timed.of(Outcome(base, "done", 4.0), 15.0).working == 12.0
-    assert Timed.of(Outcome(base, "done", 4.0), 10.0).working == 10.0
-    assert Timed.of(Outcome(trial, "failed"), 3.0) == Timed(trial, 3.0, 0.0)
+    assert Outcome(base, "done", 4.0, wall=15.0).working == 12.0
+    assert Outcome(base, "done", 4.0, wall=10.0).working == 10.0
+    assert Outcome(trial, "failed", wall=3.0).working == 0.0
 
 
 def test_quality_is_decibels_either_way_and_a_record_is_plain() -> None:
