@@ -1,5 +1,6 @@
 """Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
 
+import errno
 import os
 import shutil
 import sys
@@ -16,6 +17,7 @@ from beamline.core.stop import StopRequest
 from beamline.scan.control import State, running
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
+from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
@@ -195,6 +197,17 @@ def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in
         assert describe(run).state == "preparing"
         recover_run(run)
     assert describe(run).state == "failed"
+
+
+def test_on_a_disk_without_locks_no_run_is_said_to_have_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_lock(file: int, *, exclusive: bool) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(writer_lock, "_lock", no_lock)
+    file = RecordFile(_part(tmp_path / "a", RunRecord(State.IDLE)), RunRecord(State.ACQUIRING, frames=3))
+    assert (describe(tmp_path / "a").state, describe(tmp_path / "a").frames) == (State.ACQUIRING, 3)
+    file.close()
+    assert describe(tmp_path / "a").state == State.FAILED
 
 
 @pytest.mark.bench
