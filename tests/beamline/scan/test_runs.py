@@ -11,17 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from beamline.core.errors import ConfigError
+from beamline.config.load import resolved_yaml
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.scan.control import State, running
-from beamline.scan.resume import open_for_resume, recover_run
+from beamline.scan.resume import NoFrame, open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
 from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran, killed
+from tests.beamline.ran import Ran, killed, small
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
@@ -181,6 +182,21 @@ def test_of_a_kill_in_the_last_fit_the_run_has_died_and_recover_says_that_it_is_
     assert f"`beamline recover {run}` ends the run" in died.next_step
     recover_run(run)
     assert (describe(run).state, describe(run).frames, describe(run).next_step) == ("done", FRAMES, "")
+
+
+def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_path: Path) -> None:
+    run = _part(tmp_path / "a", RunRecord(State.PREPARING, planned=FRAMES))
+    for content in (None, b"", b"\x89HDF\r\n\x1a\n"):  # its file was not made, or not to its end
+        if content is not None:
+            (run / "scan.h5").write_bytes(content)
+        died = describe(run)
+        assert (died.state, died.frames) == ("died", 0)
+        assert died.next_step == "It ended before its first frame: start the scan anew."
+    with pytest.raises(DataError, match=r"has no frame: .*Nothing was changed"):
+        recover_run(run)
+    (run / "config.resolved.yaml").write_text(resolved_yaml(small()))
+    with pytest.raises(NoFrame, match="run the scan anew"), open_for_resume(run):
+        pass
 
 
 def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in_preparation(tmp_path: Path) -> None:
