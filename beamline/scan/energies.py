@@ -171,10 +171,8 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
         return held.enter_context(open_for_resume(run))
     except NoFrame:
         return None
-    except NotJoined:
-        recover_run(run)
-    except NothingMissing:
-        pass
+    except (NotJoined, NothingMissing):
+        recover_run(run)  # which ends the record of one that died in its last fit
     except DataError as error:
         raise DataError(f"{error} If {run} cannot be recovered, move it away: --resume then takes it anew.") from None
     return scan_file(run)

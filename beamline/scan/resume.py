@@ -196,13 +196,13 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
-    """The files of the parts, without those of later parts that ended before their first frame, and a sentence on each
-    of these."""
+    """The files of the parts, without those of parts that ended before their first frame, and a sentence on each of
+    these."""
     files, left_out = [], []
     for part in parts_of(run):
         if not (part / SCAN).is_file():
             continue
-        if part == run or may_hold_frames(part / SCAN):
+        if may_hold_frames(part / SCAN):
             files.append(part / SCAN)
         else:
             left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {RECORD} has none.")
@@ -282,7 +282,8 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     with _alone(run):
         files, left_out = _files(run)
         if not files:
-            raise DataError(f"{run} is not the folder of a run: it has no {SCAN}. {_UNTOUCHED}")
+            why = left_out[0] if left_out else f"it is not the folder of a run, without a {SCAN}."
+            raise DataError(f"{run} has no frame: {why} {_UNTOUCHED}")
         done = [recover(part, say) for part in files]
         if len(parts := [one.path for one in done if one.frames]) > 1:
             changed = not is_joined(run / JOINED)

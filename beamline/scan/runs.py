@@ -135,20 +135,23 @@ def record_sink(file: RecordFile) -> Sink:
             case ScanDone(result=scan):
                 flags = {check: dict(levels) for check, levels in scan.flags.items()}
                 record = replace(record, frames=scan.n_frames, joined=scan.path.name != SCAN, flags=flags)
-        file.put(record, at_once=isinstance(event, StateEntered | ScanDone))
+        file.put(record, at_once=isinstance(event, StateEntered | ScanDone) or not file.record.frames)
 
     return keep
 
 
 def record_of(part: Path) -> RunRecord:
-    """The record of a part; frames and flags of one that died, and all of a part without a record, by its file."""
+    """The record of a part; frames and flags of one that died, and all of a part without a record, by its file.
+
+    Where that cannot be read, as when a kill came while it was made, the frames stay as they were written last.
+    """
     record = read_record(part)
     if record is not None and record.state != DIED:
         return record
     by_file = _by_file(part / SCAN)
     if record is None:
         return by_file
-    frames = by_file.frames if (part / SCAN).exists() else record.frames
+    frames = record.frames if by_file.frames is None else by_file.frames
     return replace(record, frames=frames, flags=by_file.flags, joined=False)
 
 

@@ -86,13 +86,14 @@ def next_step(scan: Path) -> str:
     if lives or (run is not None and held(run / EVENTS, exclusively=True)) or (growing and held(scan)):
         watch = "" if run is None else f"`beamline watch {run}` shows it, "
         return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
+    if run is not None and not any(may_hold_frames(part / SCAN) for part in parts_of(run)):
+        return "It ended before its first frame: start the scan anew."
     if not growing:
         if run is not None and head is not None and _lacks_views(run):
             return f"It ended early: {resume}."
         record = None if run is None else read_record(parts_of(run)[-1])
-        ended = f"after its scan file was closed: `beamline recover {run}` ends the run"
-        how = ended if head is not None else "before its first frame: start the scan anew"
-        return f"Its process died {how}." if record is not None and record.state == DIED else ""
+        died = f"Its process died after its scan file was closed: `beamline recover {run}` ends the run."
+        return died if record is not None and record.state == DIED else ""
     sure = lives is False or abandoned(scan)  # where the disk has no locks, its program may run
     died = "Its scan has died" + ("" if sure else ", unless a program still writes to it")
     what = scan if run is None else run

@@ -1,5 +1,6 @@
 """Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
 
+import errno
 import os
 import shutil
 import sys
@@ -10,16 +11,18 @@ from pathlib import Path
 
 import pytest
 
-from beamline.core.errors import ConfigError
+from beamline.config.load import resolved_yaml
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.scan.control import State, running
-from beamline.scan.resume import open_for_resume, recover_run
+from beamline.scan.resume import NoFrame, open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
+from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran, killed
+from tests.beamline.ran import Ran, killed, small
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
@@ -85,8 +88,7 @@ def test_parts_of_a_resumed_run_are_one_run(tmp_path: Path) -> None:
     assert (found.frames, found.parts, found.state, found.planned) == (22, 2, "done", 20)
     assert found.flags == {"mass": {"warn": 3, "alarm": 4}}
     write_record(run / "part-2", replace(later, state=State.ACQUIRING, over=False, frames=5))
-    (run / "part-2" / "scan.h5").touch()
-    assert (describe(run).frames, describe(run).state) == (None, "died")
+    assert (describe(run).frames, describe(run).state) == (9 + 5, "died")
 
 
 def test_newest_first_also_within_a_second(tmp_path: Path) -> None:
@@ -182,6 +184,21 @@ def test_of_a_kill_in_the_last_fit_the_run_has_died_and_recover_says_that_it_is_
     assert (describe(run).state, describe(run).frames, describe(run).next_step) == ("done", FRAMES, "")
 
 
+def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_path: Path) -> None:
+    run = _part(tmp_path / "a", RunRecord(State.PREPARING, planned=FRAMES))
+    for content in (None, b"", b"\x89HDF\r\n\x1a\n"):  # its file was not made, or not to its end
+        if content is not None:
+            (run / "scan.h5").write_bytes(content)
+        died = describe(run)
+        assert (died.state, died.frames) == ("died", 0)
+        assert died.next_step == "It ended before its first frame: start the scan anew."
+    with pytest.raises(DataError, match=r"has no frame: .*Nothing was changed"):
+        recover_run(run)
+    (run / "config.resolved.yaml").write_text(resolved_yaml(small()))
+    with pytest.raises(NoFrame, match="run the scan anew"), open_for_resume(run):
+        pass
+
+
 def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in_preparation(tmp_path: Path) -> None:
     run = _run(tmp_path, 9)
     file = RecordFile(run, RunRecord(State.FINISHING, sample="battery"))
@@ -196,6 +213,17 @@ def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in
         assert describe(run).state == "preparing"
         recover_run(run)
     assert describe(run).state == "failed"
+
+
+def test_on_a_disk_without_locks_no_run_is_said_to_have_died(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_lock(file: int, *, exclusive: bool) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(writer_lock, "_lock", no_lock)
+    file = RecordFile(_part(tmp_path / "a", RunRecord(State.IDLE)), RunRecord(State.ACQUIRING, frames=3))
+    assert (describe(tmp_path / "a").state, describe(tmp_path / "a").frames) == (State.ACQUIRING, 3)
+    file.close()
+    assert describe(tmp_path / "a").state == State.FAILED
 
 
 @pytest.mark.bench
