@@ -31,7 +31,6 @@ from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
 from beamline.storage.interrupted import scan_file
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
@@ -168,7 +167,8 @@ def monitor(
     if config is not None:
         read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
         checks, limits = configured_checks(read.monitor), reference_limits(read.references)
-    with _opened(scan_file(path), follow) as source:
+    place = scan_file(path)
+    with awaited(lambda: open_scan(place, follow=follow), place, SystemClock()) as source:
         return verdict(source, list(replay(source, checks, follow=SystemClock() if follow else None)), limits)
 
 
@@ -188,7 +188,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     refuse_wrong_arguments(stream, locals())
     path = Path(path)
     place = parts_of(path)[-1] / SCAN if path.is_dir() and not (path / JOINED).is_file() else scan_file(path)
-    with _opened(place, follow) as source:
+    with awaited(lambda: open_scan(place, follow=follow), place, SystemClock()) as source:
         for frame, _ in frames_of(source, follow=SystemClock() if follow else None):
             yield frame
 
@@ -220,8 +220,3 @@ def volumes(run: str | Path) -> Iterator[Volume]:
         if over:
             return
         time.sleep(_POLL)
-
-
-def _opened(path: Path, follow: bool) -> ScanSource:
-    """The scan; with `follow` it waits until there is one."""
-    return awaited(lambda: open_scan(path, follow=follow), path, SystemClock())

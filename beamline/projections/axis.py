@@ -180,14 +180,16 @@ def locate_axis(
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     lit = np.flatnonzero(~band.masked.all(axis=0))  # what slits hide is filled, and its noise has a long lever
-    first, last = (int(lit[0]), int(lit[-1]) + 1) if lit.size else (0, band.data.shape[2])
+    angles = source.angles[band.view_ids]
     try:
-        estimate = find_axis(band.data[..., first:last], source.angles[band.view_ids])
+        estimate = find_axis(band.data[..., lit[0] : lit[-1] + 1], angles)
+        estimate = replace(estimate, value=estimate.value + lit[0], candidates=estimate.candidates + lit[0])
+        if lit.size < band.data.shape[2] and not estimate.confident:
+            estimate = find_axis(band.data, angles)
     except ValueError as error:
         raise _not_found(source, error) from error
-    estimate = replace(estimate, value=estimate.value + first, candidates=estimate.candidates + first)
     if all_there and not estimate.confident and source.axis_col is None and estimate.method != ENDS:
-        estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
+        estimate = _by_unseen_views(band, angles) or estimate
     axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
         return axis_col, estimate

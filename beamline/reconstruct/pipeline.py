@@ -127,9 +127,9 @@ def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> Sc
     """Wait until the file exists and is readable."""
     with suppress(NotReadyError):
         return options.source.open(follow=True)
-    path, clock = Path(options.source.path), channels.clock
-    channels.sink(StateEntered("waiting", f"Waiting for {path}", time=clock.now()))
-    return awaited(lambda: options.source.open(follow=True), path, clock, timing.patience, timing.poll)
+    path = Path(options.source.path)
+    channels.sink(StateEntered("waiting", f"Waiting for {path}", time=channels.clock.now()))
+    return awaited(lambda: options.source.open(follow=True), path, channels.clock, timing.patience, timing.poll)
 
 
 def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:

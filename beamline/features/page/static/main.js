@@ -225,7 +225,7 @@ function onRun(event) {
     case "run_started": planned = data.n_frames; log(data, `Scan of ${data.sample}: ${data.n_frames} frames planned`); break;
     case "state": if (!live) { state = data.state; $("message").textContent = data.message; $("said").textContent = ""; } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
     case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
-    case "flag": advice.push(data); log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning", data.frame); break;
+    case "flag": advice.push(data); logFlag(data); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
@@ -246,6 +246,18 @@ function point(line, x, y) {
 }
 
 /** A line of the log; of a flag it leads to its frame. */
+const findings = {};
+/** A finding of several frames that goes on, such as a crumb that crosses the field, is one line with their number. */
+function logFlag(data) {
+  const before = findings[data.check], own = data.first ?? data.frame;
+  const goesOn = before && data.first != null && data.level === before.level && own <= before.frame + 1;
+  if (goesOn) before.item.remove();
+  const first = goesOn ? Math.min(own, before.first) : own;
+  const where = first === data.frame ? `frame ${first}` : `${data.frame - first + 1} frames, ${first} to ${data.frame}`;
+  const item = log(data, `${data.check} (${data.level}), ${where}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning", data.frame);
+  findings[data.check] = { first, frame: data.frame, level: data.level, item };
+}
+
 function log(data, text, kind = "", at = null) {
   const item = element("li", "", kind), time = element("time", new Date(1000 * data.time).toLocaleTimeString());
   item.append(time, element("span", text));
@@ -257,6 +269,7 @@ function log(data, text, kind = "", at = null) {
   }
   $("log").prepend(item);
   while ($("log").children.length > 300) $("log").lastChild.remove();
+  return item;
 }
 
 let fetched = 0, flagsFetched = 0;

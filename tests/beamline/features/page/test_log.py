@@ -1,0 +1,31 @@
+"""The page's log in JavaScript: a finding of several frames is one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from importlib.resources import files
+
+import pytest
+
+RUN = """
+const lines = [], log = (data, text) => { const item = { text, remove: () => lines.splice(lines.indexOf(item), 1) }; lines.push(item); return item; };
+const logFlag = new Function("log", FUNCTION + "; return logFlag")(log);
+for (const [check, level, first, frame] of FLAGS) logFlag({ check, level, first, frame, advice: "x" });
+console.log(JSON.stringify(lines.map((line) => line.text)));
+"""  # noqa: E501
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_a_crumb_is_one_line_with_its_number_of_frames() -> None:
+    script = (files("beamline.features.page") / "static" / "main.js").read_text("utf-8")
+    function = script[script.index("const findings") : script.index("function log(data")]
+    flags = [("floater", "warn", 43, 60), ("floater", "warn", 61, 62), ("mass", "warn", None, 5)]
+    flags += [("mass", "warn", None, 6), ("floater", "warn", 63, 80), ("floater", "warn", 111, 120)]
+    code = RUN.replace("FUNCTION", json.dumps(function)).replace("FLAGS", json.dumps(flags))
+    done = subprocess.run(["node", "-e", code], capture_output=True, text=True, check=True, timeout=60)
+    assert json.loads(done.stdout) == [
+        "mass (warn), frame 5: x", "mass (warn), frame 6: x", "floater (warn), 38 frames, 43 to 80: x",
+        "floater (warn), 10 frames, 111 to 120: x",
+    ]  # fmt: skip
