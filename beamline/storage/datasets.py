@@ -35,11 +35,11 @@ WAVELENGTH_UNITS = {"angstrom": 1.0, "angstroms": 1.0, "å": 1.0, "a": 1.0, "nm"
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
 
 
+HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
+_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
-_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _PIECE = 2**31  # bytes of a chunk of frames
-HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 
 
