@@ -48,7 +48,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
-        items = ((kind, where, datasets.dataset(file, where, (order or _USUAL)[0])) for kind, where in PLACES)
+        items = ((kind, where, datasets.dataset(file, where, order[0] if order else 0)) for kind, where in PLACES)
         stacks = [
             FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
             for kind, where, item in items
