@@ -69,7 +69,8 @@ scan_options = together(
     option(
         "--frames",
         metavar="KINDS",
-        help="Kinds of frames, overriding names and keys of the file: darks=0:5,flats=5:10+95:100. Others are views.",
+        help="Kinds of frames, overriding names and keys of the file: darks=0:5,flats=5:10+95:100. Others are views. "
+        "0::2 or 1::2: every second view, with its darks and flats, where two exposures or thresholds alternate.",
     ),
     option(
         "--then",

@@ -37,11 +37,11 @@ def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
     return units.get(name, units.get(name[:-1]) if name.endswith("s") and len(name) > 3 else None)
 
 
+HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
+_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
-_CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _PIECE = 2**31  # bytes of a chunk of frames
-HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one by one unpack each piece once
 NAME = 1000  # letters of a name or a title
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 

@@ -13,16 +13,12 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import Attributes, Quantity, ScanSource, frame_indices, read_known
 from beamline.storage.readers.frames import BY_FRAME, Frames, Read
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.readers.supplied import assign
 from drivers.base.frame import FrameKind
 
 
 def overlaid(
     base: ScanSource,
     *,
-    angles: NDArray[np.float64] | None = None,
-    angles_from: str = "",
-    of_views: bool = False,
     darks: NDArray[Any] | None = None,
     flats: NDArray[Any] | None = None,
     quantity: Quantity | None = None,
@@ -33,8 +29,6 @@ def overlaid(
     all parts of the scan. All frames have one dtype, as of one camera.
 
     Args:
-        angles: radians, for `base` (see `supplied.assign`); `angles_from` names them in errors.
-        of_views: the angles are those of projections alone.
         darks, flats: [frame, row, col].
 
     Raises:
@@ -49,12 +43,10 @@ def overlaid(
             )
     if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
         quantity = quantity or "counts"
-    own: dict[str, Any] = {} if angles is None else {"angles": assign(base, angles, angles_from, of_views=of_views)}
     base = Frames(
         base,
         quantity=quantity or base.quantity,
         image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
-        **own,
     )
     if not given:
         return base

@@ -124,11 +124,12 @@ def _later_flats(file: h5py.File, n: int) -> int | None:
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Radians of each of so many frames; None where the file has no such list."""
+    """Radians of each of so many frames, in the unit of the views where it states none; None without such a list."""
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
-    angles = datasets.radians(item, default="degrees")
+    of_views = datasets.attribute(file["exchange"].get("theta", item), "units")
+    angles = datasets.radians(item, default=of_views if of_views.lower() in datasets.ANGLE_UNITS else "degrees")
     return angles if np.isfinite(angles).all() else None
 
 

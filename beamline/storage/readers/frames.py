@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -93,26 +93,22 @@ def _column(each: Sequence[NDArray[Any] | None], sizes: _Sizes) -> NDArray[Any] 
 def _replaced(each: Sequence[NDArray[np.int64] | None], sizes: _Sizes) -> NDArray[np.int64] | None:
     if all(rows is None for rows in each):
         return None
-    firsts = np.cumsum(sizes) - sizes
     filled = [np.full(n, -1) if rows is None else rows for rows, n in zip(each, sizes, strict=True)]
-    return np.concatenate([np.where(rows < 0, -1, rows + first) for rows, first in zip(filled, firsts, strict=True)])
+    return np.concatenate([np.where(rows < 0, -1, rows + n) for rows, n in _after(filled, sizes)])
 
 
-def _starts(each: Sequence[NDArray[np.int64]], sizes: _Sizes) -> NDArray[np.int64]:
-    return np.concatenate([rows + first for rows, first in zip(each, np.cumsum(sizes) - sizes, strict=True)])
-
-
-def _rows(each: Sequence[frozenset[int]], sizes: _Sizes) -> frozenset[int]:
-    firsts = (np.cumsum(sizes) - sizes).tolist()
-    return frozenset(row + first for rows, first in zip(each, firsts, strict=True) for row in rows)
+def _after(each: Sequence[Any], sizes: _Sizes) -> Iterator[tuple[Any, int]]:
+    """With the number of frames before each source."""
+    return zip(each, (np.cumsum(sizes) - sizes).tolist(), strict=True)
 
 
 _JOINED: dict[str, Callable[[Any, _Sizes], Any]] = {
     **dict.fromkeys((*_OF_FRAMES, "triggers", "framestamps"), _column),
     "replaces": _replaced,
-    "part_starts": _starts,
-    "altered": _rows,
-    "damaged": _rows,
+    "part_starts": lambda each, sizes: np.concatenate([rows + n for rows, n in _after(each, sizes)]),
+    **dict.fromkeys(
+        ("altered", "damaged"), lambda each, sizes: frozenset(r + n for s, n in _after(each, sizes) for r in s)
+    ),
     "flags": FrameFlags.joined,
     "checksummed": lambda each, sizes: all(each),
 }

@@ -18,18 +18,29 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.changed import AveragedSource, angles_of_frames, overlaid, stated_frames_per_view
+from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, sided
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
-from beamline.storage.readers.supplied import Angles, Images, load_angles, load_images, parse_angles, select_rows
+from beamline.storage.readers.supplied import (
+    Angles,
+    Images,
+    assign,
+    load_angles,
+    load_images,
+    parse_angles,
+    select_rows,
+)
 from beamline.storage.readers.wrapped import (
     UNPACKED,
     as_unsigned,
     cropped,
     in_parts,
     keyed,
+    parted,
+    selected,
     turned,
     type_wrapped,
 )
@@ -87,7 +98,7 @@ class SourceOptions:
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds.
+            files in a folder then say no kinds. "0::2": every second view, as `wrapped.selected` says.
         then: further files of the same scan, whose frames follow.
         side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
@@ -149,7 +160,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
 def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
-    opening = Opening(follow, options.angles is None and options.angles_path is None, options.frames is not None)
+    kinds, _ = parted(options.frames)
+    opening = Opening(follow, options.angles is None and options.angles_path is None, kinds is not None)
     with ExitStack() as opened:
 
         def file(path: Path) -> ScanSource:
@@ -163,8 +175,8 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
             base = in_parts([base, *map(file, options.then[:-1])], file(options.then[-1]), path)
         if options.earlier:
             base = in_parts([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
-        if options.frames is not None:
-            base = keyed(base, options.frames)
+        if kinds is not None:
+            base = keyed(base, kinds)
         opened.pop_all()
     return base
 
@@ -175,21 +187,23 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
         base = sided(base, side)
-    angle_table, angles_from = _angle_table(options, base, side)
+    n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
+    _, views = parted(options.frames)
+    angles, angles_from = _angle_table(options, base, side)
+    if angles is not None:
+        angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
+        base = Frames(base, angles=assign(base, angles, angles_from, of_views=options.angle_rows is not None))
+    if views is not None:
+        base = selected(base, views)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
         base = as_unsigned(base, dtype)
     darks, flats = _references(base, options, None if side is None else side.white)
     if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
         base, counts_photons = marked_source(base, no_data)
         darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
-    n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
-    angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
-    if any(given is not None for given in (angles_of_all, darks, flats, quantity)):
+    if any(given is not None for given in (angles, darks, flats, quantity)):
         base = overlaid(
             base,
-            angles=angles_of_all,
-            angles_from=angles_from,
-            of_views=options.angle_rows is not None,
             darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
             flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
             quantity="counts" if quantity == "transmission" else quantity,

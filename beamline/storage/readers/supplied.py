@@ -259,7 +259,7 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
     return (item for item in datasets.images_in(file) if min(item.shape[-2:]) > 1)
 
 
-def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) -> NDArray[Any]:
+def _read(path: Path, item: h5py.Dataset) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
         raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
     if item.ndim not in (2, 3):
@@ -267,9 +267,8 @@ def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) 
     if item.ndim == 2:
         return _stack(item[()], f"{item.name} in {path}")
     datasets.require_possible(item)
-    rows = np.arange(len(item)) if rows is None else rows
-    out = np.empty((rows.size, *item.shape[1:]), item.dtype)
-    datasets.read_frames(item, rows.astype(np.int64), slice(None), out)
+    out = np.empty(item.shape, item.dtype)
+    datasets.read_frames(item, np.arange(len(item)), slice(None), out)
     return _stack(out, f"{item.name} in {path}")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.readers.base import ScanSource, TakesTooLongError, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanSource, TakesTooLongError, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
 
@@ -109,6 +109,36 @@ def keyed(base: ScanSource, kinds: str) -> ScanSource:
     return Frames(base, image_key=keys, **own)
 
 
+def parted(frames: str | None) -> tuple[str | None, slice | None]:
+    """The kinds and the views that --frames names, such as "darks=0:5,flats=5:10" and 0::2; None: it names none."""
+    words = [] if frames is None else frames.split(",")
+    matches = [_VIEWS.fullmatch(word) for word in words]
+    taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]
+    if len(taken) != 1:
+        return frames, None
+    return ",".join(word for word, match in zip(words, matches, strict=True) if not match) or None, taken[0]
+
+
+def selected(base: ScanSource, views: slice) -> ScanSource:
+    """Some views of a scan, counted from 0 without darks and flats; the others are invalid frames.
+
+    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the views were, so that
+    those of the same turn are selected, counted from 0, too. Else all of them are.
+
+    Raises:
+        DataError: no view is left.
+    """
+    keys, n = base.image_key.copy(), int((base.image_key == FrameKind.PROJECTION).sum())
+    first, end, step = views.indices(n)
+    if first >= end:
+        raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
+    for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
+        rows = np.flatnonzero(keys == kind)
+        in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
+        keys[np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn)] = FrameKind.INVALID
+    return Frames(base, image_key=keys)
+
+
 def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
     """The kind of each of n frames by what the caller says."""
     stated, named = np.full(n, -1), _ranges(kinds, n)
@@ -153,6 +183,7 @@ def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
 _ENERGY = "energy="
 _SAME_ENERGY = 1e-4  # as a monochromator repeats one
 _LISTED = 6  # energies in a sentence
+_VIEWS = re.compile(r"\s*(-?\d{1,9})?:(-?\d{1,9})?(?::([1-9]\d{0,8})?)?\s*")  # a slice of Python
 _KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
 
 
@@ -167,7 +198,8 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
             if name not in _KINDS or not first < end <= n:
                 raise DataError(
                     f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
-                    "such as darks=0:5,flats=5:10+95:100. Frames are counted from 0 in the order of the scan."
+                    "such as darks=0:5,flats=5:10+95:100, frames counted from 0 in the order of the scan, or 0::2 for "
+                    "every second view."
                 )
             ranges.append((_KINDS[name], first, end))
     return ranges

@@ -56,6 +56,42 @@ def test_ranges_that_cannot_be_are_refused(series: Path, frames: str, message: s
         open_scan(SourceOptions(series, frames=frames))
 
 
+@pytest.mark.parametrize(
+    ("frames", "taken"),
+    [
+        ("0::2", [0, 2, 4, 6, 8, 9, 10, 12, 14, 15]),
+        ("1::2", [1, 3, 5, 7, 8, 10, 11, 13, 15]),
+        ("2:4", [0, 1, 2, 3, 6, 7, 8, 10, 15]),
+        ("darks=0:2, flats=2:4, 0::2", [0, 2, 4, 6, 8, 10, 12, 14]),
+        ("-1:, darks=0:3", [0, 1, 2, 15]),
+    ],
+)
+def test_views_are_selected_in_turn_with_their_references(tmp_path: Path, frames: str, taken: list[int]) -> None:
+    """Four darks alternate as the views do; three flats, between which views are counted on, cannot."""
+    key = np.r_[[2] * 4, [0] * 4, 1, 0, 1, [0] * 4, 1]
+    pixels = np.arange(16, dtype=np.uint16)[:, None, None] * np.ones(SHAPE, np.uint16)
+    path = write_nxtomo(tmp_path / "s.nxs", pixels, key.tolist(), 10.0 * np.arange(16))
+    with open_scan(SourceOptions(path, frames=frames)) as source:
+        assert np.flatnonzero(source.image_key != NONE).tolist() == taken
+        np.testing.assert_array_equal(source.read([3, 9])[:, 0, 0], [3, 9])
+
+
+def test_angles_are_those_of_all_views_or_of_the_selected_ones(series: Path) -> None:
+    kinds = "darks=0:1,flats=1:2,1::2"
+    for angles in (np.arange(8.0), np.arange(8)[1::2]):
+        with open_scan(SourceOptions(series, frames=kinds, angles=angles)) as source:
+            views = source.image_key == VIEW
+            assert source.read(np.flatnonzero(views))[:, 0, 0].tolist() == [3, 5, 7, 9]
+            np.testing.assert_allclose(source.angles[views], [1, 3, 5, 7])
+    with pytest.raises(DataError, match=r"selects no view: .* has 8"):
+        open_scan(SourceOptions(series, frames="darks=0:1,flats=1:2,8:", angles=np.arange(8.0)))
+
+
+def test_names_of_files_say_kinds_where_views_alone_are_selected(series: Path) -> None:
+    with open_scan(SourceOptions(series, frames="0::2", angles=np.arange(4.0))) as source:
+        assert [int((source.image_key == kind).sum()) for kind in (DARK, VIEW)] == [3, 2]
+
+
 def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
     """Darks, flats and two halves of the views in files of their own, as Diamond and others write them."""
     paths = []
