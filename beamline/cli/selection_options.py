@@ -45,7 +45,7 @@ scan_options = together(
         "--darks",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file.",
+        help="TIFF, folder of TIFFs, HDF5 file (FILE::DATASET), or counts of every pixel, for darks of the file.",
     ),
     option(
         "--flats",

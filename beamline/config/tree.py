@@ -69,9 +69,12 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     except yaml.MarkedYAMLError as error:
         colon = error.problem is not None and "expected ':'" in error.problem  # which is missed at the next line
         mark = (error.context_mark if colon else None) or error.problem_mark or error.context_mark
-        where = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
+        line, col = (mark.line, mark.column) if mark else (0, 0)
+        *_, before, here = ["", "", *text.split("\n")][: line + 3]
+        above = line > 0 and "mapping values" in str(error.problem) and ":" not in before + here[:col]
+        where = f"{name}:{line + 1 - above}" if mark and "\n" in text else name
         what = ", ".join(part for part in (error.context, error.problem) if part)
-        what = "a colon is missing after a key" if colon else what
+        what = "a colon is missing after a key" if colon or above else what
         raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         what = " ".join(str(error).split()) or type(error).__name__

@@ -209,10 +209,14 @@ def text_in(path: Path, largest: int = TEXT) -> str:
         ) from error
 
 
-def decoded(content: bytes) -> str:
-    """Text with \n for any end of line, by its byte-order mark where it has one. UnicodeDecodeError for other text."""
+def decoded(content: bytes, errors: str = "strict") -> str:
+    """Text with \n for any end of line, by its byte-order mark where it has one.
+
+    Args:
+        errors: "replace" what is no text; "strict": UnicodeDecodeError.
+    """
     utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return content.decode("utf-16" if utf16 else "utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    return content.decode("utf-16" if utf16 else "utf-8-sig", errors).replace("\r\n", "\n").replace("\r", "\n")
 
 
 def broken_link(path: Path) -> str:

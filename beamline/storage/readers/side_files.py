@@ -199,13 +199,9 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str:
-    """The content of a small file, also where a program of Windows wrote its own characters."""
+    """The content of a small file; its numbers and keys also where a program of Windows wrote its own characters."""
     require_regular(path, SETTINGS)
-    content = path.read_bytes()
-    try:
-        return decoded(content)
-    except UnicodeDecodeError:
-        return content.decode("cp1252", "replace")
+    return decoded(path.read_bytes(), "replace")
 
 
 def _of_element(element: ElementTree.Element, path: str, values: dict[str, str]) -> None:

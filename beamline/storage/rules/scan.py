@@ -24,6 +24,7 @@ from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 from recon.base.views import spread
 
+CONSTANT = "constant-darks"  # a rule whose finding is no fault, and told by `info`
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
 TURNED = 12  # views by which the direction of the axis is told
@@ -95,6 +96,18 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
                 f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
                 "say --quantity transmission, or line-integrals where their logarithm was taken.",
             )
+
+
+def darks_measured(source: ScanSource) -> Iterator[Finding]:
+    """Darks are images of the camera: no two of its pixels read the same without light."""
+    darks = _sample(source, FrameKind.DARK) if source.dtype.kind in "ui" else None
+    if darks is not None and darks.min() == darks.max():
+        yield Finding(
+            "info",
+            CONSTANT,
+            f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
+            "light. If its darks were taken, give them with --darks.",
+        )
 
 
 def pixels_measured(source: ScanSource) -> Iterator[Finding]:
@@ -338,6 +351,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_shown,
     quantity_stated,
     references_present,
+    darks_measured,
     exposures_agree,
     one_energy,
     pixels_measured,

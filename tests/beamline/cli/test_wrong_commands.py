@@ -27,6 +27,21 @@ CASES = {
 }
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "what"),
+    [
+        ("camera:\n  driver simulated\n  exposure_s: 0.1\n", 2, "a colon is missing"),
+        ("# mine\ncamera\n  driver: simulated\n", 2, "a colon is missing"),
+        ("# mine\nperiod_s: 1: 2\n", 2, "mapping values"),
+        ("views: 3\n  period_s: 1\n", 2, "mapping values"),
+    ],
+)
+def test_the_line_without_a_colon_is_named(folder: Path, text: str, line: int, what: str) -> None:
+    (folder / "bad.yaml").write_text(text)
+    result = beamline("check", "bad.yaml")
+    assert f"bad.yaml:{line}: this is not YAML ({what}" in " ".join(result.stderr.split())
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_sentence_names_what_it_is_and_what_to_type(case: str, folder: Path) -> None:
     arguments, code, expected = CASES[case]

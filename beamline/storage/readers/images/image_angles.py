@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.text import are_a_count
 
 _NUMBER = re.compile(
-    r"(?P<word>(?<![a-z])(?:angle|theta|ang|deg|tilt)(?:[ _=(]|-(?=[-+\u2212]))?)?"
+    r"(?P<word>(?<![a-z])(?:angle|theta|ang|deg)(?:[ _=(]|-(?=[-+\u2212]))?)?"
     r"(?P<mark>(?:minus|plus|neg|pos)[ _]?|[-+\u2013\u2212mnp])?"  # a hyphen, an en dash, a minus
     r"(?P<value>(?P<whole>\d+)(?:[.,p](?P<part>\d+))?(?:e[-+]\d+)?)"
     r"(?P<unit>[ _]?(?:deg|°|tilt))?",
@@ -44,9 +44,9 @@ class NamedAngles(NamedTuple):
 
 
 def angles_in(names: Sequence[str]) -> NamedAngles:
-    """Angles as a number beside `angle`, `theta`, `ang`, `tilt` or `deg`; as the one number that has a minus in some
-    names and none in others; or as three digits of degrees and three of thousandths before the number of the frame
-    (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
+    """Angles as a number beside `angle`, `theta`, `ang` or `deg`, or before `tilt`; as the one number that has a minus
+    in some names and none in others; or as three digits of degrees and three of thousandths before the number of the
+    frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
 
     Decimals follow a point, a comma or p; n, m, neg and minus are signs as a hyphen is.
     """
@@ -63,13 +63,10 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
         return NamedAngles([*names])
     distinct = np.unique(degrees)
     others = [[each["value"] for each in row if each is not its] for row, its in zip(numbers, chosen, strict=True)]
-    if (
-        words
-        and are_a_count([each["value"] for each in chosen])
-        and any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
-    ):
-        doubt = "the number beside the word counts the images, and another does not"
-    elif not words and chosen[0].re is _NUMBER and (distinct[-1] > _TURN or not in_even_steps(distinct)):
+    another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
+    if words and are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3):
+        doubt = "the number beside the word counts the images"
+    elif not words and chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not in_even_steps(distinct)):
         doubt = doubt or "the numbers that have signs are in no even steps within a turn"
     elif distinct.size < _DISTINCT * degrees.size:
         doubt = doubt or f"{degrees.size} names give {distinct.size} angles alone; are signs or decimals lost?"

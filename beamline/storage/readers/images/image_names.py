@@ -24,12 +24,6 @@ COUNTED = 100  # range of the numbers over the count of files; above it the numb
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
 
 
-def kind_of(name: str) -> FrameKind:
-    """The kind of image by a file's name relative to the scan's folder; the name itself takes precedence over
-    folders."""
-    return _by(_REFERENCE, name)
-
-
 def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
     called.
@@ -42,7 +36,7 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
         DataError: no series can be told to be the projections.
     """
     within = _without_common_folder(names)
-    kinds = {name: kind_of(short) for name, short in zip(names, within, strict=True)}
+    kinds = {name: _by(_REFERENCE, short) for name, short in zip(names, within, strict=True)}
     if not names:
         return kinds
     kinds |= {
@@ -80,6 +74,7 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
 
 
 def _by(words: re.Pattern[str], name: str) -> FrameKind:
+    """The kind of image by a file's name relative to the scan's folder, which takes precedence over its folders."""
     for part in reversed(name.lower().split("/")):
         match = words.search(part)
         if match is not None:
@@ -205,12 +200,8 @@ def two_orders(names: Sequence[str]) -> bool:
     digits = [re.findall(r"\d+", name) for name in names]
     if len({len(each) for each in digits}) != 1:
         return False
-    orders = set()
-    for column in zip(*digits, strict=True):
-        numbers = np.array([int(each[-18:]) for each in column], np.int64)
-        if in_even_steps(np.sort(numbers)):
-            orders.add(tuple(np.argsort(numbers)))
-    return len(orders) > 1
+    columns = [np.array([int(each[-18:]) for each in column], np.int64) for column in zip(*digits, strict=True)]
+    return len({tuple(np.argsort(column)) for column in columns if in_even_steps(np.sort(column))}) > 1
 
 
 def _several_series(path: object, names: Sequence[str]) -> str:

@@ -179,11 +179,7 @@ class TiffSeriesSource(ScanSource):
         return images
 
     def _text(self, name: str) -> str:
-        content = self._bytes(name, TEXT)
-        try:
-            return decoded(content)
-        except UnicodeDecodeError:
-            return content.decode("utf-8", "replace")  # a comment in another alphabet; numbers are told later
+        return decoded(self._bytes(name, TEXT), "replace")  # a comment in another alphabet; numbers are told later
 
     def _image(self, name: str) -> NDArray[Any]:
         content = self._bytes(name, LARGEST_IMAGE)

@@ -248,3 +248,13 @@ def test_what_is_no_images_is_refused(tmp_path: Path) -> None:
         file.create_virtual_dataset("data", drawn)
     with pytest.raises(DataError, match=r"gone\.h5"):
         load_images(tmp_path / "v.h5", FrameKind.DARK)
+
+
+def test_a_number_stands_for_darks_of_every_pixel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    darks = load_images("300", FrameKind.DARK, (2, 3))
+    assert (darks.tolist(), darks.dtype) == ([[[300] * 3] * 2], np.uint16)
+    tifffile.imwrite("300", np.full((2, 3), 7, np.uint16))
+    assert load_images("300", FrameKind.DARK, (2, 3)).max() == 7
+    with pytest.raises(DataError, match="cannot be read"):
+        load_images("301.5", FrameKind.DARK, (2, 3))

@@ -56,6 +56,20 @@ def test_a_good_scan_has_no_finding(path: Path) -> None:
     assert validate(path) == []
 
 
+@pytest.mark.parametrize("level", [0, 100])
+def test_darks_of_one_number_are_named(tmp_path: Path, level: int) -> None:
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        for name, n in (("data", 4), ("data_white", 3), ("data_dark", 3)):
+            file[f"exchange/{name}"] = np.random.default_rng(n).integers(900, 999, (n, 8, 9)).astype(np.uint16)
+        file["exchange/theta"] = np.arange(4) * 45.0
+    with h5py.File(tmp_path / "s.h5", "a") as file:
+        file["exchange/data_dark"][:, :, :8] = level
+    assert "The darks are" not in "; ".join(describe(tmp_path / "s.h5")["findings"])
+    with h5py.File(tmp_path / "s.h5", "a") as file:
+        file["exchange/data_dark"][:] = level
+    assert f"The darks are {level} in every pixel" in "; ".join(describe(tmp_path / "s.h5")["findings"])
+
+
 def test_exposures_that_do_not_go_together_are_told(write: Write, frames: list[Frame]) -> None:
     def told(seconds: dict[FrameKind, float], last: float = 0.05) -> list[str]:
         changed = [replace(frame, exposure=seconds.get(frame.kind, 0.05)) for frame in frames]
