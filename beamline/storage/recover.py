@@ -254,7 +254,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
             require_harmless(file)
             _require_ours(path, file)
             committed, frames = int(file[layout.COMMITTED][()]), _rows_readable(file)
-            if not frames or not head.open_for_writing:
+            if not frames:
                 raise damage
             say(
                 f"{path} cannot be mended in place: its frames are copied to a new file of about {size(head.size)}; "
