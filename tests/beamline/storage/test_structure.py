@@ -220,7 +220,8 @@ def test_pages_without_end_and_images_without_pixels(tmp_path: Path, monkeypatch
     monkeypatch.setattr(tiff, "_MOST_PAGES", 50)
     path = tmp_path / "s.tif"
     path.write_bytes(_pages(50))
-    assert open_scan(path).image_key.size == 50
+    with open_scan(path) as source:
+        assert source.image_key.size == 50
     for content in (_pages(51), _pages(20, 5)):
         path.write_bytes(content)
         with pytest.raises(DataError, match="more than 50 pages"):
