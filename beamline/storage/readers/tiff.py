@@ -17,6 +17,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import require_regular
 from beamline.storage.hdf5 import ALTERED
 from beamline.storage.structure import PACKED, is_blank
 
@@ -57,6 +58,8 @@ def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
     """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if it claims more bytes than allowed, or
     than it can contain.
     """
+    if isinstance(file, Path):
+        require_regular(file)
     with tifffile.TiffFile(file) as tif:
         refuse_packed(tif)
         require_possible(tif, most)

@@ -20,8 +20,9 @@ from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers import tiff
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.supplied import load_images
 from beamline.storage.volume_file import read_volume
-from drivers.base.frame import Frame
+from drivers.base.frame import Frame, FrameKind
 
 PIPES = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 
@@ -205,6 +206,9 @@ def test_a_pipe_in_a_folder_or_by_its_name(tmp_path: Path) -> None:
     for read in (read_volume, open_hdf5):
         with pytest.raises(DataError, match="a device or a pipe"):
             read(tmp_path / "p_003.tif")
+    for place in (tmp_path, tmp_path / "p_003.tif"):
+        with pytest.raises(DataError, match="a device or a pipe"):
+            load_images(place, FrameKind.DARK, (8, 8))
 
 
 def _pages(n: int, after_the_last: int = 0) -> bytes:
