@@ -83,8 +83,7 @@ class ShownScan:
 
     def __init__(self, source: ScanSource) -> None:
         self._source, self._views = source, _OverFlats(source)
-        degrees = np.degrees(source.angles[self._views.frames])
-        self._degrees = np.where(np.isfinite(degrees), degrees, np.nan)
+        self._degrees = np.degrees(source.angles[self._views.frames])
         record = bare_record(source.path, self._views)
         self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
         self._correction: ScanCorrection | None = None

@@ -249,7 +249,7 @@ def _numbers(item: h5py.Dataset, read: Callable[[h5py.Dataset], Any]) -> tuple[N
 
 
 def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians; a column becomes a list.
+    """Angles in radians, NaN for those that are not finite; a column becomes a list.
 
     Args:
         unit: whatever the file says; None: what its attribute `units` and its text say, or `default` if they do not.
@@ -259,9 +259,7 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item, values_of)
     if angles is None:
-        raise DataError(
-            f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected numbers. Give --angles FILE."
-        )
+        raise DataError(f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected whole or real numbers.")
     unit = unit or " and ".join(sorted(stated)) or default
     factor = factor_of(unit, ANGLE_UNITS)
     if factor is None:
@@ -269,7 +267,7 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
             f"{where} has {f'the units {unit!r}' if unit else 'no units attribute'}; expected degrees or radians. Set "
             "the attribute, or give --angles FILE (degrees, one a line)."
         )
-    return angles * factor
+    return np.where(np.isfinite(angles), angles * factor, np.nan)
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:

@@ -155,9 +155,11 @@ def _of_others(path: Path, head: Superblock) -> Overlay | None:
                 f"{path} is of another program and can be read as it is. `h5clear -s {path}` clears its mark, once its "
                 "writer has surely ended. Nothing was changed."
             )
-        for item in _datasets_in(file):
-            if item.shape and len(item) and not _reads(item, len(item) - 1):
-                raise DataError(f"{path} is damaged: the end of {item.name} cannot be read. Nothing was changed.")
+        torn = [
+            item.name for item in _datasets_in(file) if item.shape and len(item) and not _reads(item, len(item) - 1)
+        ]
+        if torn:
+            raise DataError(f"{path} is damaged: the end of {torn[0]} cannot be read. Nothing was changed.")
         return overlay
     return None
 
@@ -254,7 +256,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
             require_harmless(file)
             _require_ours(path, file)
             committed, frames = int(file[layout.COMMITTED][()]), _rows_readable(file)
-            if not frames or not head.open_for_writing:
+            if not frames:
                 raise damage
             say(
                 f"{path} cannot be mended in place: its frames are copied to a new file of about {size(head.size)}; "

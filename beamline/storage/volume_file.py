@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.core.files import RECON, no_file, require_regular
+from beamline.core.files import RECON, no_file, refuse_instead, require_regular
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
@@ -47,6 +47,7 @@ def read_volume(
         return _from_folder(path), None
     if not path.is_file():
         raise DataError(no_file(path))
+    refuse_instead(path)
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)

@@ -310,15 +310,11 @@ class NXtomoSource(ScanSource):
             return self._mirrored(frame_indices(frames, self.n), range(self.shape[0])[rows], *self._geometry.mirrored)
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         out = np.empty((indices.size, height, self.shape[1]), self.dtype)
-        compared = 2 * height >= self.shape[0] and self.checksummed
-        if compared and height < self.shape[0]:
-            for view, row in zip(out, indices, strict=True):
-                view[:] = self._compared(row, self._whole(row))[rows]
+        if 2 * height < self.shape[0] or not self.checksummed:
+            datasets.read_frames(self._places.data, indices, rows, out)
             return out
-        datasets.read_frames(self._places.data, indices, rows, out)
-        if compared:
-            for view, row in zip(out, indices, strict=True):
-                self._compared(row, view)
+        for view, row in zip(out, indices, strict=True):
+            view[:] = self._compared(row)[rows]
         return out
 
     def _mirrored(
@@ -330,15 +326,12 @@ class NXtomoSource(ScanSource):
         datasets.read_frames(self._places.data, indices, slice(first, end), block)
         return block[:, [row - first for row in kept], :: -1 if left_to_right else 1]
 
-    def _whole(self, row: int) -> NDArray[Any]:
+    def _compared(self, row: int) -> NDArray[Any]:
         whole = np.empty((1, *self.shape), self.dtype)
         datasets.read_frames(self._places.data, np.array([row]), WHOLE, whole)
-        return whole[0]
-
-    def _compared(self, row: int, image: NDArray[Any]) -> NDArray[Any]:
-        if not has_checksum(image, int(self._checksums[row])):
+        if not has_checksum(whole[0], int(self._checksums[row])):
             self._damaged.add(int(row))
-        return image
+        return whole[0]
 
     @property
     def checksummed(self) -> bool:

@@ -244,7 +244,8 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
             return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
-    return open_stacks(path, data, options.darks_path, options.flats_path, options.angles_path)
+    of_views = options.angles_path if options.angle_rows is None else None
+    return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
 
 
 def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:

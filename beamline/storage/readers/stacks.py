@@ -149,7 +149,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     Args:
         data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
             flats are in the same order.
-        angles: of their angles, whose number helps to tell which dimension is that of the views.
+        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the views.
 
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.

@@ -17,6 +17,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import require_regular
 from beamline.storage.hdf5 import ALTERED
 from beamline.storage.readers.base import NotUsed, Used
 from beamline.storage.structure import PACKED, is_blank
@@ -57,6 +58,8 @@ def is_hidden(name: str) -> bool:
 
 def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
     """A TIFF and the pages in it: where it is one of a set, its metadata list the pages of all files."""
+    if isinstance(file, Path):
+        require_regular(file)
     return tifffile.TiffFile(file, is_ome=False, is_mmstack=False, is_ndtiff=False)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
 from beamline.storage.superblock import block_size, lookup3, superblock
 from beamline.storage.writer_lock import QUIET, held
@@ -265,3 +266,75 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             anew += 1
         assert not recover(folder / "s.h5").changed
     assert anew  # ways that HDF5 cannot end such a file by
+
+
+def _died_elsewhere(path: Path, swmr: bool = False) -> Path:
+    """The file of another program that was killed while it wrote frames, a while ago."""
+    code = (
+        f"import h5py, os; f = h5py.File({str(path)!r}, 'w', libver='latest'); g = f.create_group('exchange'); "
+        f"d = g.create_dataset('data', (0, 4, 8), 'u2', maxshape=(None, 4, 8), chunks=(1, 4, 8)); "
+        f"g['theta'] = range(90); {'f.swmr_mode = True; ' if swmr else ''}"
+        "[(d.resize(i + 1, 0), d.__setitem__(i, i), d.flush()) "
+        "for i in range(60)]; f.flush(); os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=False)
+    return _aged(path)
+
+
+def test_the_mark_of_another_programs_writer_is_cleared_as_the_refusal_advises(tmp_path: Path) -> None:
+    died = _died_elsewhere(tmp_path / "d.h5")
+    before = died.read_bytes()
+    with pytest.raises(DataError, match=f"`beamline recover {re.escape(str(died))}` clears the mark"):
+        open_scan(died)
+    assert "can be read" in recover(died).in_words()
+    assert died.read_bytes()[48:] == before[48:]
+    with h5py.File(died) as file:
+        assert file["exchange/data"][:, 0, 0].tolist() == list(range(60))
+    with pytest.raises(DataError, match=r"90 angles for 60 .* --angles-path /exchange/theta --angle-rows 0:60"):
+        open_scan(died)
+    with open_scan(SourceOptions(died, angles_path="/exchange/theta", angles_unit="deg", angle_rows="0:60")) as source:
+        np.testing.assert_allclose(np.degrees(source.angles), np.arange(60))
+
+
+def test_a_file_of_another_program_that_may_grow_is_left_alone(tmp_path: Path) -> None:
+    died = _died_elsewhere(tmp_path / "d.h5", swmr=True)
+    before = died.read_bytes()
+    with pytest.raises(DataError, match=f"can be read as it is. `h5clear -s {re.escape(str(died))}`"):
+        recover(died)
+    assert died.read_bytes() == before
+
+
+@pytest.mark.parametrize("libver", ["earliest", "latest"])
+def test_of_a_cut_file_only_a_rescue_that_works_is_advised(
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], libver: str
+) -> None:
+    with h5py.File(tmp_path / "whole.h5", "w", libver=libver) as file:
+        file["exchange/data"] = np.zeros((3, 4, 8), "u2")
+    cut = tmp_path / "cut.h5"
+    cut.write_bytes((tmp_path / "whole.h5").read_bytes()[:-100])
+    with pytest.raises(DataError, match=r"the last 100 bytes are missing.* nothing else brings it back"):
+        open_scan(cut)
+    writer = _written(tmp_path / "s.h5", frames[:10], clock)
+    writer.close()
+    ours = tmp_path / "ours.h5"
+    ours.write_bytes((tmp_path / "s.h5").read_bytes()[:-100])
+    _aged(ours)
+    with pytest.raises(DataError, match=r"`beamline recover .*` rescues its frames"):
+        open_scan(ours)
+    assert recover(ours).frames
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is empty"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 3\n", "`git lfs pull`"),
+        (b"\x1f\x8b\x08\x00abc", "`gunzip`"),
+        (b"<!DOCTYPE html><html><body>Sign in</body></html>", "download the file again"),
+    ],
+)
+@pytest.mark.parametrize("name", ["s.h5", "s.tif"])
+def test_what_stands_in_the_place_of_a_scan_is_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(DataError, match=said):
+        open_scan(tmp_path / name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -16,9 +17,12 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.storage import datasets, structure
 from beamline.storage.hdf5 import open_hdf5
+from beamline.storage.readers import tiff
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
-from drivers.base.frame import Frame
+from beamline.storage.readers.supplied import load_images
+from beamline.storage.volume_file import read_volume
+from drivers.base.frame import Frame, FrameKind
 
 PIPES = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 
@@ -121,3 +125,124 @@ def test_a_list_larger_than_any_scan_has(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=r"holds 0\.839 GB"):
             datasets.values_of(item)
         assert datasets.first_of(item) == 0
+
+
+def _drawn(name: str, where: str) -> Callable[[h5py.File, str], None]:
+    def draw(file: h5py.File, place: str) -> None:
+        layout = h5py.VirtualLayout((2, 8, 8), "u2")
+        layout[:] = h5py.VirtualSource(name, where, (2, 8, 8))
+        file.create_virtual_dataset(place, layout)
+
+    return draw
+
+
+@pytest.mark.parametrize(("name", "where"), [(".", "a"), ("a.h5", "a"), (".", "link"), ("b.h5", "a"), ("hard.h5", "a")])
+def test_a_virtual_dataset_that_draws_on_itself(tmp_path: Path, name: str, where: str) -> None:
+    """HDF5 crashes where it is read."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        _drawn(name, where)(file, "a")
+        file["link"] = h5py.SoftLink("/a")
+    os.link(tmp_path / "a.h5", tmp_path / "hard.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        _drawn("a.h5", "a")(file, "a")
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["a"] = h5py.ExternalLink("b.h5", "/a")
+    for asked in ("a.h5", "b.h5", "c.h5"):
+        with pytest.raises(DataError, match="draws on itself"):
+            open_hdf5(tmp_path / asked)
+
+
+@pytest.mark.parametrize(("n", "opens"), [(6, True), (60, False)])
+def test_virtual_datasets_one_after_the_other(tmp_path: Path, n: int, opens: bool) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for k in range(n):
+            _drawn(".", f"d{k + 1}")(file, f"d{k}")
+        file[f"d{n}"] = np.ones((2, 8, 8), "u2")
+    if opens:
+        with open_hdf5(tmp_path / "a.h5") as file:
+            assert file["d0"][()].all()
+    else:
+        with pytest.raises(DataError, match="more than 8 others"):
+            open_hdf5(tmp_path / "a.h5")
+
+
+def test_a_percent_sign_in_the_name_of_a_source(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "part_50%.h5", "w") as file:
+        file["a%b"] = np.ones((2, 8, 8), "u2")
+    with h5py.File(tmp_path / "whole.h5", "w") as file:
+        _drawn("part_50%%.h5", "a%%b")(file, "data")
+        _drawn("gone_%%.h5", "a%%b")(file, "lost")
+    with open_hdf5(tmp_path / "whole.h5") as file:
+        assert datasets.missing_links(file["data"]) == [] and file["data"][()].all()
+        assert datasets.missing_links(file["lost"]) == [str(tmp_path / "gone_%.h5")]
+    with pytest.raises(DataError, match="numbered series"):
+        structure.plain_name("part_%b.h5")
+
+
+@pytest.mark.parametrize(("rows", "level", "opens"), [(1000, 9, False), (1000, 0, True), (100, 9, True)])
+def test_large_chunks_that_hold_no_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, level: int, opens: bool
+) -> None:
+    monkeypatch.setattr(structure, "CLAIMED", 1e6)
+    monkeypatch.setattr(structure, "_LARGE", 10**6)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset(
+            "data", data=np.zeros((1000, 1000), "u2"), chunks=(rows, 1000), compression="gzip", compression_opts=level
+        )
+    if opens:
+        open_hdf5(tmp_path / "a.h5").close()
+    else:
+        with pytest.raises(DataError, match=r"claims 0\.002 GB, but only"):
+            open_hdf5(tmp_path / "a.h5")
+
+
+@PIPES
+def test_a_pipe_in_a_folder_or_by_its_name(tmp_path: Path) -> None:
+    for n in range(3):
+        tifffile.imwrite(tmp_path / f"p_{n:03d}.tif", np.full((8, 8), n, np.uint16))
+    os.mkfifo(tmp_path / "p_003.tif")
+    with pytest.raises(DataError, match="a device or a pipe"):
+        read_volume(tmp_path)
+    for read in (read_volume, open_hdf5):
+        with pytest.raises(DataError, match="a device or a pipe"):
+            read(tmp_path / "p_003.tif")
+    for place in (tmp_path, tmp_path / "p_003.tif"):
+        with pytest.raises(DataError, match="a device or a pipe"):
+            load_images(place, FrameKind.DARK, (8, 8))
+
+
+def _pages(n: int, after_the_last: int = 0) -> bytes:
+    """A TIFF of so many pages of 4 x 4 pixels; the last leads to page `after_the_last`, if that is not 0."""
+    tags = (256, 4, 4), (257, 4, 4), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1), (278, 4, 4)
+    body = struct.pack("<H", 9) + b"".join(struct.pack("<HHII", t, kind, 1, v) for t, kind, v in (*tags, (279, 4, 32)))
+    places = [40 + (len(body) + 4) * k for k in range(n)]
+    following = [*places[1:], places[after_the_last] if after_the_last else 0]
+    return b"II*\0" + struct.pack("<I", 40) + bytes(32) + b"".join(body + struct.pack("<I", at) for at in following)
+
+
+def test_pages_without_end_and_images_without_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiff, "_MOST_PAGES", 50)
+    path = tmp_path / "s.tif"
+    path.write_bytes(_pages(50))
+    with open_scan(path) as source:
+        assert source.image_key.size == 50
+    for content in (_pages(51), _pages(20, 5)):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match="more than 50 pages"):
+            open_scan(path)
+        with pytest.raises(DataError, match="more than 50 pages"):
+            read_volume(path)
+    huge = _pages(1)
+    for tag in (257, 278):
+        huge = huge.replace(struct.pack("<HHII", tag, 4, 1, 4), struct.pack("<HHII", tag, 4, 1, 2**31 - 1))
+    path.write_bytes(huge)
+    with pytest.raises(DataError, match=r"claims 17\.2 GB in 154 bytes"):
+        open_scan(path)
+
+
+def test_a_zip_whose_image_is_blank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(structure, "_LARGE", 10**6)
+    with zipfile.ZipFile(tmp_path / "s.zip", "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("p_0.tif", bytes(2 * 10**6))
+    with pytest.raises(DataError, match="all alike"):
+        open_scan(tmp_path / "s.zip")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.scan import axis_vertical
 
 PATHS = {
     "data_path": "/raw/images",
@@ -122,3 +124,82 @@ def test_a_layout_that_is_not_known_says_what_the_file_has(path: Path) -> None:
     (path.parent / "s.txt").write_text("no")
     with pytest.raises(DataError, match="HDF5"):
         open_scan(SourceOptions(path.parent / "s.txt", **PATHS))
+
+
+ORDERS = {"view,row,col": (0, 1, 2), "view,col,row": (0, 2, 1), "row,view,col": (1, 0, 2), "row,col,view": (1, 2, 0),
+          "col,view,row": (2, 0, 1), "col,row,view": (2, 1, 0)}  # fmt: skip
+
+
+def _stored(path: Path, images: np.ndarray, order: tuple[int, ...], matlab: bool, one: bool = False) -> Path:
+    """Projections, darks and flats whose dimensions are in this order; `one`: a single dark and flat."""
+    with h5py.File(path, "w") as file:
+        for name, part in (("images", images[5:]), ("dark", images[:2]), ("flat", images[2:5])):
+            file[name] = (
+                part[0].transpose([n - 1 for n in order if n]) if one and name != "images" else part.transpose(order)
+            )
+            if matlab:
+                file[name].attrs["MATLAB_class"] = np.bytes_("uint16")
+        file["omega"] = np.linspace(0, 180, 5)[None]
+    return path
+
+
+def _options(path: Path, dimensions: str = "") -> SourceOptions:
+    names = {"darks_path": "dark", "flats_path": "flat", "angles_path": "omega", "angles_unit": "deg"}
+    return SourceOptions(path, data_path=f"/images{dimensions}", **names)
+
+
+@pytest.mark.parametrize("one", [False, True])
+@pytest.mark.parametrize("dimensions", ORDERS)
+def test_dimensions_that_are_named(tmp_path: Path, images: np.ndarray, dimensions: str, one: bool) -> None:
+    path = _stored(tmp_path / "s.h5", images, ORDERS[dimensions], False, one)
+    with open_scan(_options(path, f":{dimensions}")) as source:
+        expected = images[[0, 2, 5, 6, 7, 8, 9]] if one else images
+        np.testing.assert_array_equal(source.read(slice(None)), expected)
+        np.testing.assert_array_equal(source.read([1], slice(1, 3)), expected[[1], 1:3])
+
+
+@pytest.mark.parametrize("one", [False, True])
+@pytest.mark.parametrize(
+    ("dimensions", "matlab"),
+    [
+        *(("view,row,col", False), ("row,view,col", False), ("row,col,view", False)),
+        *(("view,col,row", True), ("col,row,view", True)),  # (row, col, view) and (view, row, col) in MATLAB
+        ("row,view,col", True),  # sinograms (col, view, row)
+    ],
+)
+def test_dimensions_that_shapes_tell(
+    tmp_path: Path, images: np.ndarray, dimensions: str, matlab: bool, one: bool
+) -> None:
+    with open_scan(_options(_stored(tmp_path / "s.mat", images, ORDERS[dimensions], matlab, one))) as source:
+        np.testing.assert_array_equal(source.read(slice(5 - 3 * one, None)), images[5:])
+        np.testing.assert_array_equal(source.read([0])[0], images[0])
+
+
+def test_names_of_dimensions_that_say_nothing(path: Path) -> None:
+    for names in ("frame,row", "a,b,c", "row,col,x"):
+        with pytest.raises(DataError, match=f"given as {names}; expected three"):
+            open_scan(SourceOptions(path, **(PATHS | {"data_path": f"/raw/images:{names}"})))
+
+
+@pytest.mark.parametrize("store", ["stacks", "exchange"])
+def test_the_advice_for_exchanged_rows_and_columns_gives_no_mirror_image(tmp_path: Path, store: str) -> None:
+    angles, place = np.arange(60) * 3.0, np.arange(24) - 11.5
+    t = np.radians(angles)[:, None, None]
+    shadow = np.exp(-((place - 5 * np.cos(t)) ** 2 + (place[:, None] - 3) ** 2) / 8)
+    views = np.round(4e4 * np.exp(-shadow)).astype(np.uint16)
+    names = {"stacks": ("proj", "dark", "flat"), "exchange": ("data", "data_dark", "data_white")}[store]
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        group = file if store == "stacks" else file.create_group("exchange")
+        stacks = views, np.zeros((2, 24, 24), "u2"), np.full((2, 24, 24), 40_000, "u2")
+        for name, part in zip(names, stacks, strict=True):
+            group[name] = part.transpose(0, 2, 1)
+        group["theta"] = angles
+        group["theta"].attrs["units"] = "deg"
+    given = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
+    with open_scan(SourceOptions(tmp_path / "s.h5", **(given if store == "stacks" else {}))) as source:
+        (finding,) = axis_vertical(source)
+    options = dict(re.findall(r"--(\w+)-path ([\w/,:]+\w)", finding.message))
+    given |= {f"{name}_path": where for name, where in options.items()}
+    with open_scan(SourceOptions(tmp_path / "s.h5", **given)) as source:
+        np.testing.assert_array_equal(source.read(slice(4, None)), views)
+        assert not [*axis_vertical(source)]

@@ -277,6 +277,39 @@ def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Entry) ->
 
 
 @pytest.mark.parametrize(
+    ("value", "units", "um"),
+    [
+        *(
+            (value, units, 6.5)
+            for value in ("6.5", b"6.5 ", ["6.5"], 6.5)
+            for units in ("um", "Micrometers", b"\xb5m", "microns.")
+        ),
+        *((value, None, 6.5) for value in ("6.5 um", "6.5e-3mm", " 6.5E-6 metres ", ".0065 millimeter")),
+        ([[6.5]], np.bytes_(b"um \0"), 6.5),
+        (6.5e-6, "meters", 6.5),
+        ("6.5 um", "mm", None),  # which of the two?
+        *((value, "um", None) for value in ("6,5", "about 6.5", "six", "6.5 furlong")),
+    ],
+)
+def test_numbers_in_text_and_units_in_full_are_used_or_named(tmp_path: Path, value: Any, units: Any, um: Any) -> None:
+    field = f"{DETECTOR}/x_pixel_size".removeprefix("instrument/")
+    value = np.array(value, h5py.string_dtype()) if isinstance(value, list) and value == ["6.5"] else value
+    path = nxtomo(tmp_path / "s.nx", (field, value, units))
+    with open_scan(path) as source:
+        assert source.pixel_size_mm == (None if um is None else pytest.approx(um * 1e-3))
+        assert any(each.where == field for each in (source.not_used if um is None else source.used))
+
+
+@pytest.mark.parametrize(("value", "units"), [("25.0", "keV"), (b"25 keV", None), ("25000", "electronvolts")])
+def test_an_energy_and_angles_in_text(tmp_path: Path, value: Any, units: str | None) -> None:
+    angles = np.array([f"{n:.3f}" for n in np.r_[0, 0, np.arange(VIEWS) * 36.0]], h5py.string_dtype())
+    changes = ("instrument/beam/incident_energy", value, units), ("sample/rotation_angle", angles, "degrees")
+    with open_scan(nxtomo(tmp_path / "s.nx", *changes)) as source:
+        assert source.energy_kev == pytest.approx(25.0)
+        np.testing.assert_allclose(np.degrees(source.angles[2:]), np.arange(VIEWS) * 36.0)
+
+
+@pytest.mark.parametrize(
     ("where", "value"), [(ENERGY, 25.0), (f"{PIXEL}/x_pixel_size", 0.65), (f"{PIXEL}/y_pixel_size", 6.5)]
 )
 def test_a_number_that_cannot_be_in_the_units_of_the_si_is_named(tmp_path: Path, where: str, value: float) -> None:
