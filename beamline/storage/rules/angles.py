@@ -264,7 +264,7 @@ def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     some = spread(views, VIEWS)
     some = some[seen.lit(some)]
     degrees = np.degrees(source.angles)
-    if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
+    if np.unique(degrees[some]).size < _LEAST_SEEN:
         return
     apart = max(np.ptp(degrees[some]) / _FINE, float(np.median(np.diff(np.unique(degrees[views])))))
     beside = views[np.abs(degrees[views] - degrees[some][:, None] - apart).argmin(axis=1)]

@@ -97,28 +97,35 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
     some, dark = (views[:_IN_A_ROW], views[-_IN_A_ROW:]), mean_cells(source, darks) if darks.size else 0.0
     if source.quantity != "counts" or not flats.size or views.size < _IN_A_ROW:
         return
-    if any(np.ptp(part) >= part.size for part in some) or np.median(np.abs(np.diff(source.angles[some[0]]))) > _BESIDE:
+    if (
+        any(np.ptp(part) >= part.size for part in some)
+        or not np.median(np.abs(np.diff(source.angles[some[0]]))) <= _BESIDE
+    ):
         return
 
     def levels(rows: NDArray[np.int64]) -> F64:
-        light = [np.nanpercentile(cells - dark, BRIGHT) for cells in cells_of(source, rows[:_IN_A_ROW])]
+        light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in cells_of(source, rows[:_IN_A_ROW])]
         return np.asarray(np.log(np.maximum(light, 1e-30)), np.float64)
 
     n, again = (lights_in_turn(levels(part)) for part in some)
     change, most = np.ptp(levels(some[0])), ReferenceLimits().uneven
     if not n or n != again or change < most:
         return
-    shares = np.zeros(n)
+    shares, middles = np.zeros(n), np.zeros((2, n))
     for first in range(n):
         own = [levels(rows[rows % n == first]) for rows in (flats, views)]
         if (darks % n == first).any() and own[0].size and np.ptp(own[0]) < most:
-            share = np.exp(np.median(own[1]) - np.median(own[0]))
+            middles[:, first] = [np.median(each) for each in own]
+            share = np.exp(middles[1, first] - middles[0, first])
             shares[first] = share if share <= 1 + BRIGHTER else 0.0
+    turned = lights_in_turn(levels(flats))
+    if turned and np.prod(middles - middles.mean(axis=1, keepdims=True), axis=0).sum() < 0:
+        shares[:] = 0.0  # the brighter views would go with the darker flats
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     way = f"{' or '.join(steps)} takes one, with its darks and flats, from all frames of the file, counted from 0."
     no_way = f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
     yield Finding(
-        "error" if lights_in_turn(levels(flats)) else "warning",
+        "error" if turned else "warning",
         "light",
         f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
         f"apart): thresholds, exposures or energies, of which a volume takes one. {way if steps else no_way}",
