@@ -30,6 +30,7 @@ LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is 
 ZINGER = 12.0  # times the median change: more is not noise
 BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
 CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
+IN_TURN = 3.0  # times the change to the next frame of the same light: 1 of a drift, less of what is random
 WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
 ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
 
@@ -340,9 +341,9 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     changed = float(np.ptp(levels))
     place = float(worst_place(local).max())
     if changed > limits.uneven:
-        sentence = (
-            f"their light changes by {changed:.0%} from flat to flat (limit {limits.uneven:.0%}): an unstable beam."
-        )
+        n = lights_in_turn(levels)
+        why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
+        sentence = f"their light changes by {changed:.0%} from flat to flat (limit {limits.uneven:.0%}): {why}."
         return ReferenceFault(FaultKind.UNEVEN, changed, limits.uneven, sentence)
     if place > max(limits.uneven, CHANGE_SIGMAS * noise):
         sentence = (
@@ -351,6 +352,15 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
         )
         return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, sentence)
     return None
+
+
+def lights_in_turn(levels: NDArray[np.floating]) -> int:
+    """How many lights frames in a row [frame] have in turn, 2 or 3; 0: their light does not change so."""
+    for n in range(2, min(3, levels.size // 2) + 1):
+        between = float(np.ptp([np.median(levels[first::n]) for first in range(n)]))
+        if between > IN_TURN * float(np.abs(levels[n:] - levels[:-n]).max()):
+            return n
+    return 0
 
 
 def worst_place(changes: NDArray[np.floating]) -> NDArray[np.floating]:

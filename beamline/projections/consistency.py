@@ -40,7 +40,7 @@ _MOST_OF_THEM = 5, 95  # percent of views: one that a crumb crosses does not cou
 _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
 _STEP_OF_LIGHT = 0.1  # of line integral, as the monitor's alarm `gain`
-_OF_LOCAL, _ALTERNATING = 3.0, 0.9  # times the change to the next view, as angles differ by so much; share of the views
+_OF_LOCAL = 3.0  # times the change to the next view, as angles differ by so much
 _BESIDE = np.radians(4.1)  # a slab 20 times as long as thick, wider than the field, is no spike in views so dense
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
@@ -198,12 +198,12 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
 
 
 def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]) -> Law:
-    """Views half a turn apart are mirror images, and the light does not alternate, where no air tells of it."""
+    """Views half a turn apart are mirror images, where no air tells of the light."""
     reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
     around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
     levels = np.array([np.median(data[view][:, around]) for view in some])
     steps = np.diff(levels)
-    usual, apart = float(np.median(np.abs(steps))), np.abs(np.abs(angles[:, None] - angles) - np.pi)
+    apart = np.abs(np.abs(angles[:, None] - angles) - np.pi)
     opposite = apart <= 1.01 * float(np.median(np.abs(np.diff(np.sort(angles)))))
     local = np.maximum(np.append(np.abs(steps), 0), np.append(0, np.abs(steps)))
     change = np.where(opposite, np.abs(levels[:, None] - levels) - _OF_LOCAL * np.maximum(local[:, None], local), -1)
@@ -213,8 +213,6 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
         f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, half a turn apart, see one and the "
         f"same matter, but differ by {abs(levels[first] - levels[last]):.2f} of line integral"
     )
-    if usual > _STEP_OF_LIGHT and np.mean(steps[1:] * steps[:-1] < 0) > _ALTERNATING:
-        size, what = usual, f"From view to view line integrals of the whole view rise and fall in turn by {usual:.2f}"
     at, odd = _out_of_line(levels, angles)
     if odd > max(_STEP_OF_LIGHT, np.nan_to_num(size)):
         size, more = odd, f"by {odd:.2f} of line integral more than these change"
@@ -279,7 +277,8 @@ def _way_of(mass: F64, frames: NDArray[np.int64]) -> str:
     away = mass - mass.mean()
     whole, n = float(away @ away), mass.size
     if float(away[1:] @ away[:-1]) < _IN_TURN * whole:
-        return f"in turn, from view to view, by {np.abs(np.diff(mass)).mean():.0%}"
+        by = np.abs(np.diff(mass)).mean()
+        return f"in turn, from view to view, by {by:.0%} (--frames 0::2 or 1::2 take every second frame)"
     sums, before = np.cumsum(away)[:-1], np.arange(1, n)
     steps = sums**2 * n / (before * (n - before))
     at = int(steps.argmax())

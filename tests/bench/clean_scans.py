@@ -1,4 +1,4 @@
-"""False words: 240 clean scans of many kinds through all judgements of a reconstruction and of `info`.
+"""Clean scans: 240 of many kinds through all judgements of a reconstruction and of `info`.
 
 python -m tests.bench.clean_scans [FIRST [STOP]] prints every warning, and ends with 1 if there is one that no property
 of the scan explains (few views, a sample wider than the field and so on; see EXPLAINED).
@@ -27,7 +27,7 @@ EXPLAINED = {
     "wide": r"beyond the field|wider than the field|continues? beyond|No column shows air|leaves the field",
     "few": r"limited angle|not a clear optimum|was not found|fewer than|at least|only",
     "exposed": r"The projections were exposed for|The darks were exposed for",
-    "faint": r"less light through than the floor|No view looked at differs|zingers|dead or hot|All darks are 0|"
+    "faint": r"less light through than the floor|leaves the field|No view looked at differs|zingers|dead or hot|All darks are 0|"
     r"In places the views are brighter",
     "cone": r"rotation axis",
     "always": r"got no beam, or is saturated|dead or hot|zingers",
@@ -67,7 +67,7 @@ def clean_scan(seed: int, change: Change = lambda t, balls: balls, **fixed: obje
         "turns": 1,
         "views": int(rng.choice(VIEWS)), "rows": int(rng.integers(6, 26)), "cols": int(rng.integers(48, 97)),
         "beam": str(rng.choice(["half", "half", "full", "cone"])), "wide": rng.random() < 0.25,
-        "depth": float(rng.choice([0.1, 1.0, 1.5, 2.5, 5.0])), "light": float(10 ** rng.uniform(1.7, 4.7)),
+        "depth": float(rng.choice([0.1, 1.0, 1.5, 2.5, 5.0])), "light": float(10 ** rng.uniform(2.0, 4.7)),
         "order": str(rng.choice(["even", "even", "even", "passes", "random", "repeated"])),
         "written": str(rng.choice(["counts"] * 8 + ["float", "share", "full scale"])),
         "exposed": rng.random() < 0.1, "groups": int(rng.integers(1, 4)), "rings": rng.random() < 0.3,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, coarse_views
+from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, angles_stand, coarse_views
 from beamline.storage.rules.references import VIEWS
 from recon.base.views import spread
 
@@ -25,6 +25,7 @@ RULE = "angle-order"
 def angles_shown(source: ScanSource) -> Iterator[Finding]:
     """Views show the turns, and the order of angles, that the file states."""
     if (seen := coarse_views(source)) is not None:
+        yield from angles_stand(seen)
         yield from angles_seen(seen)
         yield from angles_in_order(seen)
 

@@ -23,6 +23,7 @@ _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
 # Of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses; minutes; thousandths of rad.
@@ -222,6 +223,35 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
     return CoarseViews(source, light, views) if views.size >= _LEAST_SEEN else None
 
 
+def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
+    """Frames in a row that are stated at one angle look alike, as those that are averaged do.
+
+    Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
+    """
+    starts = np.flatnonzero(np.diff(seen.source.angles[seen.rows], prepend=np.nan) != 0)
+    lengths = np.diff(starts, append=seen.rows.size)
+    runs = starts[some := spread(np.flatnonzero(lengths >= _STANDS), PAIRS)]
+    ends, firsts = seen.rows[runs + lengths[some] - 1], seen.rows[runs]
+    if not runs.size or not seen.lit(np.concatenate([firsts, ends])).all():
+        return
+    beside, across = (
+        float(
+            np.median([seen.unlike_pairs([pair], False) for pair in zip(firsts.tolist(), other.tolist(), strict=True)])
+        )
+        for other in (seen.rows[runs + 1], ends)
+    )
+    if across > _TURNED * beside:
+        n, degrees = int(np.median(lengths[lengths >= _STANDS])), np.degrees(seen.source.angles[seen.rows])
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"Angles stand for {n} frames each that differ (frames {firsts[0]} and {ends[0]}, both stated at "
+            f"{degrees[runs[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): they were read back "
+            f"more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views with "
+            f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly.",
+        )
+
+
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     """Views half a turn apart by their angles are mirror images (a whole turn: alike), and no others are.
 
@@ -234,7 +264,7 @@ def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     some = spread(views, VIEWS)
     some = some[seen.lit(some)]
     degrees = np.degrees(source.angles)
-    if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
+    if np.unique(degrees[some]).size < _LEAST_SEEN:
         return
     apart = max(np.ptp(degrees[some]) / _FINE, float(np.median(np.diff(np.unique(degrees[views])))))
     beside = views[np.abs(degrees[views] - degrees[some][:, None] - apart).argmin(axis=1)]

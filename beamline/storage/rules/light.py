@@ -168,7 +168,7 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
     end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
     air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
     noise = _white_noise(views, end) or (_change(source, groups) if not written else 0.0)
-    at = (views >= end) & (read_known(source, rows[0][:1], _middle(source)) < end)
+    at = (views == end) & (read_known(source, rows[0][:1], _middle(source)) < end)
     around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
     refused = written and not accepted
     if noise > 0 and around.size and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:

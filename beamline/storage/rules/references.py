@@ -40,8 +40,8 @@ from recon.base.views import spread
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-_BRIGHTER = 0.02  # share of the light by which views may be brighter than flats: a beam drifts by so much
-_SORTED = 2**20  # pixels, about, among whose values that of a limit is looked for where they are not of 16 bits
+BRIGHTER = 0.02  # share of the light by which views may be brighter than flats: a beam drifts by so much
+_SORTED = 2**20  # pixels, about, whose values are counted
 CELLS = 32  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
@@ -259,7 +259,7 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
     most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
     of_views = source.exposures[views]
     for each in (of_views.max(), np.median(of_views), of_views.min()):
-        if each <= (1 + _BRIGHTER) * most:
+        if each <= (1 + BRIGHTER) * most:
             return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
     return source.exposures
 
@@ -284,17 +284,13 @@ def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     block, side = check_block(image.shape), max(1, image.shape[1] // CELLS)
     frame = ReferenceFrame.seen(row, FrameKind.INVALID, np.nan, saturated, block_means(image, block), block)
     frame = replace(frame, cells=block_means(image, side))
-    if image.dtype == np.uint16:
-        held, values = np.bincount(image.ravel()), np.arange(0)
-    else:
-        frame = replace(frame, invalid=1 - float(np.mean(is_valid(image))))
-        frame = frame if counts else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0
-        some = image.ravel()[:: 1 + image.size // _SORTED]
-        values, held = np.unique(some[np.isfinite(some)], return_counts=True)
+    if image.dtype != np.uint16:
+        frame = replace(frame, invalid=1 - float(np.mean(is_valid(image))), rounding=frame.rounding * counts)
+    some = image.ravel()[:: 1 + image.size // _SORTED]
+    values, held = np.unique(some[np.isfinite(some)], return_counts=True)
     if not held.size:
         return frame
-    end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else held.size - 1
-    whole = not values.size and end == held.size - 1
-    beside = BY_CHANCE if whole else max(BY_CHANCE, int(held[end - 1]))
-    shared = max(0, int(held[end]) - beside) / held.sum()  # counts that thin out towards a few hot pixels do not end
-    return replace(frame, largest=float(values[end] if values.size else end), at_largest=float(shared))
+    end = int(np.flatnonzero(held > min(BY_CHANCE, held.max() - 1))[-1])
+    last = counts and end == held.size - 1  # counts that thin out towards a few hot pixels do not end
+    shared = max(0, int(held[end]) - max(BY_CHANCE, 0 if last else int(held[end - 1]))) / some.size
+    return replace(frame, largest=float(values[end]), at_largest=shared)

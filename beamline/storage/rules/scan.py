@@ -20,6 +20,7 @@ from beamline.storage.rules.angle_order import angles_shown
 from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.exposures import one_energy
 from beamline.storage.rules.light import exposures_agree, views_scaled
+from beamline.storage.rules.unlit import light_one
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 from recon.base.views import spread
@@ -354,6 +355,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     darks_measured,
     exposures_agree,
     one_energy,
+    light_one,
     pixels_measured,
     pixels_as_labelled,
     views_scaled,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angle_order import angles_in_order
-from beamline.storage.rules.angles import angles_seen, coarse_views
+from beamline.storage.rules.angles import angles_seen, angles_stand, coarse_views
 from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
@@ -163,3 +163,22 @@ def test_any_number_of_views_shows_halves_exchanged_and_no_symmetric_sample(view
     two: Balls = [(0, 0, 22, 0.01), (9, 5, 6, 0.04)]
     for balls in (ROD, two):
         assert ordered(scan(balls, copied, even)) == []
+
+
+@pytest.mark.parametrize("stands", [4, 8, 12])
+def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
+    true = turn(180, 120)
+    source = scan(WITHIN, true, np.repeat(true[::stands], stands))
+    (finding,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
+    assert (
+        f"Angles stand for {stands} frames each that differ (frames 8 and {7 + stands}, both stated at 0"
+        in finding.message
+    )
+    assert "--angles FILE" in finding.message
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
+@pytest.mark.parametrize("stands", [1, 2, 4, 8])
+def test_frames_of_one_angle_that_are_averaged_do_not_differ(balls: Balls, stands: int) -> None:
+    angles = np.repeat(turn(180, 120)[::stands], stands)
+    assert not list(angles_stand(coarse_views(scan(balls, angles, angles))))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.projections.selection import Selection
 from beamline.storage.rules.light import BRIGHTER, WARN, views_scaled
+from beamline.storage.rules.references import references_usable
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 
@@ -129,7 +130,7 @@ def test_a_step_and_turns_of_the_light_where_the_sample_fills_the_field() -> Non
     assert "Frames 10 and 54, half a turn apart, see one and the same matter, but differ by 0.36" in said
     darks, flats, views = counts(60.0)
     views[::2] = (views[::2] - 100) * 0.7 + 100
-    assert "rise and fall in turn by 0.36" in told(darks, flats, views)
+    assert "The views have 2 lights in turn" in told(darks, flats, views)
 
 
 @pytest.mark.parametrize(("view", "factor"), [(2, 0.7), (30, 1.4)])
@@ -196,3 +197,65 @@ def test_whole_numbers_that_stand_for_transmission() -> None:
     full = np.full((1, *SHAPE), 65535.0)
     said = told(0 * full, full, 65535 * np.exp(-lines(20.0)))
     assert said == ""
+
+
+@pytest.mark.parametrize("end", [65535.0, 4095.0])
+def test_flats_saturated_everywhere_beside_darks_of_one_number(end: float) -> None:
+    darks, flats, views = counts(20.0)
+    said = told(np.full_like(darks, 100), np.full_like(flats, end), views)
+    assert said.startswith("refused: ")
+    assert "100.00% of their pixels are saturated" in said
+
+
+def test_flats_stuck_at_one_number_beside_darks_of_one_number() -> None:
+    darks, flats, views = counts(20.0)
+    said = told(np.full_like(darks, 100), np.full_like(flats, 3500), views)
+    assert "every pixel of the flats 3500, which no camera gives" in said
+
+
+def test_real_numbers_that_end_in_flats() -> None:
+    darks, flats, views = counts(20.0)
+    frames = darks + np.random.default_rng(4).normal(0, 1, darks.shape), np.minimum(flats + 0.37, 3080.3), views
+    found = [list(references_usable(scan_of(*each, ANGLES, np.float32))) for each in (frames, (darks, flats, views))]  # type: ignore[arg-type]
+    assert "counts end there" in found[0][0].message
+    assert not found[1]
+
+
+def test_views_alone_that_end_at_one_count() -> None:
+    darks, flats, views = counts(20.0)
+    assert "of the views looked at hold 2800 without the noise" in told(darks, flats, np.minimum(views, 2800))
+    assert "saturated" not in told(darks, flats, views)
+
+
+@pytest.mark.parametrize(
+    ("lights", "of_flats", "step"),
+    [
+        ((1, 0.45), (1, 0.45), "--frames 0::2 or --frames 1::2 takes one"),
+        ((1, 0.45), (1,), "--frames 1::2 takes one"),
+        ((1, 4), (1,), "--frames 1::2 takes one"),
+        ((1, 0.6, 0.3), (1, 0.6, 0.3), "--frames 0::3 or --frames 1::3 or --frames 2::3 takes one"),
+        ((1, 0.5), (0.5, 1), "No step"),
+    ],
+)
+@pytest.mark.parametrize("radius", [20.0, 60.0])
+def test_lights_in_turn(radius: float, lights: tuple[float, ...], of_flats: tuple[float, ...], step: str) -> None:
+    """As thresholds or exposures; the first view is frame 12 where flats alternate alike, else frame 11."""
+    darks, flats, views = counts(radius)
+    n = len(lights)
+    before = (6, 6) if lights == of_flats else (5, 6 if len(of_flats) == 1 else 8)
+    darks, flats = (np.resize(each, (m, *SHAPE)) for each, m in zip((darks, flats), before, strict=True))
+    views = 100 + (views - 100) * np.resize(lights, len(views))[:, None, None]
+    flats = 100 + (flats - 100) * np.resize(of_flats, len(flats))[:, None, None]
+    said = told(darks, flats, views)
+    assert f"The views have {n} lights in turn, from frame to frame" in said
+    assert step in said
+
+
+def test_a_beam_that_flickers_or_drifts_has_no_lights_in_turn() -> None:
+    darks, flats, views = counts(20.0)
+    for factors in (
+        np.linspace(1, 0.8, 45),
+        np.where(np.arange(45) < 20, 1, 0.7),
+        1 - 0.3 * np.random.default_rng(2).random(45),
+    ):
+        assert "in turn" not in told(darks, flats, 100 + (views - 100) * factors[:, None, None])
