@@ -104,8 +104,13 @@ class Narration:
             flag = replace(flag, first=min(known.flag.frames.start, flag.frames.start))
             self._open[flag.check] = replace(event, flag=flag, time=known.time)
             return
-        end = math.inf if isinstance(event, BlockDone | ScanDone | Failed | Done | RunDone) else 0
-        now = event.n - _OVER if isinstance(event, FrameStored) else end
+        now = (
+            event.n - _OVER
+            if isinstance(event, FrameStored)
+            else math.inf
+            if isinstance(event, BlockDone | ScanDone | Failed | Done | RunDone)
+            else 0
+        )
         yield from map(self._open.pop, [check for check, known in self._open.items() if known.flag.frame < now])
         yield event
 

@@ -98,8 +98,9 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
         DataError: the scan died. KeyboardInterrupt: a stop before its end; nothing was written.
     """
     with channels.stop_scope() as should_stop, _open(options, channels, timing) as source:
-        until = f"{options.method.name} needs all views: it begins when the scan has ended"
-        channels.sink(StateEntered("waiting", until, time=channels.clock.now()))
+        channels.sink(
+            StateEntered("waiting", f"{options.method.name} begins when the scan has ended", time=channels.clock.now())
+        )
         for _ in growing(source, channels.clock, timing.patience, timing.poll):
             if should_stop():
                 raise KeyboardInterrupt("stopped before the scan had ended; nothing was written")

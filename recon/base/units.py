@@ -22,11 +22,11 @@ _EDGE = 32  # of the columns are an edge
 _SIGMAS = 3.0
 
 
-def look_like_degrees(angles: NDArray[np.floating]) -> bool:
+def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
     """Whether angles [view] given as radians look like degrees.
 
     They do if all are whole numbers, or if they span 180 or 360. They also do if they span more than ten turns and are
-    round to two digits.
+    round to two digits. Before a scan has `ended` its span says nothing: one of many turns passes 180 rad.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -38,13 +38,13 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
         return False
     round_numbers = np.allclose(distinct * 100, np.round(distinct * 100), rtol=0, atol=1e-3)
     whole = span + span / (distinct.size - 1)
-    turns = any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
+    turns = ended and any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
     return bool(round_numbers or turns)
 
 
-def warn_of_degrees(angles: NDArray[np.floating]) -> None:
+def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:
     """Give a UserWarning if angles look like degrees; it names the line that called the asking function."""
-    if look_like_degrees(angles):
+    if look_like_degrees(angles, ended):
         warnings.warn(
             f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
             "np.deg2rad(angles)",

@@ -155,8 +155,10 @@ class StreamingFit:
         self._held_out += [is_held_out(self._arrived + k) for k in range(theta.size)]
         self._arrived += theta.size
         self._angles.extend(theta.tolist())
-        if not look_like_degrees(np.asarray(self._angles[: self.n_views - theta.size])):  # else it was said
-            warn_of_degrees(np.asarray(self._angles))
+        if not look_like_degrees(
+            np.asarray(self._angles[: self.n_views - theta.size]), ended=False
+        ):  # else it was said
+            warn_of_degrees(np.asarray(self._angles), ended=False)
         if self._state is not None and theta.size:
             new = range(self.n_views - theta.size, self.n_views)
             self._unseen += [view for view in new if not self._held_out[view]]
@@ -295,6 +297,8 @@ class StreamingFit:
         """
         if not self._angles:
             raise ValueError("no view has arrived, there is nothing to finish")
+        if not look_like_degrees(np.asarray(self._angles), ended=False):
+            warn_of_degrees(np.asarray(self._angles))
         self._begin_round(force=True)
         state, problem = self._state, self._problem
         assert state is not None and problem is not None

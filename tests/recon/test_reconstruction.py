@@ -229,6 +229,11 @@ def test_degrees_are_told_as_views_come(noisy: np.ndarray) -> None:
         for view, angle in zip(noisy, np.rad2deg(ANGLES), strict=True):
             model.add_views(view[None], [angle])
     assert len(told) == 1 and told[0].filename == __file__  # once
+    uneven = np.linspace(0, 180, 23, endpoint=False)
+    model = recon.StreamingFit(VIEWS, gaussians=100)
+    model.add_views(noisy[:23], uneven)  # part of a scan of many turns could be as wide
+    with pytest.warns(UserWarning, match=r"look like degrees"):
+        model.finish(0.0)
 
 
 def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:

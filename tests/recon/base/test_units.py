@@ -29,6 +29,13 @@ def test_degrees_are_told_from_radians(name: str) -> None:
     assert not look_like_degrees(np.deg2rad(SCANS[name]))
 
 
+@pytest.mark.parametrize("step", np.radians([3.0, 18.0, 63.0]))
+def test_no_part_of_many_turns_in_radians_looks_like_degrees(step: float) -> None:
+    angles = np.arange(0, 700, step)
+    assert not any(look_like_degrees(angles[:n], ended=False) for n in range(1, angles.size, 7))
+    assert any(look_like_degrees(np.arange(0, 180, 0.25)[:n], ended=False) for n in range(5, 400))
+
+
 def test_radians_of_many_turns_are_no_degrees() -> None:
     assert not look_like_degrees(np.linspace(0, 40 * 2 * np.pi, 7201))
     assert not look_like_degrees(np.deg2rad([0.0, 120.0, 240.0]))
