@@ -92,10 +92,9 @@ class TomoScan(Device):
             while await asyncio.to_thread(asked.state) is None:  # an end of the plan need not wait for it
                 await asyncio.sleep(POLL)
         except ConfigError:
-            if self._task is not None and not self._task.done():
-                state = await asyncio.to_thread(state_of, self._folder)
-                if not state.ended:
-                    raise
+            takes = self._task is not None and not self._task.done()
+            if takes and not (await asyncio.to_thread(state_of, self._folder)).ended:
+                raise
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:

@@ -198,15 +198,10 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 def _files(run: Path) -> tuple[list[Path], list[str]]:
     """The files of the parts, without those of parts that ended before their first frame, and a sentence on each of
     these."""
-    files, left_out = [], []
-    for part in parts_of(run):
-        if not (part / SCAN).is_file():
-            continue
-        if may_hold_frames(part / SCAN):
-            files.append(part / SCAN)
-        else:
-            left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {RECORD} has none.")
-    return files, left_out
+    scans = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]
+    files = [scan for scan in scans if may_hold_frames(scan)]
+    empty = [scan for scan in scans if scan not in files]
+    return files, [f"{scan} is left out: no frame can be read in it, and its {RECORD} has none." for scan in empty]
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:

@@ -126,9 +126,7 @@ def record_sink(file: RecordFile) -> Sink:
     def keep(event: Event) -> None:
         record = file.record
         match event:
-            case Event(source="recon"):
-                pass
-            case StateEntered(state=state) if state in [*State]:
+            case StateEntered(state=state, source=None) if state in [*State]:
                 record = replace(record, state=state, over=State(state).ended)
             case FrameStored(n=n):
                 record = replace(record, frames=n)
@@ -180,9 +178,7 @@ def _began(run: Path) -> float:
     """When the run began: by the folder's name, which a simulated clock does not change, or else by its first file."""
     with suppress(ValueError):
         return timegm(time.strptime(run.name.partition("_")[0], STAMP))
-    with suppress(OSError):
-        return (run / CONFIG).stat().st_mtime
-    return 0.0
+    return (run / CONFIG).stat().st_mtime if (run / CONFIG).exists() else 0.0
 
 
 def _numbered(run: Path) -> tuple[int, str]:
