@@ -231,10 +231,7 @@ def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.gene
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
     _check_size(path, item.nbytes)
-    try:
-        return item[()]
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{path}: {name} cannot be read ({error}).") from error
+    return item[()]
 
 
 def _only(path: Path, axes: dict[str, int]) -> str:
