@@ -106,7 +106,8 @@ def refuse_instead(path: Path) -> None:
     """Raise DataError for a file that is empty, packed as a whole, or stands for the data elsewhere."""
     with path.open("rb") as file:
         head = file.read(64).lower()
-    if why := "empty" if not head else next((why for begin, why in _INSTEAD.items() if head.startswith(begin)), ""):
+    why = "empty" if not head else next((why for begin, why in _INSTEAD.items() if head.startswith(begin)), "")
+    if why and not path.name.lower().endswith(".nii.gz"):  # a volume, which is read as it is packed
         raise DataError(f"{path} is {why}. Nothing was read.")
 
 

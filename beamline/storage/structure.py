@@ -51,9 +51,11 @@ def require_harmless(file: h5py.File) -> None:
             with suppress(*_DAMAGED):
                 opened[number] = files.enter_context(h5py.File(path, "r", locking=False))
                 waiting += _looked_at(opened[number], path, virtual)
-        for _ in range(_NESTED):
-            virtual = [*dict(_virtual_sources(virtual, opened)).values()]
-    if virtual:
+        sources = {_place_of(item): {*_sources(item, opened)} for item in virtual}
+    nested = {*sources}
+    for _ in range(_NESTED):
+        nested = {place for each in nested for place in sources[each] if place in sources}
+    if nested:
         raise DataError(
             f"{file.filename}: a virtual dataset draws on itself, or on more than {_NESTED} others one after the "
             "other. Nothing was read."
@@ -66,19 +68,19 @@ def _number_of(path: Path) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
-def _virtual_sources(
-    virtual: list[h5py.Dataset], opened: dict[tuple[int, int], Any]
-) -> Iterator[tuple[tuple[int, int], h5py.Dataset]]:
-    """The virtual datasets that others draw on, by their places, as far as their files are open."""
-    for item in virtual:
-        path = Path(item.file.filename)
-        for name, where in drawn_on(item.id.get_create_plist()):
-            for place in [path] if name == "." else _places(name, path):
-                with suppress(*_DAMAGED):
-                    source = opened[_number_of(place)][where]
-                    if isinstance(source, h5py.Dataset) and source.is_virtual:
-                        known = h5py.h5o.get_info(source.id)
-                        yield (known.fileno, known.addr), source
+def _place_of(item: h5py.Dataset) -> tuple[int, int]:
+    """What tells an object of open files from all others, under whatever name."""
+    known = h5py.h5o.get_info(item.id)
+    return known.fileno, known.addr
+
+
+def _sources(item: h5py.Dataset, opened: dict[tuple[int, int], Any]) -> Iterator[tuple[int, int]]:
+    """The places of what a virtual dataset draws on, as far as its files are open."""
+    path = Path(item.file.filename)
+    for name, where in drawn_on(item.id.get_create_plist()):
+        for place in [path] if name == "." else _places(name, path):
+            with suppress(*_DAMAGED):
+                yield _place_of(opened[_number_of(place)][where])
 
 
 def require_inside(file: h5py.File) -> None:

@@ -47,7 +47,6 @@ def read_volume(
         return _from_folder(path), None
     if not path.is_file():
         raise DataError(no_file(path))
-    refuse_instead(path)
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)
@@ -92,6 +91,7 @@ def _is_numpy(path: Path) -> bool:
 
 def _from_tiff(path: Path) -> NDArray[np.generic]:
     require_regular(path)
+    refuse_instead(path)
     with tifffile.TiffFile(path) as tif:
         require_possible(tif)
         series = tif.series[0]
@@ -231,10 +231,7 @@ def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.gene
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
     _check_size(path, item.nbytes)
-    try:
-        return item[()]
-    except (OSError, RuntimeError) as error:
-        raise DataError(f"{path}: {name} cannot be read ({error}).") from error
+    return item[()]
 
 
 def _only(path: Path, axes: dict[str, int]) -> str:

@@ -73,7 +73,11 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
             unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
-        elif field.units is not None and datasets.in_units(item, field.units) is None and _states(value, item, source):
+        elif (
+            field.units is not None
+            and datasets.in_units(item, field.units) is None
+            and (datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source))
+        ):
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
             if value.dtype.kind not in "uifb":
                 why = "it is text; expected a number, and a known unit behind it or as its attribute `units`"
@@ -158,10 +162,6 @@ def _text(value: NDArray[Any], units: str) -> str:
     else:
         text = " x ".join(map(str, value.shape)) + " values"
     return printable(f"{text} {units}".strip())
-
-
-def _states(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
-    return bool(datasets.text(value)) if value.dtype.kind in "SO" else _true(value, item, source)
 
 
 def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
