@@ -24,6 +24,7 @@ from beamline.storage.rules.references import (
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, F64, median_deviation
+from recon.base.noise import noise_level
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
@@ -44,6 +45,7 @@ BELOW, OF_VIEWS = (
     0.25,
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
 CUT, SOLID = 0.01, 0.9  # shares: of pixels with such neighbours; of these, that hold the end; clipped noise has half
+AS_FLATS = 0.4  # of the noise of flats, which views of less light have: without noise, the sample's edges have 0.2
 WHITE = 0.8  # change from pixel to pixel over that of the next but one: noise has 1, structure a quarter to a half
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
@@ -167,7 +169,10 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
     views, written = read_known(source, some, _middle(source)).astype(np.float64), not (np.ptp(dark) or np.ptp(flat))
     end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
     air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
-    noise = _white_noise(views, end) or (_change(source, groups) if not written else 0.0)
+    noise = _white_noise(views, end)
+    if not (noise or written):  # where the sample varies more
+        noise = noise_level(np.where(views < end, views, np.nan).astype(np.float32))
+        noise *= noise > AS_FLATS * _change(source, groups) > 0
     at = (views == end) & (read_known(source, rows[0][:1], _middle(source)) < end)
     around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
     refused = written and not accepted
