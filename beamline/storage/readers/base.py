@@ -93,9 +93,7 @@ class ScanSource(ABC):
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
-        shifts: float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it; NaN
-            in other frames, None where it says nothing.
-        stated_ending: `ending` of a format in which it does not change.
+        stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
     """
 
     path: Path
@@ -126,7 +124,7 @@ class ScanSource(ABC):
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None
-    shifts: NDArray[np.float64] | None = None
+    stated_shifts: NDArray[np.float64] | None = None
     stated_ending: ScanEnding = ScanEnding()
 
     @property
@@ -163,6 +161,14 @@ class ScanSource(ABC):
     def times(self) -> NDArray[np.float64] | None:
         """float64 [frame], s at the trigger, NaN where unknown; None if the file has no times."""
         return None
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        """float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it.
+
+        NaN in other frames; None where it says nothing.
+        """
+        return self.stated_shifts
 
     @property
     def triggers(self) -> NDArray[np.int64]:

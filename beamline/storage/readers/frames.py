@@ -20,7 +20,7 @@ _Sizes = NDArray[np.int64]
 _AT_REFRESH = ("image_key", "angles", "exposures")
 BY_FRAME = ("currents", "energies", "times", "shifts", "aside_mm")
 _OF_FRAMES = (*_AT_REFRESH, *BY_FRAME)
-_COPIED = {*ScanSource.__annotations__} - {"unreadable", "facts", "stated_ending", *_OF_FRAMES}
+_COPIED = {*ScanSource.__annotations__} - {"unreadable", "facts", "stated_shifts", "stated_ending", *_OF_FRAMES}
 
 
 class Frames(ScanSource):

@@ -130,8 +130,8 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         ]
     source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
     if (shifts := _shifts(path, file, n)).any():
-        source.shifts = np.full((source.image_key.size, 2), np.nan)
-        source.shifts[-n:] = shifts
+        source.stated_shifts = np.full((source.image_key.size, 2), np.nan)
+        source.stated_shifts[-n:] = shifts
     if n < planned:
         source.stated_ending = ScanEnding("stopped", reason=f"{n} of {count(planned, 'planned view')} were taken.")
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
