@@ -226,4 +226,5 @@ def test_a_few_kills(tmp_path: Path) -> None:
 def test_two_hundred_kills(tmp_path: Path) -> None:
     counted = kills(tmp_path, 200, 0)
     print(dict(sorted(counted.items())))
-    assert counted["kills in the record"] > 20 and counted[State.FINISHING] > 20
+    in_fits = counted[State.FINISHING] + counted["finishing of a resumption"]
+    assert counted["kills in the record"] > 20 and in_fits > 10
