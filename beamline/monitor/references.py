@@ -269,7 +269,7 @@ def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refe
     count, and it is not the same in all frames; hot pixels and zingers, which are few, have more."""
     hot = [dark.at_largest for dark in darks or () if dark.largest == flats[0].largest]
     score = float(np.median([flat.at_largest for flat in flats])) - max(hot, default=0.0)
-    if len(flats) < 2 or score <= limits.saturated or len({flat.largest for flat in flats}) > 1:
+    if len(flats) < 2 or score <= saturation_limit(flats[0], limits) or len({flat.largest for flat in flats}) > 1:
         return None
     blocks = np.stack([flat.blocks for flat in flats])
     change = np.abs(np.diff(blocks, axis=0))

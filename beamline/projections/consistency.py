@@ -58,7 +58,10 @@ _INVERTED = (
     "Where the sample is, the views are brighter than the air beside it, and line integrals are below 0: were images "
     "stored with dark and bright exchanged, or of flats with another sample? Give them as the camera wrote them."
 )
-_REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0  # in a scan; 600 at rest: 5.2 sigmas
+_REPEATED, _REPEATED_SIGMAS = (
+    np.array([0.5, 0.06, 0.025, 0.03]),
+    6.0,
+)  # in a scan; 369 scans at rest have up to 5.2 sigmas
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 _EVEN, _STEP, _IN_TURN = 0.5, 0.8, -0.5  # shares that a line and a step explain of a change of mass; from view to view
 
