@@ -281,7 +281,7 @@ def _way_of(mass: F64, frames: NDArray[np.int64]) -> str:
     whole, n = float(away @ away), mass.size
     if float(away[1:] @ away[:-1]) < _IN_TURN * whole:
         by = np.abs(np.diff(mass)).mean()
-        return f"in turn, from view to view, by {by:.0%} (--frames 0::2 or 1::2 take every second frame)"
+        return f"in turn, from view to view, by {by:.0%} (--frames 0::2 or 1::2 take every second view)"
     sums, before = np.cumsum(away)[:-1], np.arange(1, n)
     steps = sums**2 * n / (before * (n - before))
     at = int(steps.argmax())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beamline.monitor.flats_with_sample import lit_places
 from beamline.monitor.references import BRIGHT, ReferenceLimits, lights_in_turn
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.wrapped import selected
 from beamline.storage.rules import Finding
 from beamline.storage.rules.references import BRIGHTER, VIEWS, ReferenceGroups, cells_of, mean_cells
 from drivers.base.frame import FrameKind
@@ -90,7 +91,7 @@ class ViewLight:
 
 
 def light_one(source: ScanSource) -> Iterator[Finding]:
-    """Views in a row have one light, but for a drift; else which step through the file takes one, with its flats."""
+    """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
     darks, flats, views = (
         np.flatnonzero(source.image_key == kind) for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION)
     )
@@ -113,8 +114,9 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
         return
     shares, middles = np.zeros(n), np.zeros((2, n))
     for first in range(n):
-        own = [levels(rows[rows % n == first]) for rows in (flats, views)]
-        if (darks % n == first).any() and own[0].size and np.ptp(own[0]) < most:
+        keys = selected(source, slice(first, None, n)).image_key
+        own = [levels(np.flatnonzero(keys == kind)) for kind in (FrameKind.FLAT, FrameKind.PROJECTION)]
+        if np.ptp(own[0]) < most:
             middles[:, first] = [np.median(each) for each in own]
             share = np.exp(middles[1, first] - middles[0, first])
             shares[first] = share if share <= 1 + BRIGHTER else 0.0
@@ -122,7 +124,7 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
     if turned and np.prod(middles - middles.mean(axis=1, keepdims=True), axis=0).sum() < 0:
         shares[:] = 0.0  # the brighter views would go with the darker flats
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
-    way = f"{' or '.join(steps)} takes one, with its darks and flats, from all frames of the file, counted from 0."
+    way = f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
     no_way = f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
     yield Finding(
         "error" if turned else "warning",

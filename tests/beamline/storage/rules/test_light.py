@@ -231,15 +231,15 @@ def test_views_alone_that_end_at_one_count() -> None:
     ("lights", "of_flats", "step"),
     [
         ((1, 0.45), (1, 0.45), "--frames 0::2 or --frames 1::2 takes one"),
-        ((1, 0.45), (1,), "--frames 1::2 takes one"),
-        ((1, 4), (1,), "--frames 1::2 takes one"),
+        ((1, 0.45), (1,), "--frames 0::2 takes one"),
+        ((1, 4), (1,), "--frames 0::2 takes one"),
         ((1, 0.6, 0.3), (1, 0.6, 0.3), "--frames 0::3 or --frames 1::3 or --frames 2::3 takes one"),
         ((1, 0.5), (0.5, 1), "No step"),
     ],
 )
 @pytest.mark.parametrize("radius", [20.0, 60.0])
 def test_lights_in_turn(radius: float, lights: tuple[float, ...], of_flats: tuple[float, ...], step: str) -> None:
-    """As thresholds or exposures; the first view is frame 12 where flats alternate alike, else frame 11."""
+    """As thresholds or exposures; steps count views, whatever stands before the first."""
     darks, flats, views = counts(radius)
     n = len(lights)
     before = (6, 6) if lights == of_flats else (5, 6 if len(of_flats) == 1 else 8)
