@@ -208,23 +208,13 @@ def never_close(file: h5py.File) -> None:
 
     For a file that the disk did not take. Closing it would repeat the writes, with a traceback for each object, and may
     leave the file marked so that nobody can open it. HDF5 still closes it at the end of the process, and crashes if the
-    disk fails: its handle then leads to memory.
+    disk fails: on Linux its handle then leads to memory.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back
-    if os.name == "posix":  # elsewhere the numbers of handles may be another library's
+    if sys.platform == "linux":
         with suppress(OSError, RuntimeError, ValueError):
-            handle = file.id.get_vfd_handle()
-            atexit.register(_lead_to_memory, handle, os.fstat(handle).st_ino)
-
-
-def _lead_to_memory(handle: int, inode: int) -> None:
-    with suppress(OSError):
-        if os.fstat(handle).st_ino == inode:
-            if sys.platform == "linux":
-                os.dup2(os.memfd_create("closed"), handle)
-            else:
-                os.dup2(os.open(os.devnull, os.O_RDWR), handle)
+            atexit.register(os.dup2, os.memfd_create("closed"), file.id.get_vfd_handle())
 
 
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
