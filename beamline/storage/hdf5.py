@@ -24,6 +24,8 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
+COMMITTED = "/entry/progress/frames_committed"  # of our own files
+
 
 class NotReadyError(DataError):
     """The file is just being created. This is not a fault: try again."""
@@ -104,8 +106,6 @@ def _unopened(
 
 def _ours(path: Path, head: Superblock | None) -> bool:
     """Whether this program wrote a file that is not whole."""
-    from beamline.storage.writers.layout import COMMITTED  # which imports this module
-
     with suppress(*ALTERED):
         if head is not None:
             with h5py.File(GrowingFile(path, head), "r") as file:
