@@ -2,42 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-import mmap
-import os
-import sys
 import weakref
 from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
-
-if sys.platform == "win32":
-
-    def _mapped(size: int) -> mmap.mmap:
-        return mmap.mmap(-1, size)
-
-    def lock_pages(address: int, size: int) -> None:
-        kernel, this = ctypes.WinDLL("kernel32", use_last_error=True), ctypes.c_void_p(-1)
-        least, most = ctypes.c_size_t(), ctypes.c_size_t()  # pages that Windows keeps of the process
-        if not (
-            kernel.GetProcessWorkingSetSize(this, ctypes.byref(least), ctypes.byref(most))
-            and kernel.SetProcessWorkingSetSize(
-                this, ctypes.c_size_t(least.value + size), ctypes.c_size_t(most.value + size)
-            )
-            and kernel.VirtualLock(ctypes.c_void_p(address), ctypes.c_size_t(size))
-        ):
-            raise ctypes.WinError(ctypes.get_last_error())
-
-else:
-
-    def _mapped(size: int) -> mmap.mmap:
-        return mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANON)
-
-    def lock_pages(address: int, size: int) -> None:
-        if ctypes.CDLL(None, use_errno=True).mlock(ctypes.c_void_p(address), ctypes.c_size_t(size)):
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number))
 
 
 class FrameMemory:
@@ -47,34 +16,20 @@ class FrameMemory:
     """
 
     def __init__(self) -> None:
-        self._free: deque[bytearray | memoryview] = deque()
+        self._free: deque[bytearray] = deque()
         self._bytes = 0
 
-    def prepare(self, n: int, shape: tuple[int, int]) -> str:
-        """Allocate memory for so many frames of a shape, with all pages present and locked against swapping.
+    def prepare(self, n: int, shape: tuple[int, int]) -> None:
+        """Allocate memory for so many frames of a shape, with all pages present.
 
         It replaces the kept buffers. Further frames allocate memory when they come.
 
-        Returns:
-            the system's reason if it is not locked, such as a missing permission; "" if it is locked.
-
         Raises:
-            OSError: there is too little memory. No buffer is kept then.
+            MemoryError: there is too little.
         """
-        wanted = 2 * shape[0] * shape[1]
-        self._free, self._bytes = deque(), wanted
-        if not n:
-            return ""
-        slot = -(-wanted // mmap.PAGESIZE) * mmap.PAGESIZE
-        memory = _mapped(n * slot)
-        pages, why = np.frombuffer(memory, np.uint8), ""
-        try:
-            lock_pages(pages.ctypes.data, pages.size)  # until the system gets it back
-        except OSError as error:
-            why = error.strerror or str(error)
-        pages[:: mmap.PAGESIZE] = 0
-        self._free.extend(memoryview(memory)[i * slot : i * slot + wanted] for i in range(n))
-        return why
+        self._bytes = 2 * shape[0] * shape[1]
+        self._free = deque()
+        self._free.extend(bytearray(b"\1") * self._bytes for _ in range(n))  # written, so that the system gives it
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.uint16]:
         """An array uint16 [row, col] of arbitrary content, in memory that no other frame uses."""

@@ -18,7 +18,6 @@ from recon.base.registry import did_you_mean
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
-_MOST_VALUES, _MOST_DIGITS = 100_000, 1000
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
@@ -57,15 +56,12 @@ def read(text: str, name: str) -> Tree:
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
-    loader = None
     try:
-        loader = yaml.SafeLoader(text)  # refuses control characters
-        node = loader.get_single_node()
+        node = yaml.compose(text, yaml.SafeLoader)  # refuses control characters
         if node is None:
             return None, origins
-        origins[()] = f"{name}:{_line(node)}"
         _walk(node, (), name, origins)
-        return loader.construct_document(node), origins
+        return yaml.SafeLoader("").construct_document(node), origins
     except yaml.MarkedYAMLError as error:
         colon = error.problem is not None and "expected ':'" in error.problem  # which is missed at the next line
         mark = (error.context_mark if colon else None) or error.problem_mark or error.context_mark
@@ -81,43 +77,21 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
         raise ConfigError(f"{name}: this is not YAML ({what}). Nothing was started.") from None
     except RecursionError:
         raise ConfigError(f"{name}: a value contains itself or is nested too deeply. Nothing was started.") from None
-    finally:
-        if loader is not None:
-            loader.dispose()
-
-
-def _line(node: yaml.Node) -> int:
-    return int(node.start_mark.line) + 1
 
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
-    if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
-        raise ConfigError(
-            f"{name} has more than {_MOST_VALUES} values: this cannot be a configuration. Nothing was started."
-        )
-    if isinstance(node, yaml.ScalarNode):
-        if "\0" in node.value:
-            raise ConfigError(f"{name}:{_line(node)}: a text contains a NUL character. Nothing was started.")
-        # Python neither reads nor writes very long numbers.
-        if node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS:
-            raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")
-    if isinstance(node, yaml.SequenceNode):
-        for index, child in enumerate(node.value):
-            origins[(*path, index)] = f"{name}:{_line(child)}"
-            _walk(child, (*path, index), name, origins)
-    if not isinstance(node, yaml.MappingNode):
-        return
-    seen: dict[str, int] = {}
-    for key, child in node.value:
-        word = str(key.value)
-        if word in seen:
-            full = ".".join(map(str, (*path, word)))
+    origins.setdefault(path, f"{name}:{node.start_mark.line + 1}")
+    of_keys = isinstance(node, yaml.MappingNode)
+    for index, item in enumerate([] if isinstance(node, yaml.ScalarNode) else node.value):
+        key, child = item if of_keys else (item, item)
+        at, line = (*path, str(key.value) if of_keys else index), key.start_mark.line + 1
+        if at in origins:
+            full, before = ".".join(map(str, at)), origins[at].rpartition(":")[2]
             raise ConfigError(
-                f"{name}:{_line(key)}: {full} appears twice (also in line {seen[word]}); keep one. Nothing was started."
+                f"{name}:{line}: {full} appears twice (also in line {before}); keep one. Nothing was started."
             )
-        seen[word] = _line(key)
-        origins[(*path, word)] = f"{name}:{_line(key)}"
-        _walk(child, (*path, word), name, origins)
+        origins[at] = f"{name}:{line}"
+        _walk(child, at, name, origins)
 
 
 def override(
@@ -186,47 +160,20 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
     faults: dict[KeyPath, str] = {}
-    all_found = error.errors(include_url=False)
-    real = _keys_of_real(all_found, tree.data, schema)
-    for finding in all_found:
+    for finding in error.errors(include_url=False):
         missing = finding["type"] == "missing" and isinstance(finding["loc"][-1], str)  # not a missing item of a list
         path = _path(finding["loc"], tree.data, missing)
         if finding["type"].startswith("union_tag"):
             path = (*path, finding["ctx"]["discriminator"].strip("'"))
             missing = finding["type"] == "union_tag_not_found"
-        if path and path[-1] in (keys := real.get(path[:-1], [])):
-            if path[-1] == keys[0]:
-                faults[path] = f"{tree.origin(path)}: {_keys_sentence(path[:-1], keys, tree.data)}"
-            continue
         sentence = _sentence("missing" if missing else finding["type"], path, finding["msg"], tree.data, schema)
         place = tree.origin((*path, *_key_named(finding["type"], finding["msg"])))
-        faults.setdefault(path, f"{place}: {sentence}")
+        if not any(text.endswith(f": {sentence}") for text in faults.values()):  # one for all keys of a real device
+            faults.setdefault(path, f"{place}: {sentence}")
     # A list with a wrong item may also seem too short.
     lists = {path for path in faults if isinstance(_value(tree.data, path), list)}
     items = {path[:-1] for path in faults if path}
     return [text for path, text in faults.items() if path not in lists & items]
-
-
-def _keys_of_real(found: Sequence[Any], data: Any, schema: Schema) -> dict[KeyPath, list[str]]:
-    """Of each group of a simulated device: the keys that it does not have, and its real counterpart has."""
-    keys: dict[KeyPath, list[str]] = {}
-    for each in found:
-        path = _path(each["loc"], data, False)
-        if each["type"] != "extra_forbidden" or not path:
-            continue
-        group = _value(data, path[:-1])
-        others = [key for branch in declared_at(schema, path[:-1], None) for key in branch.get("properties", {})]
-        if str(group.get("kind", "")).startswith("simulated") and path[-1] in others:
-            keys.setdefault(path[:-1], []).append(str(path[-1]))
-    return keys
-
-
-def _keys_sentence(group: KeyPath, keys: Sequence[str], data: Any) -> str:
-    name, kind = ".".join(map(str, group)), _value(data, group)["kind"]
-    return (
-        f"{name}: {', '.join(keys)} belong{'s' if len(keys) == 1 else ''} to a real device, and its kind is {kind}; "
-        "leave out what it does not have, or take the real configuration as it is: `beamline scan CONFIG --rehearse`"
-    )
 
 
 def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
@@ -259,7 +206,14 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         sentence = message.removeprefix(_OF_VALIDATOR)
         return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden":
-        keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
+        group, keys = _value(data, path[:-1]), _keys_at(schema, path[:-1], data)
+        others = set(_keys_at(schema, path[:-1], None)).difference(keys)
+        if path[-1] in others and str(group.get("kind", "")).startswith("simulated"):
+            return (
+                f"{'.'.join(map(str, path[:-1]))}: {', '.join(key for key in group if key in others)} belong to a real "
+                f"device, and its kind is {group['kind']}; leave them out, or take the real configuration as it is: "
+                "`beamline scan CONFIG --rehearse`"
+            )
         return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
     branches = declared_at(schema, path, data)
     choices = [str(choice) for branch in branches for choice in _choices(branch)]
@@ -283,6 +237,10 @@ def _shown(value: Any) -> str:
     else:
         text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _keys_at(schema: Schema, path: KeyPath, data: Any) -> list[str]:
+    return [key for branch in declared_at(schema, path, data) for key in branch.get("properties", {})]
 
 
 def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
@@ -343,7 +301,5 @@ def _words(branch: Schema) -> str:
         if "pattern" in branch:
             return f"text of {branch['description']}"
         least, most = branch.get("minLength", 0), branch.get("maxLength")
-        if most is None:
-            return f"text of {least} or more characters" if least > 1 else "text that is not empty" if least else "text"
-        return f"text of {least} to {most} characters"
+        return f"text of {least} to {most} characters" if most else "text that is not empty" if least else "text"
     return {"boolean": "true | false"}.get(kind, kind)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
-from enum import StrEnum
-from functools import lru_cache
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, dataclass_transform, get_type_hints
+from typing import Any, ClassVar, dataclass_transform
 
 import numpy as np
 
@@ -24,9 +21,13 @@ KINDS: dict[str, list[type[Event]]] = {}
 _SPREAD = "spread"
 
 
-def _spread(of: Callable[[Any], Mapping[str, Any]] | None = None, **of_field: Any) -> Any:
-    """A field whose own values stand in the line: a mapping, a dataclass, or what `of` makes of another value."""
-    return field(metadata={_SPREAD: of or _values_of}, **of_field)
+def _spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **of_field: Any) -> Any:
+    """A field whose own values stand in the line: a mapping, or what `of` makes of another value, here its attributes.
+
+    Args:
+        made: of the values in a line of another process.
+    """
+    return field(metadata={_SPREAD: (of, made)}, **of_field)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, _spread))
@@ -60,7 +61,7 @@ class Event:
         for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):
             value = getattr(self, each.name)
             if _SPREAD in each.metadata:
-                values |= value if isinstance(value, Mapping) else each.metadata[_SPREAD](value)
+                values |= value if isinstance(value, Mapping) else each.metadata[_SPREAD][0](value)
             elif value is not each.default:
                 values[each.name] = value
         return values
@@ -81,17 +82,12 @@ def event_of(values: Mapping[str, Any]) -> Event:
     """The event in a JSON line of another process. Raises ValueError if no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
-        spread: dict[str, Any] = {
-            item.name: kind if is_dataclass(kind) else dict for item, kind in _spread_fields(each)
-        }
-        named = {item.name: item for item in fields(each) if item.name not in spread}
-        rest = {name: value for name, value in given.items() if name not in named}
-        needed = {name for name, item in named.items() if item.default is MISSING}
-        if needed <= given.keys() and (spread or not rest):
-            taken: dict[str, Any] = {name: value for name, value in given.items() if name in named}
-            with suppress(TypeError):  # the values are not those of the dataclass that is spread
-                taken |= {name: made(**rest) for name, made in spread.items()}
-                return each(**taken)
+        spread = {item.name: item.metadata[_SPREAD][1] for item in fields(each) if _SPREAD in item.metadata}
+        own = {item.name for item in fields(each) if item.name not in spread}
+        rest = {name: value for name, value in given.items() if name not in own}
+        with suppress(TypeError):  # other fields, or the values are not those of the dataclass that is spread
+            taken = {name: made(**rest) for name, made in spread.items()} or rest
+            return each(**{name: value for name, value in given.items() if name in own}, **taken)
     raise ValueError(f"no kind of event has the values {dict(values)}")
 
 
@@ -99,74 +95,23 @@ LONGEST = 2**20
 """Most bytes of a line of a log: a scan with 100,000 missing triggers takes 700 kB to say so."""
 LARGEST_LOG = 2**30
 """Bytes of a log that are read: those of a week with ten lines a second."""
-_LATEST = 2.0**34  # s since the Unix epoch: the year 2514, which the calendars of all systems reach
 
 
 def event_in(line: str | bytes) -> dict[str, Any] | None:
     """The values of an event in a line of a log; None if the line is no event.
 
-    Whoever can write to the folder of a run wrote it: values of the fields that its kind has are of their types; fields
-    may lack or be unknown, as of another version of this program.
+    Only its kind and its time are looked at: fields may lack, be unknown, or have other types, as of another version.
     """
-    from recon.base.declared_types import is_of_type  # here, because most commands need none of it
-
     with suppress(UnicodeDecodeError):
         text = line.decode() if isinstance(line, bytes) else line
         values = json_object(text) if len(text) <= LONGEST else None
-        if values is None or not isinstance(values.get("event"), str):
-            return None
-        types = _types(values["event"])
-        time = values.get("time", 0.0)
-        fit = all(
-            any(is_of_type(value, each, _of_json) for each in types.get(name, (Any,))) for name, value in values.items()
-        )
-        return values if fit and time is not None and _of_json(time, float) and abs(time) < _LATEST else None
+        if values is not None and isinstance(values.get("event"), str) and _is_time(values.get("time", 0.0)):
+            return values
     return None
 
 
-def _spread_fields(kind: type[Event]) -> Sequence[tuple[Field[Any], Any]]:
-    """The fields of an event whose own values stand in the line, with their types."""
-    spread = [each for each in fields(kind) if _SPREAD in each.metadata]
-    hints = get_type_hints(kind) if spread else {}
-    return [(each, hints[each.name]) for each in spread]
-
-
-@lru_cache
-def _types(event: str) -> Mapping[str, Sequence[Any]]:
-    """The types of each field that a line of this kind names; those of several classes may differ."""
-    kinds = []
-    for kind in KINDS.get(event, ()):
-        spread = _spread_fields(kind)
-        hints = _hints(kind, without=[each.name for each, _ in spread])
-        for _, of in spread:
-            hints |= _hints(of) if is_dataclass(of) else {}
-        kinds.append((hints, any(not is_dataclass(of) for _, of in spread)))
-    names = {name for hints, _ in kinds for name in hints}
-    # What has no field of its own is among what is spread.
-    return {name: [hints.get(name, Any) for hints, others in kinds if name in hints or others] for name in names}
-
-
-def _hints(kind: Any, without: Sequence[str] = ()) -> dict[str, Any]:
-    hints = get_type_hints(kind)
-    return {each.name: hints[each.name] for each in fields(kind) if each.name not in without}
-
-
-def _of_json(value: Any, kind: Any) -> bool | None:
-    """Where JSON differs: a real number may be null (it was not finite), paths and enumerations are text."""
-    if kind is float:
-        return value is None or (_is_plain(value, int | float) and abs(value) <= sys.float_info.max)
-    if kind is int:
-        return _is_plain(value, int) and abs(value) < 2**63
-    return isinstance(value, str) if isinstance(kind, type) and issubclass(kind, Path | StrEnum) else None
-
-
-def _is_plain(value: Any, kind: Any) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _values_of(value: Any) -> dict[str, Any]:
-    """What a dataclass holds, by name."""
-    return {each.name: getattr(value, each.name) for each in fields(value)}
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) < math.inf
 
 
 def _of_no_json_type(value: Any) -> Any:
@@ -249,7 +194,7 @@ class BeamRead(Event, event="beam"):
 class FrameFlagged(Event, event="flag"):
     """A check of the monitor begins to flag, or flags at another level."""
 
-    flag: Flag = _spread(Flag.event_values)
+    flag: Flag = _spread(Flag.event_values, Flag)
 
 
 class RuleBroken(Event, event="flag"):
@@ -370,7 +315,7 @@ class FitReached(Event, event="progress"):
 class ScanDone(Event, event="scan_done"):
     """The scan file is closed."""
 
-    result: RunResult = _spread(RunResult.file_values)
+    result: RunResult = _spread(RunResult.file_values, RunResult)
 
 
 class ReconStarted(Event, event="recon_started"):

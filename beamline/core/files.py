@@ -242,8 +242,8 @@ def refuse_existing(path: Path) -> None:
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
-    told = hasattr(os, "pathconf") and path.parent.is_dir()
-    if len(os.fsencode(path.name)) > (most := (os.pathconf(path.parent, "PC_NAME_MAX") if told else 255) - _BESIDE):
+    longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
+    if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
         raise DataError(
             f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for names of "
             f"temporary files and of what lies beside {path}. Name another output. Nothing was written."

@@ -19,11 +19,8 @@ from typing import Any
 
 from beamline.core.errors import INTERRUPTED, ScanStopped
 
-_ENDING = (
-    "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
-    "SIGPWR",
-)  # fmt: skip
-"""Signals that would end the process, on any system: of a batch system, a time limit, a power failure."""
+_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+"""Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
 _PRINTING = 0.2  # s that a message to the terminal may delay the stop
 
 
@@ -32,7 +29,7 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
     """A context in which the first Ctrl-C requests a stop, the second an abort.
 
     SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
-    other signals that would end the process request a stop. Ctrl-Z suspends nothing: the shutter would stay open, and
+    the signals of batch systems request a stop. Ctrl-Z suspends nothing: the shutter would stay open, and
     the watchdog would take the scan for dead.
     """
 
@@ -51,9 +48,7 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
         _say("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
-    there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    ending = [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
-    with _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(ending, terminate)}):
+    with _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_asking_to_end(), terminate)}):
         yield
 
 
@@ -118,10 +113,9 @@ def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
 
 
 def _asking_to_end() -> list[signal.Signals]:
-    """The signals that ask a process to end; SIGHUP only where the system has it and `nohup` does not ignore it."""
-    if sys.platform == "win32" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-        return [signal.SIGTERM]
-    return [signal.SIGTERM, signal.SIGHUP]
+    """The signals of _ENDING that the system has, and that are not ignored, as SIGHUP under `nohup`."""
+    there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+    return [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def _say(text: str) -> None:

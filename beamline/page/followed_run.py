@@ -113,7 +113,7 @@ class StampedValues:
         values, stamps = self.values, dict(self.stamps)
         for line in lines:
             event = event_in(line) or {}
-            with suppress(KeyError):  # a field is not there
+            with suppress(LookupError, TypeError, ValueError, ArithmeticError):  # a field lacks or has another type
                 at, taken, severity = float(event["time"]), event_values(values, event), _severity(event)
                 texts = {name: one_line(value, LONGEST) for name, value in taken.items() if isinstance(value, str)}
                 values = replace(values, **{**taken, **texts})
@@ -228,7 +228,7 @@ def event_values(before: RunValues, event: Event) -> dict[str, Any]:
     """The values that an event sets, by name; {} if it sets none. Unknown numbers are NaN.
 
     Raises:
-        KeyError: the event lacks a field.
+        LookupError, TypeError, ValueError, ArithmeticError: the event lacks a field, or one has another type.
     """
     values = _BY_KIND.get(str(event.get("event")))
     return {} if values is None else values(before, event)

@@ -269,10 +269,10 @@ class _Run:
             return
         frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
         try:
-            why = memory.prepare(n, self.ready.timing.shape)
-            sentence = f"{frames}, is ready" + (f"; the system may swap it out ({why})" if why else " and locked")
-        except OSError as error:
-            sentence = f"{frames}, cannot be had before they come ({error.strerror or error})"
+            memory.prepare(n, self.ready.timing.shape)
+            sentence = f"{frames}, is ready"
+        except MemoryError:
+            sentence = f"{frames}, cannot be had before they come"
         self.sink(StateEntered(self.states.state, sentence[0].upper() + sentence[1:]))
 
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:

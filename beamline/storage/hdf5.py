@@ -24,6 +24,8 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
+COMMITTED = "/entry/progress/frames_committed"  # of our own files
+
 
 class NotReadyError(DataError):
     """The file is just being created. This is not a fault: try again."""
@@ -104,8 +106,6 @@ def _unopened(
 
 def _ours(path: Path, head: Superblock | None) -> bool:
     """Whether this program wrote a file that is not whole."""
-    from beamline.storage.writers.layout import COMMITTED  # which imports this module
-
     with suppress(*ALTERED):
         if head is not None:
             with h5py.File(GrowingFile(path, head), "r") as file:
@@ -208,23 +208,13 @@ def never_close(file: h5py.File) -> None:
 
     For a file that the disk did not take. Closing it would repeat the writes, with a traceback for each object, and may
     leave the file marked so that nobody can open it. HDF5 still closes it at the end of the process, and crashes if the
-    disk fails: its handle then leads to memory.
+    disk fails: on Linux its handle then leads to memory.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back
-    if os.name == "posix":  # elsewhere the numbers of handles may be another library's
+    if sys.platform == "linux":
         with suppress(OSError, RuntimeError, ValueError):
-            handle = file.id.get_vfd_handle()
-            atexit.register(_lead_to_memory, handle, os.fstat(handle).st_ino)
-
-
-def _lead_to_memory(handle: int, inode: int) -> None:
-    with suppress(OSError):
-        if os.fstat(handle).st_ino == inode:
-            if sys.platform == "linux":
-                os.dup2(os.memfd_create("closed"), handle)
-            else:
-                os.dup2(os.open(os.devnull, os.O_RDWR), handle)
+            atexit.register(os.dup2, os.memfd_create("closed"), file.id.get_vfd_handle())
 
 
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types

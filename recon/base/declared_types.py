@@ -117,20 +117,14 @@ def plain(value: Any) -> Any:
     return value.item() if lone(value) else value
 
 
-Fits = Callable[[Any, Any], bool | None]
-"""Whether a value is of a type, where it is written otherwise than in Python; None: as in Python."""
-
-
-def is_of_type(value: Any, kind: Any, fits: Fits = lambda value, kind: None) -> bool:
+def is_of_type(value: Any, kind: Any) -> bool:
     """Whether a value is of a declared type."""
-    if (told := fits(value, kind)) is not None:
-        return told
     origin, args = _parts(kind)
     if kind is None or kind is NoneType:
         return value is None
     if origin in (Union, UnionType):
         others = _without_arrays(args)
-        return (len(others) < len(args) and _is_numeric(value)) or any(is_of_type(value, each, fits) for each in others)
+        return (len(others) < len(args) and _is_numeric(value)) or any(is_of_type(value, each) for each in others)
     if origin is Literal:
         return isinstance(value, str | int) and value in args
     if kind is bool:
@@ -140,12 +134,12 @@ def is_of_type(value: Any, kind: Any, fits: Fits = lambda value, kind: None) -> 
     if kind is float:
         return is_number(value) and not math.isnan(value)
     if origin is tuple:
-        return _is_sequence(value) and _each_fits(value, args, fits)
+        return _is_sequence(value) and _each_fits(value, args)
     if origin is Callable:
         return callable(value)
     if origin is Mapping and args:
-        return isinstance(value, Mapping) and all(is_of_type(each, args[1], fits) for each in value.values())
-    return _is_instance(value, origin) and (not _is_of_sequences(origin, args) or _each_fits(value, (*args, ...), fits))
+        return isinstance(value, Mapping) and all(is_of_type(each, args[1]) for each in value.values())
+    return _is_instance(value, origin) and (not _is_of_sequences(origin, args) or _each_fits(value, (*args, ...)))
 
 
 def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -193,10 +187,10 @@ def _is_of_sequences(origin: Any, args: tuple[Any, ...]) -> bool:
     return isinstance(origin, type) and issubclass(origin, Sequence) and origin is not str and len(args) == 1
 
 
-def _each_fits(values: Any, kinds: tuple[Any, ...], fits: Fits) -> bool:
+def _each_fits(values: Any, kinds: tuple[Any, ...]) -> bool:
     if len(kinds) == 2 and kinds[1] is ...:
-        return all(is_of_type(value, kinds[0], fits) for value in values)
-    return len(values) == len(kinds) and all(is_of_type(*each, fits) for each in zip(values, kinds, strict=True))
+        return all(is_of_type(value, kinds[0]) for value in values)
+    return len(values) == len(kinds) and all(is_of_type(*each) for each in zip(values, kinds, strict=True))
 
 
 def _is_instance(value: Any, kind: Any) -> bool:

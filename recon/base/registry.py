@@ -127,24 +127,15 @@ def plugins(
                 raise ValueError(f"the name is taken by {by}; expected a name of its own")
             with redirect_stdout(sys.stderr):  # stdout is for results
                 found[point.name] = made(point.name, point.load())
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # another package's fault must not stop a scan
+        except (Exception, SystemExit) as error:  # another package's fault must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
-            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {_said(error)}"
+            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
             warnings.warn(
                 f"The {kind.replace('_', ' ')} {_one_line(told)}. Mend or uninstall that package; all else works "
                 "without it.",
                 stacklevel=2,
             )
     return found
-
-
-def _said(error: BaseException) -> str:
-    try:
-        return str(error)
-    except BaseException as again:  # from the text of another package's error, too
-        return f"it does not say why ({type(again).__name__})"
 
 
 def _one_line(text: str) -> str:

@@ -42,6 +42,7 @@ from beamline.core.installed import version
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import preview_shape
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, VALID, write_legend
+from beamline.storage.hdf5 import COMMITTED as COMMITTED
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
@@ -61,7 +62,6 @@ ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
 X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with wide views
 PREVIEW = "/entry/digest/preview"
-COMMITTED = "/entry/progress/frames_committed"
 COUNT_TIME = f"{DETECTOR}/count_time"
 TRIGGER = "/entry/frame_log/trigger"
 FRAMESTAMP = "/entry/frame_log/framestamp"

@@ -63,18 +63,13 @@ def test_no_value_in_any_field_ends_who_reads_a_log(line: str) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        '{"event": "frame", "time": 1.0, "n": "x"}', '{"event": "frame", "time": 1.0, "n": 1.0}',
-        '{"event": "frame", "time": 1.0, "n": true}', f'{{"event": "frame", "time": 1.0, "n": {2**63}}}',
-        '{"event": "frame", "time": 1.0, "mean": NaN}', '{"event": "frame", "time": 1.0, "mb_per_s": 1e999}',
-        f'{{"event": "frame", "time": 1.0, "mean": {"9" * 400}}}', f'{{"event": "frame", "n": {"9" * 5000}}}',
-        '{"event": "state", "time": null}', '{"event": "state", "time": "1"}', '{"event": "state", "time": 1e300}',
-        '{"event": "flag", "time": 1.0, "severity": "a", "rule": "b", "message": "c", "level": [1]}',
-        '{"event": "flag", "time": 1.0, "region": [0, "x"]}', '{"event": "run_started", "sample": {}}',
+        '{"event": "state", "time": null}', '{"event": "state", "time": "1"}', '{"event": "state", "time": 1e999}',
+        '{"event": "state", "time": NaN}',
         f'{{"event": "state", "message": {DEEP}', f'{{"event": "new", "a": {DEEP}{DEEP.replace("[", "]")}}}',
         '{"event": ["state"]}', '{"time": 1.0}', "[1]", "", "\0" * 9, b"\xff\xfe", b'{"event": "new", "a": "\xff"}',
         '{"event": "new", "a": "' + "x" * LONGEST + '"}',
     ],
-    ids=range(24),
+    ids=range(14),
 )  # fmt: skip
 def test_a_line_that_is_no_event(line: str | bytes) -> None:
     assert event_in(line) is None

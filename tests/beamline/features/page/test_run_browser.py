@@ -161,7 +161,7 @@ def test_a_log_is_read_without_its_bad_lines(tmp_path: Path) -> None:
         '{"event": "state", "time": 1.0, "state": "darks", "message": "first"}',
         '{"event": "warning", "time": 2.0}',
     ]
-    bad = ['{"event": "frame", "time": 1.0, "n": "x"}', "[" * 100_000, "no JSON", '{"event": "state",\r"time": 1.0}']
+    bad = ['{"event": "frame", "time": "x"}', "[" * 100_000, "no JSON", '{"event": "state",\r"time": 1.0}']
     (tmp_path / "events.jsonl").write_bytes("\n".join([good[0], *bad, good[1], good[0][:20]]).encode())
     log = EventLog(tmp_path)
     log.refresh()
