@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import JOINED, parts_of, run_of, whole_file
+from beamline.core.files import JOINED, SCAN, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
 from beamline.storage.run_record import read_record
@@ -88,7 +88,8 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     seen = triggers[first : views[-1] + 1]
     return tuple(
         (
-            _planned_before_views(file) + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
+            sum(_planned(file, "start").values())
+            + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
         ).tolist()
     )
 
@@ -100,21 +101,15 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
         files: all of the scan, in the order that they were taken in.
     """
     taken = _after_views(files)
-    return frozenset(kind for kind, n in _planned_after_views(files[0]).items() if len(taken[kind]) < n)
+    return frozenset(kind for kind, n in _planned(files[0], "end").items() if len(taken[kind]) < n)
 
 
-def _planned_before_views(file: h5py.File) -> int:
-    """Number of references planned before the views."""
-    plan = _plan_of(file)
-    fields = (plan.get(kind, {}) for kind in ("darks", "flats"))
-    return sum(int(field["count"]) for field in fields if field.get("at") in ("start", "both"))
-
-
-def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
-    """Numbers of references planned after the views, in the order of acquisition."""
+def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
+    """Numbers of references planned at the "start" or the "end" of the views, in the order of acquisition at the
+    end."""
     plan = _plan_of(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
-    return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in ("end", "both")}
+    return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in (when, "both")}
 
 
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
@@ -157,8 +152,12 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 def other_parts(part: Path) -> list[Path]:
     """The files of the other parts of its run that may hold frames, joined or not."""
     part = part.resolve()
-    files = (folder / part.name for folder in parts_of(run_of(part.parent)))
-    return [file for file in files if file != part and may_hold_frames(file)]
+    return [file for file in files_with_frames(run_of(part.parent), part.name) if file != part]
+
+
+def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
+    """The files of this name in the folders of a run's parts that may hold frames."""
+    return [folder / name for folder in parts_of(run) if may_hold_frames(folder / name)]
 
 
 def may_hold_frames(part: Path) -> bool:
@@ -263,17 +262,12 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         for file, name, first, n in zip(files, names, firsts[:-1], rows, strict=True):
             virtual[first : first + n] = h5py.VirtualSource(name, path, file[path].shape)[:n]
         datasets.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
-    for path, item in _links(files[0]):
-        joined[path] = joined[item]
     del joined[layout.END_TIME]
     files[-1].copy(layout.END_TIME, joined, layout.END_TIME)
     state_ending(joined, replace(ending_in(files[-1]), missing=_missing(files)))
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
     _name_parts(files, names, rows, joined)
-    joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
-    joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
-    layout.state_field_of_view(joined)
-    add_exchange_view(joined)
+    _complete(files[0], joined, int(firsts[-1]))
     return int(firsts[-1])
 
 
@@ -288,10 +282,16 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
         for row in range(n):
             made[row] = item[row]
             target.require_taken()
-    for path, item in _links(file):
-        target[path] = target[item]
-    target[layout.IMAGE_KEY_CONTROL] = target[layout.KIND]
+    _complete(file, target, n)
+
+
+def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
+    """The links of the source, and what a writer adds at the end of its `n` frames."""
+    for name, item in source["/entry/data"].items():
+        if linked := _target(item):
+            target[f"/entry/data/{name}"] = target[linked]
     target[layout.COMMITTED][()], target[layout.FINISHED][()] = n, 1
+    target[layout.IMAGE_KEY_CONTROL] = target[layout.KIND]
     layout.state_field_of_view(target)
     add_exchange_view(target)
 
@@ -320,22 +320,16 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
             source.copy(name, target)
 
 
-def _links(file: h5py.File) -> list[tuple[str, str]]:
-    """Paths of links, and their targets."""
-    data = file["/entry/data"]
-    return [(f"/entry/data/{name}", target) for name, item in data.items() if (target := _target(item))]
-
-
 def _target(item: h5py.HLObject) -> str:
     return datasets.attribute(item, "target")
 
 
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
     """Triggers that gave no frame, in a later part either."""
-    before = _planned_before_views(files[0])
+    before = sum(_planned(files[0], "start").values())
     stored = {before + view for file in files for view in views_in(file)}
     taken, first = _after_views(files), before + (views_planned(files[0]) or 0)
-    for kind, n in _planned_after_views(files[0]).items():
+    for kind, n in _planned(files[0], "end").items():
         stored |= {first + trigger for trigger in taken[kind]}
         first += n
     return tuple(sorted({trigger for file in files for trigger in ending_in(file).missing} - stored))
