@@ -87,9 +87,7 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
     for row in rows.tolist():
         if all(abs(row - other) >= APART for other in apart):
             apart.append(row)
-        if len(apart) == MOST:
-            break
-    return apart
+    return apart[:MOST]
 
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:

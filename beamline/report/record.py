@@ -38,10 +38,10 @@ def history_from(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
     if not arrays:
         return ()
     n = len(arrays["seconds"])
-    columns = []
-    for name, kind in _FIELDS.items():
-        values = np.asarray(arrays.get(name, np.full(n, np.nan))).tolist()
-        columns.append([int(v) for v in values] if kind == "int" else values)
+    columns = [
+        [int(v) if kind == "int" else v for v in np.asarray(arrays.get(name, np.full(n, np.nan))).tolist()]
+        for name, kind in _FIELDS.items()
+    ]
     return tuple(Progress(*values) for values in zip(*columns, strict=True))
 
 

@@ -177,16 +177,10 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
     """The file that joins this one with other parts of its scan, and how many it joins; None if there is none."""
     part = part.resolve()
     for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
-        joined = folder / JOINED
-        if not joined.is_file():
-            continue
-        try:
-            with hdf5.open_hdf5(joined) as file:
-                names = [source.file_name for source in file[layout.DATA].virtual_sources()]
-        except (DataError, *hdf5.ALTERED):
-            continue
-        if part in [(folder / name).resolve() for name in names]:
-            return joined, len(names)
+        with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(folder / JOINED) as file:
+            names = [source.file_name for source in file[layout.DATA].virtual_sources()]
+            if part in [(folder / name).resolve() for name in names]:
+                return folder / JOINED, len(names)
     return None
 
 
@@ -212,12 +206,10 @@ def require_joined(file: h5py.File) -> None:
 
 def is_joined(joined: Path) -> bool:
     """Whether this file exists and has the frames of all parts of its scan."""
-    try:
-        with hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
-            require_joined(file)
-    except DataError:
-        return False
-    return True
+    with suppress(DataError), hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
+        require_joined(file)
+        return True
+    return False
 
 
 def _disagreement(joined: h5py.File, folder: Path) -> str:
@@ -266,7 +258,11 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     files[-1].copy(layout.END_TIME, joined, layout.END_TIME)
     state_ending(joined, replace(ending_in(files[-1]), missing=_missing(files)))
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
-    _name_parts(files, names, rows, joined)
+    group, text = joined.create_group(layout.PARTS), h5py.string_dtype("utf-8")
+    group.attrs["NX_class"] = "NXcollection"
+    group.create_dataset("name", data=list(names), dtype=text)
+    group.create_dataset("frames", data=np.array(rows, np.int64))
+    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
     _complete(files[0], joined, int(firsts[-1]))
     return int(firsts[-1])
 
@@ -288,7 +284,7 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
 def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
     """The links of the source, and what a writer adds at the end of its `n` frames."""
     for name, item in source["/entry/data"].items():
-        if linked := _target(item):
+        if linked := datasets.attribute(item, "target"):
             target[f"/entry/data/{name}"] = target[linked]
     target[layout.COMMITTED][()], target[layout.FINISHED][()] = n, 1
     target[layout.IMAGE_KEY_CONTROL] = target[layout.KIND]
@@ -296,21 +292,12 @@ def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
     add_exchange_view(target)
 
 
-def _name_parts(files: Sequence[h5py.File], names: Sequence[str], rows: Sequence[int], joined: h5py.File) -> None:
-    group = joined.create_group(layout.PARTS)
-    group.attrs["NX_class"] = "NXcollection"
-    text = h5py.string_dtype("utf-8")
-    group.create_dataset("name", data=list(names), dtype=text)
-    group.create_dataset("frames", data=np.array(rows, np.int64))
-    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
-
-
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
     """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
     datasets.copy_attributes(source, target)
     for name, item in source.items():
         path = f"{source.name.rstrip('/')}/{name}"
-        if path in _MADE_ANEW or path in _VIRTUAL or _target(item) not in ("", path):
+        if path in _MADE_ANEW or path in _VIRTUAL or datasets.attribute(item, "target") not in ("", path):
             continue
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)
@@ -318,10 +305,6 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
             datasets.copy_attributes(item, target.create_dataset(name, data=values[path]))
         else:
             source.copy(name, target)
-
-
-def _target(item: h5py.HLObject) -> str:
-    return datasets.attribute(item, "target")
 
 
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
