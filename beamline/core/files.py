@@ -13,8 +13,8 @@ import sys
 import time
 import uuid
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TextIO
@@ -377,6 +377,15 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
         bring_to_disk(partial)
         if partial.read_bytes() != data:
             raise OSError(errno.EIO, "what is read back is not what was written")
+
+
+def write_together(writes: Iterable[tuple[Path, Callable[[Path], object]]]) -> None:
+    """Write each of these files by its function, in order; all of them, or none."""
+    with ExitStack() as undo:
+        for path, write in writes:
+            write(path)
+            undo.callback(remove, path)
+        undo.pop_all()
 
 
 def remove(path: Path) -> None:

@@ -87,9 +87,7 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
     for row in rows.tolist():
         if all(abs(row - other) >= APART for other in apart):
             apart.append(row)
-        if len(apart) == MOST:
-            break
-    return apart
+    return apart[:MOST]
 
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
@@ -99,12 +97,12 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
     kind, replaces = FrameKind(int(source.image_key[row])).name.lower(), source.replaces
     if replaces is not None and (new := np.flatnonzero(replaces == row)).size:
         kind = f"replaced by {new[0]}"
-    labels, regions, alarm = [], [], False
+    labels, regions, colour = [], [], "tab:orange"
     for i, entry in enumerate(flags.legend):
         if not flags.bits[row] >> entry.bit & 1:
             continue
         is_alarm = bool(flags.bits[row] >> entry.alarm_bit & 1)
-        alarm = alarm or is_alarm
+        colour = "tab:red" if is_alarm else colour
         has_score = flags.scores is not None and np.isfinite(flags.scores[row, i])
         score = f" {flags.scores[row, i]:.3g}" if flags.scores is not None and has_score else ""
         labels.append(f"{entry.name} {Level.ALARM if is_alarm else Level.WARN}{score}")
@@ -112,7 +110,9 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
             top, bottom, left, right = flags.regions[row, i].tolist()
             regions.append((top, bottom, left, right))
     title = f"frame {row}, {kind}" + (f", {angle:.1f}°" if np.isfinite(angle) else "")
-    return FlaggedFrame(_small(source.read([row])[0]), source.shape, title, labels, regions, alarm)
+    return FlaggedFrame(
+        _small(source.read([row])[0]), source.shape, title, labels, [(region, colour) for region in regions], colour
+    )
 
 
 def _small(image: NDArray[np.generic]) -> NDArray[np.float32]:

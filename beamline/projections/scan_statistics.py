@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.report.figures import one_panel, png
+from beamline.report.figures import finish, one_panel, png
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
@@ -241,6 +241,6 @@ def histograms(statistics: list[KindStatistics]) -> bytes:
         edges = np.append(each.edges[starts], each.edges[-1])
         shares = np.add.reduceat(each.pixels, starts) / max(each.pixels.sum(), 1) / np.diff(edges)
         axes.stairs(shares, edges, label=f"{each.kind.name.lower()} ({each.frames} of {each.of} frames)")
-    axes.set(xlabel="value of a pixel, as stored", ylabel="share of pixels per unit", yscale="log")
-    axes.legend(fontsize=8)
+    axes.set_yscale("log")
+    finish(axes, "value of a pixel, as stored", "share of pixels per unit")
     return png(figure)

@@ -208,9 +208,7 @@ class VolumeLooks:
 
         Regions of the volume itself would give each method others.
         """
-        reference = self.truth or self.volumes.get(BASELINE)
-        if reference is None and self.direct:
-            reference = self.made.volume
+        reference = self.truth or self.volumes.get(BASELINE) or (self.made.volume if self.direct else None)
         if reference is not None:
             mask = regions(reference, self.context.seed)
             for name, volume in self.volumes.items():

@@ -130,7 +130,7 @@ def measure(
             values |= metrics.contrast(truth.data, volume.data)
     if prepared is None:
         return {name: float(value) for name, value in values.items()}
-    some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
+    some, weights = spread(np.arange(prepared.geometry.n_views), _RESIDUAL_VIEWS), prepared.ray_factors()
     values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights, progress)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
@@ -155,7 +155,7 @@ def residuals_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple
     _, y, x = grid.coordinates()
     inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
     uniform = (Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True))
-    some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
+    some, weights = spread(np.arange(prepared.geometry.n_views), _RESIDUAL_VIEWS), prepared.ray_factors()
     products, total = np.zeros((4, 4)), 0.0  # of the views, the volume and the two uniform ones
     volumes, data = (volume, *uniform), prepared.projections.data
     # What is not looked at in bands of rows takes less memory so.
@@ -237,11 +237,6 @@ def _at_voxel_resolution(
     known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
     own = np.where(known, views, np.float32(0))
     return known, own, at_voxel_resolution(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
-
-
-def _views_compared(geometry: Geometry) -> NDArray[np.int64]:
-    n = geometry.n_views
-    return spread(np.arange(n), _RESIDUAL_VIEWS)
 
 
 def _residual(

@@ -130,19 +130,16 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         table["views on the way back"] = "; ".join(view.in_words() for view in returned)
     remarks = [] if flags is None else reasons(flags)
     remarks += [f"On the way back {view.in_words()} since the first view." for view in returned if view.moved]
-    flagged = [] if flags is None else worst_frames(source, flags)
-    frames = f"{n}/{n + missing}"
-    images = reference_images(source)
     ended = " ".join(finding.message for finding in scan_ended(source)) if source.finished else ""
     return ScanFacts(
         source.path,
         source.path.name,
         sample,
         table,
-        frames,
+        f"{n}/{n + missing}",
         remarks,
-        flagged,
-        images,
+        [] if flags is None else worst_frames(source, flags),
+        reference_images(source),
         source.shape,
         columns,
         ended,
@@ -206,10 +203,6 @@ def sample_radius_note(settings: Mapping[str, Any], prepared: PreparedProjection
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
         f"field ({known}). The whole sample was reconstructed; only the part within the field is written.{sure}"
-    )
-    return Note(
-        f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / field:.2f} times as far as the "
-        f"field ({known}). All of it was reconstructed, and the field's part is written.{sure}"
     )
 
 

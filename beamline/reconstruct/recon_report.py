@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.outcome import ReportContext, ScanFacts, as_text, label_of
+from beamline.reconstruct.outcome import ReportContext, as_text, label_of
 from beamline.report import figures
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
@@ -25,7 +24,7 @@ from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
 from recon.base.views import spread
-from recon.base.volume import Grid, Volume, VolumeSeries
+from recon.base.volume import Volume, VolumeSeries
 from recon.methods import BASELINE
 from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
@@ -60,8 +59,7 @@ def compose(
             *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
             *_doubts(made, prepared, unexplained, context.psnr),
             *_views(prepared),
-            *_stray_mass(context.stray, made.volume.grid, prepared),
-            *_frame_pictures(context.facts),
+            *_further(made, prepared, context),
         ],
         command=context.command,
         recipe=context.recipe,
@@ -156,66 +154,60 @@ def _footnotes(
     return footnotes
 
 
-def _stray_mass(stray: NDArray[np.float32] | None, grid: Grid, prepared: PreparedProjections) -> list[Picture]:
-    if stray is None:
-        return []
-    caption = (
-        "The highest density above each other, of voxels that the views show to be empty. All of it is an artefact: "
-        "less is better."
-    )
-    return [Picture("Stray mass", caption, figures.stray_mass(stray, grid, prepared.length_unit, prepared.kind))]
-
-
-def _frame_pictures(facts: ScanFacts) -> list[Picture]:
-    """Darks, flats and flagged frames, as far as there are any."""
-    pictures = []
+def _further(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Iterator[Picture]:
+    """Stray mass, darks, flats and flagged frames, as far as there are any."""
+    facts = context.facts
+    if context.stray is not None:
+        yield Picture(
+            "Stray mass",
+            "The highest density above each other, of voxels that the views show to be empty. All of it is an "
+            "artefact: less is better.",
+            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, prepared.kind),
+        )
     if facts.references:
-        caption = (
+        yield Picture(
+            "Darks and flats",
             "As the camera gave them. Smooth flats are better: what stands in them and moves, or is missing in the "
-            "views, makes rings. Their ratio, where there are two groups, is better the nearer it is to one everywhere."
+            "views, makes rings. Their ratio, where there are two groups, is better the nearer it is to one "
+            "everywhere.",
+            reference_sheet(facts.references, facts.shape),
         )
-        pictures.append(Picture("Darks and flats", caption, reference_sheet(facts.references, facts.shape)))
     if facts.flagged:
-        caption = (
+        yield Picture(
+            "Flagged frames",
             "The worst of the frames that the monitor flagged, as the camera gave them, with the place of the flag if "
-            "it has one. Red: an alarm, the view is left out; orange: a warning, it weighs half."
+            "it has one. Red: an alarm, the view is left out; orange: a warning, it weighs half.",
+            contact_sheet(facts.flagged),
         )
-        pictures.append(Picture("Flagged frames", caption, contact_sheet(facts.flagged)))
-    return pictures
 
 
-def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
+def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
     """Slices of all volumes, and in what these differ from the first."""
     unit, kind = prepared.length_unit, prepared.kind
     shown = {"Truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
-    pictures = [
-        Picture(
-            "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
-            "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
-            figures.orthogonal_slices(shown, unit, kind),
-        ),
-        Picture(
-            "Sharpest edge, and values",
-            "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
-            "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
-            figures.profile_and_values(shown, unit, kind),
-        ),
-    ]
+    yield Picture(
+        "Slices",
+        "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
+        "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
+        figures.orthogonal_slices(shown, unit, kind),
+    )
+    yield Picture(
+        "Sharpest edge, and values",
+        "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
+        "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
+        figures.profile_and_values(shown, unit, kind),
+    )
     if len(shown) > 1:
-        pictures.append(
-            Picture(
-                "Differences",
-                f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
-                + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
-                figures.differences(shown, unit, kind),
-            )
+        yield Picture(
+            "Differences",
+            f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
+            + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
+            figures.differences(shown, unit, kind),
         )
-    return pictures
 
 
-def _several(series: VolumeSeries) -> list[Picture]:
+def _several(series: VolumeSeries) -> Iterator[Picture]:
     """Slices of some of several volumes, side by side."""
     of, what = (
         ("material", "materials in one grey window: 1 where a voxel is full of it.")
@@ -224,7 +216,6 @@ def _several(series: VolumeSeries) -> list[Picture]:
     )
     n, depth = series.data.shape[:2]
     some = spread(np.arange(n), _SHOWN)
-    pictures = []
     for title, turned in ((f"Slices of each {of}", False), (f"Upright slices of each {of}", True)):
         if turned and depth < _UPRIGHT:
             continue
@@ -232,9 +223,7 @@ def _several(series: VolumeSeries) -> list[Picture]:
         for k in some:
             volume = series.data[k]
             sheet.add(series.labels[k], volume.swapaxes(0, 1) if turned else volume)
-        caption = f"{len(some)} of {n} {what}"
-        pictures.append(Picture(title, caption, sheet.png(sheet.labels())))
-    return pictures
+        yield Picture(title, f"{len(some)} of {n} {what}", sheet.png(sheet.labels()))
 
 
 def _doubts(
@@ -242,80 +231,66 @@ def _doubts(
     prepared: PreparedProjections,
     unexplained: Unexplained | None,
     psnr: Sequence[tuple[float, float]],
-) -> list[Picture]:
+) -> Iterator[Picture]:
     """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
-    unit, kind, pictures = prepared.length_unit, prepared.kind, []
+    unit, kind = prepared.length_unit, prepared.kind
     if unseen := unseen_wedges(prepared.geometry):
-        pictures.append(Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit)))
+        yield Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit))
     if made.deviation is not None:
-        pictures.append(
-            Picture(
-                "Error bars",
-                "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
-                "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
-                figures.error_bars(made.volume, made.deviation, unit, kind),
-            )
+        yield Picture(
+            "Error bars",
+            "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
+            "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
+            figures.error_bars(made.volume, made.deviation, unit, kind),
         )
     if unexplained is not None:
         at = len(unexplained.significance) // 2
-        pictures.append(
-            Picture(
-                "What the volume leaves in the views",
-                "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
-                "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
-                "much, red: too little.",
-                figures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
-            )
+        yield Picture(
+            "What the volume leaves in the views",
+            "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
+            "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
+            "much, red: too little.",
+            figures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
         )
     if made.history:
-        pictures.append(
-            Picture(
-                "Quality against time",
-                _history_caption(made, psnr),
-                quality_against_time(history_arrays(made.history), psnr, price_of_decibel(made)),
-            )
+        yield Picture(
+            "Quality against time",
+            _history_caption(made, psnr),
+            quality_against_time(history_arrays(made.history), psnr, price_of_decibel(made)),
         )
-    return pictures
 
 
-def _views(prepared: PreparedProjections) -> list[Picture]:
+def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     """A corrected view, a sinogram, the search of the axis, and the poses."""
     data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
-    pictures = [
-        Picture(
-            "Projection",
-            f"One corrected view: the line integral of the {prepared.kind.value} along each ray. Air is better the "
-            "nearer to 0 and the more even it is.",
-            figures.projection(data, geometry, 0, unit),
-        ),
-        Picture(
-            "Sinogram",
-            "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
-            "that breaks off is a view that does not fit.",
-            figures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
-        ),
-    ]
+    yield Picture(
+        "Projection",
+        f"One corrected view: the line integral of the {prepared.kind.value} along each ray. Air is better the "
+        "nearer to 0 and the more even it is.",
+        figures.projection(data, geometry, 0, unit),
+    )
+    yield Picture(
+        "Sinogram",
+        "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
+        "that breaks off is a view that does not fit.",
+        figures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
+    )
     if axis is not None:
-        pictures.append(
-            Picture(
-                "Rotation axis",
-                f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): lower is "
-                "better, 0 is perfect agreement, about 1 is none. Columns of the binned detector.",
-                figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
-            )
+        yield Picture(
+            "Rotation axis",
+            f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): lower is "
+            "better, 0 is perfect agreement, about 1 is none. Columns of the binned detector.",
+            figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
     if geometry.shifts.any() or turns.any():
         moved = geometry.shifts * geometry.sample_pitch
-        pictures.append(
-            Picture(
-                "Poses of the views",
-                "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
-                "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
-                figures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
-            )
+        yield Picture(
+            "Poses of the views",
+            "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
+            "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
+            figures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
         )
-    return pictures
 
 
 def _of_wedges(unseen: Sequence[Wedge]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone, Warned
-from beamline.core.files import remove
+from beamline.core.files import write_together
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
@@ -177,11 +176,8 @@ def _title(made: Reconstruction, context: ReportContext) -> str:
 
 def _write(record: ReconRecord, target: OutputPaths) -> None:
     """All files, or none of them."""
-    with ExitStack() as undo:
-        for path, each in zip(target.outputs, _in_files(record, target.names), strict=True):
-            write_volume(path, each, replace=target.replace)
-            undo.callback(remove, path)
-        undo.pop_all()
+    records = zip(target.outputs, _in_files(record, target.names), strict=True)
+    write_together((path, partial(write_volume, record=each, replace=target.replace)) for path, each in records)
 
 
 def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord]:

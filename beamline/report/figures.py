@@ -44,22 +44,85 @@ def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: 
     return (bottom, top) if top > bottom else (bottom, bottom + 1.0)
 
 
-def show_grey(
+def show_image(
     axes: Axes,
     image: NDArray[np.floating],
     window: GreyWindow,
     extent: tuple[float, float, float, float] | None = None,
     stretched: bool = False,
+    colours: str = "gray",
 ) -> AxesImage:
-    """Draw an image, row 0 at the top, in a grey window, a pixel as a square unless `stretched`.
+    """Draw an image, row 0 at the top, in the colours of a window; a pixel is a square unless `stretched`.
 
     Args:
         extent: edges left, right, bottom, top; None: pixels.
+        colours: a colour map in place of greys.
     """
     return axes.imshow(
-        image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, aspect="auto" if stretched else "equal",
+        image, cmap=colours, vmin=window[0], vmax=window[1], extent=extent, aspect="auto" if stretched else "equal",
         interpolation="nearest",
     )  # fmt: skip
+
+
+def finish(axes: Axes, across: str, down: str, title: str = "", size: float = 10.0, grid: bool = False) -> None:
+    """Axis labels of `size` points, a title, a legend of what has a label, and the lines of a `grid` under curves."""
+    axes.set_xlabel(across, fontsize=size, labelpad=1)
+    axes.set_ylabel(down, fontsize=size, labelpad=1)
+    axes.set_title(title, fontsize=size + 1, pad=4)
+    axes.tick_params(labelsize=size - 1)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8)
+    if grid:
+        axes.grid(alpha=0.3)
+
+
+Plane = tuple[str, str, tuple[float, float, float, float]]
+"""Labels of the axes to the right and downwards of a slice, and its edges left, right, bottom, top."""
+
+
+def planes(grid: Grid, unit: str) -> list[Plane]:
+    """The planes of the slices across z, y and x."""
+    ends = [(at - n / 2 * grid.voxel_size, at + n / 2 * grid.voxel_size)
+            for at, n in zip(grid.centre, grid.shape, strict=True)]  # fmt: skip
+    return [
+        (f"{'zyx'[across]} ({unit})", downwards("zyx"[down], unit), (*ends[across], *ends[down][::-1]))
+        for down, across in ((1, 2), (0, 2), (0, 1))
+    ]
+
+
+def draw_slice(
+    axes: Axes,
+    image: NDArray[np.floating],
+    plane: Plane,
+    title: str,
+    window: GreyWindow,
+    colours: str = "gray",
+    size: float = 10.0,
+) -> AxesImage:
+    """Draw a slice with its axes, labels of `size` points; `window`, `colours`: as of `show_image`."""
+    from matplotlib.ticker import MaxNLocator
+
+    across, down, edges = plane
+    shown = show_image(axes, image, window, edges, image.shape[0] < _THIN * image.shape[1], colours)
+    axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
+    finish(axes, across, down, title, size)
+    return shown
+
+
+def orthogonal_cuts(volume: Volume, at: Sequence[int]) -> list[NDArray[np.float32]]:
+    """The slices across z, y and x through a voxel."""
+    return [volume.data[(slice(None),) * i + (place,)] for i, place in enumerate(at)]
+
+
+def draw_cuts(
+    row: Sequence[Axes], volume: Volume, at: Sequence[int], unit: str, name: str, window: GreyWindow, colours: str
+) -> AxesImage:
+    """Draw the orthogonal slices through a voxel side by side, the first one under a name."""
+    centres, cuts = volume.grid.coordinates(), orthogonal_cuts(volume, at)
+    for i, (axes, image, plane) in enumerate(zip(row, cuts, planes(volume.grid, unit), strict=True)):
+        place = f"{'zyx'[i]} = {centres[i][at[i]]:.3g} {unit}"
+        shown = draw_slice(axes, image, plane, f"{name}, {place}" if name and i == 0 else place, window, colours, 7)
+    return shown
 
 
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
@@ -72,12 +135,9 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     width = _BESIDE_BAR if thin else min(_BESIDE_BAR, height * cols / rows)
     figure, ((axes,),) = panels([width], [height], right=BAR)
     edges = left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch
-    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=thin)
+    image = show_image(axes, data[view], grey_window([data[view]]), edges, stretched=thin)
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
-    axes.set(
-        xlabel=f"u ({unit})", ylabel=downwards("z", unit), title=f"View at {np.degrees(geometry.angles[view]):.2f}°"
-    )
+    finish(axes, f"u ({unit})", downwards("z", unit), f"View at {np.degrees(geometry.angles[view]):.2f}°")
     add_bar(figure, image, "line integral")
     return png(figure)
 
@@ -90,27 +150,14 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
     figure, ((axes,),) = panels([_BESIDE_BAR], [3.4], right=BAR)
-    image = show_grey(axes, image_rows, grey_window([image_rows]), stretched=True)
+    image = show_image(axes, image_rows, grey_window([image_rows]), stretched=True)
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     ticks = MaxNLocator(7, steps=[1, 1.5, 2, 3, 4.5, 6, 9, 10]).tick_values(angles[0], angles[-1])
     ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
     axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
-    axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
+    finish(axes, "column (px)", "angle (°)", f"Sinogram of row {row}, {len(order)} views")
     add_bar(figure, image, "line integral")
     return png(figure)
-
-
-def planes(grid: Grid) -> list[tuple[str, str, GreyWindow, GreyWindow]]:
-    """Axes (right, down) and edges of the slices at one z, y and x: left and right, bottom and top."""
-    z, y, x = (_edges(grid.centre[i], grid.shape[i], grid.voxel_size) for i in range(3))
-    return [("x", "y", x, y[::-1]), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
-
-
-def slice_extent(grid: Grid) -> tuple[float, float, float, float]:
-    """Edges left, right, bottom and top of a slice [y, x], y downwards."""
-    _, _, across, down = planes(grid)[0]
-    return *across, *down
 
 
 def downwards(axis: str, unit: str) -> str:
@@ -133,29 +180,16 @@ def orthogonal_slices(
         unit: of length.
         kind: what the voxels are.
     """
-    from matplotlib.ticker import MaxNLocator
-
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
-    slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
-    greys = matter_window(*(image for images in slices.values() for image in images))
+    greys = matter_window(*(image for volume in volumes.values() for image in orthogonal_cuts(volume, at)))
     height = max(ny / nx, nz / nx, nz / ny, _THIN)
     column = min((WIDTH - _BESIDE - BAR - 2 * _BESIDE) / 3, 12 / (height * len(volumes)))
     down = [column * height] * len(volumes)
     figure, rows = panels([column] * 3, down, dpi_for(nx, column), left=_BESIDE, gap=_BESIDE, right=BAR)
-    for row, (name, images) in zip(rows, slices.items(), strict=True):
-        for i, (axes, image, (across, downward, h_edges, v_edges)) in enumerate(
-            zip(row, images, planes(first), strict=True)
-        ):
-            thin = image.shape[0] < _THIN * image.shape[1]
-            shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
-            axes.tick_params(labelsize=6)
-            axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
-            axes.set_xlabel(f"{across} ({unit})", fontsize=7, labelpad=1)
-            axes.set_ylabel(downwards(downward, unit), fontsize=7, labelpad=1)
-            place = f"{'zyx'[i]} = {first.coordinates()[i][at[i]]:.3g} {unit}"
-            axes.set_title(place if i else f"{name}, {place}", fontsize=8, pad=3)
+    for row, (name, volume) in zip(rows, volumes.items(), strict=True):
+        shown = draw_cuts(row, volume, at, unit, name, greys, "gray")
     add_bar(figure, shown, kind.label(unit), size=7)
     return png(figure)
 
@@ -163,23 +197,15 @@ def orthogonal_slices(
 def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """Where each volume is denser (red) or less dense (blue) than the first one, in the slice z of
     `orthogonal_slices`."""
-    from matplotlib.ticker import MaxNLocator
-
     (first, reference), *others = volumes.items()
     z = bright_centre(list(volumes.values())[-1].data)[0]
     images = [volume.data[z] - reference.data[z] for _, volume in others]
     reach = max(-grey_window(images)[0], grey_window(images)[1], 1e-12)
-    _, ny, nx = reference.grid.shape
+    (_, ny, nx), plane = reference.grid.shape, planes(reference.grid, unit)[0]
     column = min((WIDTH - 1.2) / len(images), 5.4)
     figure = new_figure((1.2 + column * len(images), 0.9 + column * ny / nx), dpi_for(nx, column))
     for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
-        shown = axes.imshow(
-            image, cmap="RdBu_r", extent=slice_extent(reference.grid), vmin=-reach, vmax=reach, interpolation="nearest",
-        )  # fmt: skip
-        axes.tick_params(labelsize=7)
-        axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
-        axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit))
-        axes.set_title(f"{name} − {first}", fontsize=10)
+        shown = draw_slice(axes, image, plane, f"{name} − {first}", (-reach, reach), "RdBu_r", 9)
     figure.colorbar(shown, ax=figure.axes, label=f"difference ({kind.unit(unit)})", shrink=0.8, pad=0.02)
     return png(figure)
 
@@ -209,37 +235,33 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
         count, edges = np.histogram(few, bins=120, range=(low, high))
         right.stairs(count / few.size, edges, lw=1.2, label=name)
     left.xaxis.set_major_locator(MaxNLocator(5))
-    left.set(xlabel=f"along the line ({unit})", ylabel=kind.label(unit))
-    left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
-    right.set(xlabel=kind.label(unit), ylabel="share of voxels", yscale="log")
-    right.set_title("Values", fontsize=9)
+    right.set_yscale("log")
     right.yaxis.set_major_formatter("{x:g}")  # powers set as formulas take as long as the rest
     right.yaxis.set_minor_formatter(NullFormatter())  # which ticks of a decade to name takes long, and none is named
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+    edge = f"Edge at y = {y}, x = {x} of slice {z} (voxels)"
+    finish(left, f"along the line ({unit})", kind.label(unit), edge, 9, grid=True)
+    finish(right, kind.label(unit), "share of voxels", "Values", 9, grid=True)
     return png(figure)
 
 
 def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> bytes:
     """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
-    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", "RdBu_r", 8.0)
+    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", (-8.0, 8.0), "RdBu_r")
 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
-    return _map(image, grid, unit, "Highest density where views show nothing", kind.label(unit), "magma")
+    window, title = (float(np.min(image)), float(np.max(image))), "Highest density where views show nothing"
+    return _map(image, grid, unit, title, kind.label(unit), window, "magma")
 
 
 def _map(
-    image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, colours: str, reach: float | None = None
+    image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, window: GreyWindow, colours: str
 ) -> bytes:
-    """An image [y, x] of a slice of the grid, with a bar of its colours, which end at ±`reach`, or its values."""
+    """An image [y, x] of a slice of the grid, with a bar of its colours."""
     figure, axes = one_panel(5.4, 6.4)
-    low = None if reach is None else -reach
-    shown = axes.imshow(image, colours, vmin=low, vmax=reach, extent=slice_extent(grid), interpolation="nearest")
-    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=title)
-    figure.colorbar(shown, ax=axes, label=label, pad=0.02)
+    drawn = draw_slice(axes, image, planes(grid, unit)[0], title, window, colours)
+    figure.colorbar(drawn, ax=axes, label=label, pad=0.02)
     return png(figure)
 
 
@@ -249,7 +271,8 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = one_panel(5.4, 6.4)
-    show_grey(axes, volume.data[at], matter_window(volume.data[at]), slice_extent(grid))
+    image, title = volume.data[at], f"Rays that no view shows, slice {at}"
+    draw_slice(axes, image, planes(grid, unit)[0], title, matter_window(image))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
         first, last = wedge.rays
@@ -257,26 +280,24 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
             sector = Sector((0, 0), radius, first + turn, last + turn, facecolor=("tab:orange", 0.08))
             sector.set(edgecolor="tab:orange", linewidth=1.2)
             axes.add_patch(sector)
-    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Rays that no view shows, slice {at}")
     return png(figure)
 
 
 def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
-    at = bright_centre(volume.data)[0]
-    grid = volume.grid
+    at, grid = bright_centre(volume.data)[0], volume.grid
     figure = new_figure((WIDTH, 4.4), dpi_for(grid.shape[2], WIDTH / 2.4))
-    extent = slice_extent(grid)
     length = round_length(grid.shape[2] * grid.voxel_size / 5)
-    panels = ((volume, kind.value, "gray"), (deviation, "standard deviation", "magma"))
-    for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
-        image = shown.data[at]
-        low, high = matter_window(image) if shown is volume else grey_window([image], 0.5, 99.5)
-        drawn = axes.imshow(image, cmap=colours, extent=extent, vmin=low, vmax=high, interpolation="nearest")
-        left, top = extent[0] + length / 4, extent[3] + length / 4
-        axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")
-        axes.text(left, top + length / 8, f"{length:g} {unit}", color="white", fontsize=8, va="top")
-        axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
+    panels = (
+        (volume.data[at], kind.value, "gray", matter_window(volume.data[at])),
+        (deviation.data[at], "standard deviation", "magma", grey_window([deviation.data[at]], 0.5, 99.5)),
+    )
+    for axes, (image, label, colours, window) in zip(figure.subplots(1, 2), panels, strict=True):
+        drawn = draw_slice(axes, image, planes(grid, unit)[0], f"Slice {at}", window, colours)
+        left, _, _, top = drawn.get_extent()
+        across, down = [left + length / 4, left + 5 * length / 4], top + length / 4
+        axes.plot(across, [down, down], color="white", lw=3, solid_capstyle="butt")
+        axes.text(across[0], down + length / 8, f"{length:g} {unit}", color="white", fontsize=8, va="top")
         figure.colorbar(drawn, ax=axes, label=f"{label} ({kind.unit(unit)})", shrink=0.8)
     return png(figure)
 
@@ -292,10 +313,8 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
     figure, ((axes,),) = panels([WIDTH - _LEFT - _GAP], [1.95])
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
-    axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
-    axes.set_title("Rotation axis: " + ("a clear optimum" if confident else "NOT a clear optimum"))
-    axes.legend(fontsize=8)
-    axes.grid(alpha=0.3)
+    title = "Rotation axis: " + ("a clear optimum" if confident else "NOT a clear optimum")
+    finish(axes, "axis candidate (column, px)", "mismatch", title, grid=True)
     return png(figure)
 
 
@@ -310,9 +329,7 @@ def pose_curves(
     for axes, (values, label, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
         for column, name in enumerate(names):
             axes.plot(angles_deg[order], values[order, column], lw=1.0, marker=".", ms=2, label=name)
-        axes.set(xlabel="angle (degrees)", ylabel=label)
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.3)
+        finish(axes, "angle (degrees)", label, grid=True)
     return png(figure)
 
 
@@ -332,10 +349,6 @@ def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
         return data.shape[0] // 2, data.shape[1] // 2, data.shape[2] // 2
     centre = (step * float(m @ np.arange(m.size)) / total for step, m in zip(steps, marginals, strict=True))
     return tuple(round(at) for at in centre)
-
-
-def _edges(centre: float, n: int, size: float) -> tuple[float, float]:
-    return centre - n / 2 * size, centre + n / 2 * size
 
 
 def dpi_for(voxels: int, inches: float) -> float:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.report.figures import WIDTH, new_figure, png
+from beamline.report.figures import WIDTH, finish, new_figure, png
 from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit, record
 from recon.base.method import Progress, Reconstruction
 from recon.splatting.settings import FitSettings
@@ -38,10 +38,10 @@ def history_from(arrays: Mapping[str, NDArray[Any]]) -> tuple[Progress, ...]:
     if not arrays:
         return ()
     n = len(arrays["seconds"])
-    columns = []
-    for name, kind in _FIELDS.items():
-        values = np.asarray(arrays.get(name, np.full(n, np.nan))).tolist()
-        columns.append([int(v) for v in values] if kind == "int" else values)
+    columns = [
+        [int(v) if kind == "int" else v for v in np.asarray(arrays.get(name, np.full(n, np.nan))).tolist()]
+        for name, kind in _FIELDS.items()
+    ]
     return tuple(Progress(*values) for values in zip(*columns, strict=True))
 
 
@@ -136,17 +136,14 @@ def quality_against_time(
     if psnr:
         axes = others.pop(0)
         axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
-        axes.set(xlabel="time (s)", ylabel="PSNR (dB)", title="Quality against the truth")
+        finish(axes, "time (s)", "PSNR (dB)", "Quality against the truth", grid=True)
     if growing:
         axes = others.pop(0)
         for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):
             values = history[name] / np.max(history[name])
             axes.step(seconds, values, where="post", color=colour, lw=1.2, label=f"{label} / {history[name].max():.0f}")
-        axes.set(xlabel="time (s)", ylabel="share of the largest", ylim=(0, 1.05), title="Growth")
-        axes.legend(fontsize=8, loc="lower right")
-    for panel in figure.axes:
-        panel.grid(alpha=0.3)
-        panel.tick_params(labelsize=8)
+        axes.set_ylim(0, 1.05)
+        finish(axes, "time (s)", "share of the largest", "Growth", grid=True)
     return png(figure)
 
 
@@ -171,8 +168,7 @@ def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
         axes.set_ylim(bottom=0)
-    axes.set(xlabel="time (s)", title="Misfit")
-    axes.legend(fontsize=8)
+    finish(axes, "time (s)", "", "Misfit", grid=True)
 
 
 def _decibels(
@@ -180,7 +176,7 @@ def _decibels(
 ) -> None:
     """The residual as dB below the data, and the time at which the next dB is expected."""
     axes.plot(seconds, quality, color="tab:green", lw=1.2, marker=".", ms=3)
-    axes.set(xlabel="time (s)", ylabel="dB below the data", title=f"Residual, {views}")
+    finish(axes, "time (s)", "dB below the data", f"Residual, {views}", grid=True)
     if further is None or seconds.size == 0:
         return
     if not further.measurable:

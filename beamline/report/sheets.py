@@ -14,11 +14,12 @@ from beamline.report.figures import (
     GreyWindow,
     bright_centre,
     dpi_for,
+    finish,
     grey_window,
     new_figure,
     panels,
     png,
-    show_grey,
+    show_image,
 )
 from recon.base.arrays import F32
 from recon.base.greys import matter_window
@@ -75,9 +76,6 @@ class SliceSheet:
         return png(figure)
 
 
-_COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
-
-
 @dataclass(frozen=True, eq=False)
 class FlaggedFrame:
     """A frame for the sheet.
@@ -87,19 +85,20 @@ class FlaggedFrame:
         extent: (rows, cols) of the whole frame, in pixels of the detector.
         reasons: a line for each flag.
         regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
-            the last.
+            the last; each with the colour of its box.
+        colour: of the frame around it.
     """
 
     image: NDArray[np.float32]
     extent: tuple[int, int]
     title: str
     reasons: Sequence[str]
-    regions: Sequence[tuple[int, int, int, int]]
-    alarm: bool
+    regions: Sequence[tuple[tuple[int, int, int, int], str]]
+    colour: str = "black"
 
 
-def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
-    """The frames as PNG, row 0 at the top, in one grey window, with a box around each region."""
+def contact_sheet(frames: Sequence[FlaggedFrame], window: GreyWindow | None = None, title: str = "") -> bytes:
+    """The frames as PNG, row 0 at the top, in one grey window (None: by all of them), with a box around each region."""
     from matplotlib.patches import Rectangle
 
     down = -(-len(frames) // COLUMNS)
@@ -107,21 +106,20 @@ def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     rows, cols = frames[0].extent
     width = WIDTH / COLUMNS
     height = np.clip(width * rows / cols, 0.5, 3.0) + 0.25 + 0.13 * lines
-    figure = new_figure((WIDTH, float(height) * down))
-    window = grey_window([frame.image for frame in frames], 0.5, 99.5)
+    figure = new_figure((WIDTH, float(height) * down + 0.25 * bool(title)))
+    figure.suptitle(title, fontsize=8)
+    window = window or grey_window([frame.image for frame in frames], 0.5, 99.5)
     panels = np.ravel(figure.subplots(down, COLUMNS, squeeze=False))
     for axes in panels[len(frames) :]:
         axes.set_axis_off()
     for axes, frame in zip(panels, frames, strict=False):
         _show(axes, frame.image, window, frame.extent)
-        colour = _COLOURS[frame.alarm]
-        for top, bottom, left, right in frame.regions:
+        for (top, bottom, left, right), colour in frame.regions:
             box = Rectangle((left - 0.5, top - 0.5), right - left, bottom - top, fill=False, ec=colour, lw=1.2)
             axes.add_patch(box)
         for side in axes.spines.values():
-            side.set(color=colour, linewidth=1.5)
-        axes.tick_params(labelsize=5, length=2)
-        axes.set_title("\n".join([frame.title, *frame.reasons]), fontsize=6.5)
+            side.set(color=frame.colour, linewidth=1.5)
+        finish(axes, "", "", "\n".join([frame.title, *frame.reasons]), 6)
     return png(figure)
 
 
@@ -138,10 +136,7 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
     figure, (row,) = panels([width] * len(images), [high], gap=1.3, right=0.5)
     for axes, (title, image) in zip(row, images.items(), strict=True):
         shown = _show(axes, image, grey_window([image], 0.5, 99.5), shape)
-        axes.tick_params(labelsize=6)
-        axes.set_title(title, fontsize=8)
-        axes.set_xlabel("column", fontsize=7)
-        axes.set_ylabel("← row", fontsize=7)
+        finish(axes, "column", "← row", title, 7)
         figure.colorbar(shown, ax=axes, fraction=0.05, pad=0.02).ax.tick_params(labelsize=6)
     return png(figure)
 
@@ -150,4 +145,4 @@ def _show(axes: Axes, image: NDArray[np.float32], window: GreyWindow, shape: tup
     """Draw an image of the whole detector of so many rows and columns, in its pixels."""
     rows, cols = shape
     edges = -0.5, cols - 0.5, rows - 0.5, -0.5
-    return show_grey(axes, image, window, edges, stretched=rows < 0.15 * cols)
+    return show_image(axes, image, window, edges, stretched=rows < 0.15 * cols)

@@ -7,11 +7,10 @@ file joins them all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 
@@ -24,13 +23,13 @@ from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
 from beamline.storage.parts import (
     end_references_missing,
+    files_with_frames,
     is_joined,
     join,
-    may_hold_frames,
     views_in,
     views_planned,
 )
-from beamline.storage.recover import Recovered, recover
+from beamline.storage.recover import Recovered, recover, require_ours
 from beamline.storage.run_record import alive
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
@@ -165,8 +164,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
-            if layout.COMMITTED not in file:
-                raise DataError(f"{part} is not a scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
+            require_ours(part, file)
             for other in (config, given):
                 if other is not None:
                     require_same_config(run, file["/entry/record/config"].asstr()[()], other)
@@ -198,9 +196,8 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 def _files(run: Path) -> tuple[list[Path], list[str]]:
     """The files of the parts, without those of parts that ended before their first frame, and a sentence on each of
     these."""
-    scans = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]
-    files = [scan for scan in scans if may_hold_frames(scan)]
-    empty = [scan for scan in scans if scan not in files]
+    files = files_with_frames(run)
+    empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
     return files, [f"{scan} is left out: no frame can be read in it, and its {RECORD} has none." for scan in empty]
 
 
@@ -220,14 +217,8 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
         raise ConfigError(f"{run} was planned with other angles: has their file changed? {_UNTOUCHED}")
     if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
         raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
-    devices = stored["/entry/instrument/devices"]
-    for device, description in ready.info.devices.items():
-        group = datasets.resolve(devices, device.replace("/", "_")) or {}
-        before, now = _identity({key: group[key][()] for key in group}), _identity(description)
-        if before != now:
-            raise ConfigError(
-                f"{run} was taken with another {device}: {_words(before)}; now there is {_words(now)}. {_UNTOUCHED}"
-            )
+    for device, before, now, _ in _devices_differing(stored, ready):
+        raise ConfigError(f"{run} was taken with another {device}: {before}; now there is {now}. {_UNTOUCHED}")
 
 
 def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
@@ -235,29 +226,31 @@ def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
     port."""
     differing: list[str] = []
     with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
-        files = sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)
-        for path in files[-1:]:
+        for path in sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)[-1:]:
             with hdf5.open_hdf5(path) as stored:
-                devices = stored["/entry/instrument/devices"]
-                for device, description in ready.info.devices.items():
-                    group = datasets.resolve(devices, device.replace("/", "_")) or {}
-                    earlier = {key: datasets.text(group[key][()]) for key in group}
-                    before, now = _identity(earlier), _identity(description)
-                    if "port" in description and earlier.get("port") == description["port"] and before != now:
-                        differing.append(
-                            f"{device}: at {description['port']} there is {_words(now)}; in {path.parent.name}, the "
-                            f"run before, it was {_words(before)}. If cables or ports were swapped, stop the scan. "
-                            "devices.stage.serial refuses another device, where its controller tells a serial number."
-                        )
+                differing += [
+                    f"{device}: at {port} there is {now}; in {path.parent.name}, the run before, it was {before}. If "
+                    "cables or ports were swapped, stop the scan. devices.stage.serial refuses another device, where "
+                    "its controller tells a serial number."
+                    for device, before, now, port in _devices_differing(stored, ready)
+                    if port
+                ]
     return differing
 
 
-def _identity(said: Mapping[str, Any]) -> dict[str, str]:
-    return {key: datasets.text(said[key]) for key in _IDENTITY if key in said}
-
-
-def _words(identity: Mapping[str, str]) -> str:
-    return ", ".join(f"{key} {value}" for key, value in identity.items()) or "none"
+def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str, str]]:
+    """Each device whose identity differs from that in a file: its name, both identities, and its port; "" for another
+    port than in the file."""
+    for device, description in ready.info.devices.items():
+        group = datasets.resolve(stored["/entry/instrument/devices"], device.replace("/", "_")) or {}
+        earlier = {key: datasets.text(group[key][()]) for key in group}
+        before, now = (
+            ", ".join(f"{key} {datasets.text(facts[key])}" for key in _IDENTITY if key in facts) or "none"
+            for facts in (earlier, description)
+        )
+        if before != now:
+            port = str(description.get("port", ""))
+            yield device, before, now, port if earlier.get("port") == port else ""
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import joined_file_of, may_hold_frames, to_join, views_in, views_planned
+from beamline.storage.parts import files_with_frames, joined_file_of, to_join, views_in, views_planned
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
@@ -31,8 +31,7 @@ def scan_file(path: str | Path) -> Path:
         return _no_run(path, SCAN)
     if (path / JOINED).is_file():
         return path / JOINED
-    parts = [part / SCAN for part in parts_of(path) if may_hold_frames(part / SCAN)]
-    if len(parts) > 1:
+    if len(parts := files_with_frames(path)) > 1:
         step = next_step(parts[-1]) or f"{to_join(path)}."
         raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
     return path / SCAN
@@ -86,7 +85,7 @@ def next_step(scan: Path) -> str:
     if lives or (run is not None and held(run / EVENTS, exclusively=True)) or (growing and held(scan)):
         watch = "" if run is None else f"`beamline watch {run}` shows it, "
         return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
-    if run is not None and not any(may_hold_frames(part / SCAN) for part in parts_of(run)):
+    if run is not None and not files_with_frames(run):
         return "It ended before its first frame: start the scan anew."
     if not growing:
         if run is not None and head is not None and _lacks_views(run):
@@ -105,11 +104,10 @@ def _lacks_views(run: Path) -> bool:
     """Whether the files of a run, all closed, lack views of its plan."""
     planned, views = 0, set[int]()
     try:
-        for part in parts_of(run):
-            if may_hold_frames(part / SCAN):
-                with hdf5.open_hdf5(part / SCAN) as file, hdf5.readable(part / SCAN):
-                    planned = views_planned(file) or 0
-                    views |= views_in(file)
+        for part in files_with_frames(run):
+            with hdf5.open_hdf5(part) as file, hdf5.readable(part):
+                planned = views_planned(file) or 0
+                views |= views_in(file)
     except (DataError, *hdf5.ALTERED):
         return False
     return len(views) < planned

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import JOINED, parts_of, run_of, whole_file
+from beamline.core.files import JOINED, SCAN, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
 from beamline.storage.run_record import read_record
@@ -88,7 +88,8 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     seen = triggers[first : views[-1] + 1]
     return tuple(
         (
-            _planned_before_views(file) + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
+            sum(_planned(file, "start").values())
+            + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
         ).tolist()
     )
 
@@ -100,21 +101,15 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
         files: all of the scan, in the order that they were taken in.
     """
     taken = _after_views(files)
-    return frozenset(kind for kind, n in _planned_after_views(files[0]).items() if len(taken[kind]) < n)
+    return frozenset(kind for kind, n in _planned(files[0], "end").items() if len(taken[kind]) < n)
 
 
-def _planned_before_views(file: h5py.File) -> int:
-    """Number of references planned before the views."""
-    plan = _plan_of(file)
-    fields = (plan.get(kind, {}) for kind in ("darks", "flats"))
-    return sum(int(field["count"]) for field in fields if field.get("at") in ("start", "both"))
-
-
-def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
-    """Numbers of references planned after the views, in the order of acquisition."""
+def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
+    """Numbers of references planned at the "start" or the "end" of the views, in the order of acquisition at the
+    end."""
     plan = _plan_of(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
-    return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in ("end", "both")}
+    return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in (when, "both")}
 
 
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
@@ -157,8 +152,12 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 def other_parts(part: Path) -> list[Path]:
     """The files of the other parts of its run that may hold frames, joined or not."""
     part = part.resolve()
-    files = (folder / part.name for folder in parts_of(run_of(part.parent)))
-    return [file for file in files if file != part and may_hold_frames(file)]
+    return [file for file in files_with_frames(run_of(part.parent), part.name) if file != part]
+
+
+def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
+    """The files of this name in the folders of a run's parts that may hold frames."""
+    return [folder / name for folder in parts_of(run) if may_hold_frames(folder / name)]
 
 
 def may_hold_frames(part: Path) -> bool:
@@ -178,16 +177,10 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
     """The file that joins this one with other parts of its scan, and how many it joins; None if there is none."""
     part = part.resolve()
     for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
-        joined = folder / JOINED
-        if not joined.is_file():
-            continue
-        try:
-            with hdf5.open_hdf5(joined) as file:
-                names = [source.file_name for source in file[layout.DATA].virtual_sources()]
-        except (DataError, *hdf5.ALTERED):
-            continue
-        if part in [(folder / name).resolve() for name in names]:
-            return joined, len(names)
+        with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(folder / JOINED) as file:
+            names = [source.file_name for source in file[layout.DATA].virtual_sources()]
+            if part in [(folder / name).resolve() for name in names]:
+                return folder / JOINED, len(names)
     return None
 
 
@@ -213,12 +206,10 @@ def require_joined(file: h5py.File) -> None:
 
 def is_joined(joined: Path) -> bool:
     """Whether this file exists and has the frames of all parts of its scan."""
-    try:
-        with hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
-            require_joined(file)
-    except DataError:
-        return False
-    return True
+    with suppress(DataError), hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
+        require_joined(file)
+        return True
+    return False
 
 
 def _disagreement(joined: h5py.File, folder: Path) -> str:
@@ -263,17 +254,16 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         for file, name, first, n in zip(files, names, firsts[:-1], rows, strict=True):
             virtual[first : first + n] = h5py.VirtualSource(name, path, file[path].shape)[:n]
         datasets.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
-    for path, item in _links(files[0]):
-        joined[path] = joined[item]
     del joined[layout.END_TIME]
     files[-1].copy(layout.END_TIME, joined, layout.END_TIME)
     state_ending(joined, replace(ending_in(files[-1]), missing=_missing(files)))
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
-    _name_parts(files, names, rows, joined)
-    joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
-    joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
-    layout.state_field_of_view(joined)
-    add_exchange_view(joined)
+    group, text = joined.create_group(layout.PARTS), h5py.string_dtype("utf-8")
+    group.attrs["NX_class"] = "NXcollection"
+    group.create_dataset("name", data=list(names), dtype=text)
+    group.create_dataset("frames", data=np.array(rows, np.int64))
+    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
+    _complete(files[0], joined, int(firsts[-1]))
     return int(firsts[-1])
 
 
@@ -288,21 +278,18 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
         for row in range(n):
             made[row] = item[row]
             target.require_taken()
-    for path, item in _links(file):
-        target[path] = target[item]
-    target[layout.IMAGE_KEY_CONTROL] = target[layout.KIND]
+    _complete(file, target, n)
+
+
+def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
+    """The links of the source, and what a writer adds at the end of its `n` frames."""
+    for name, item in source["/entry/data"].items():
+        if linked := datasets.attribute(item, "target"):
+            target[f"/entry/data/{name}"] = target[linked]
     target[layout.COMMITTED][()], target[layout.FINISHED][()] = n, 1
+    target[layout.IMAGE_KEY_CONTROL] = target[layout.KIND]
     layout.state_field_of_view(target)
     add_exchange_view(target)
-
-
-def _name_parts(files: Sequence[h5py.File], names: Sequence[str], rows: Sequence[int], joined: h5py.File) -> None:
-    group = joined.create_group(layout.PARTS)
-    group.attrs["NX_class"] = "NXcollection"
-    text = h5py.string_dtype("utf-8")
-    group.create_dataset("name", data=list(names), dtype=text)
-    group.create_dataset("frames", data=np.array(rows, np.int64))
-    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
 
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
@@ -310,7 +297,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
     datasets.copy_attributes(source, target)
     for name, item in source.items():
         path = f"{source.name.rstrip('/')}/{name}"
-        if path in _MADE_ANEW or path in _VIRTUAL or _target(item) not in ("", path):
+        if path in _MADE_ANEW or path in _VIRTUAL or datasets.attribute(item, "target") not in ("", path):
             continue
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)
@@ -320,22 +307,12 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
             source.copy(name, target)
 
 
-def _links(file: h5py.File) -> list[tuple[str, str]]:
-    """Paths of links, and their targets."""
-    data = file["/entry/data"]
-    return [(f"/entry/data/{name}", target) for name, item in data.items() if (target := _target(item))]
-
-
-def _target(item: h5py.HLObject) -> str:
-    return datasets.attribute(item, "target")
-
-
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
     """Triggers that gave no frame, in a later part either."""
-    before = _planned_before_views(files[0])
+    before = sum(_planned(files[0], "start").values())
     stored = {before + view for file in files for view in views_in(file)}
     taken, first = _after_views(files), before + (views_planned(files[0]) or 0)
-    for kind, n in _planned_after_views(files[0]).items():
+    for kind, n in _planned(files[0], "end").items():
         stored |= {first + trigger for trigger in taken[kind]}
         first += n
     return tuple(sorted({trigger for file in files for trigger in ending_in(file).missing} - stored))

@@ -167,7 +167,7 @@ def _of_others(path: Path, head: Superblock) -> Overlay | None:
 def _as_it_is(path: Path) -> Recovered | None:
     """A file that is in order; None where its end is missing."""
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
-        _require_ours(path, file)
+        require_ours(path, file)
         if not file[layout.FINISHED][()]:
             return None
         require_joined(file)
@@ -202,7 +202,8 @@ def _now_beside(path: Path) -> float:
     return time.time()
 
 
-def _require_ours(path: Path, file: h5py.File) -> None:
+def require_ours(path: Path, file: h5py.File) -> None:
+    """Raise DataError for a file of another program."""
     if layout.COMMITTED not in file:
         raise DataError(f"{path} is not a scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
@@ -215,7 +216,7 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, Overlay]:
     try:
         with h5py.File(overlay, "r") as file:
             require_harmless(file)
-            _require_ours(path, file)
+            require_ours(path, file)
             _read(file)
         with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
             committed, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
@@ -254,7 +255,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
     try:
         with h5py.File(overlay, "r") as file:
             require_harmless(file)
-            _require_ours(path, file)
+            require_ours(path, file)
             committed, frames = int(file[layout.COMMITTED][()]), _rows_readable(file)
             if not frames:
                 raise damage

@@ -95,8 +95,7 @@ def slices_along(record: ReconRecord, axis: int, side: int) -> FilmImages:
         return np.asarray(data[z : z + 1][0], np.float32)
 
     def lines(z: int, part: Sequence[int]) -> F32:
-        across_y = axis == 1
-        return slice_at(z)[part] if across_y else slice_at(z)[:, part].T
+        return slice_at(z)[part] if axis == 1 else slice_at(z)[:, part].T
 
     def across() -> Iterator[F32]:
         at_once = max(1, HELD_BYTES // (4 * grid.shape[0] * cols))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,10 @@ from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import refuse_existing, whole_file, write_whole
+from beamline.core.files import refuse_existing, whole_file, write_together, write_whole
 from beamline.core.installed import version
 from beamline.core.text import count, csv_text
-from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
+from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import axes_of
@@ -146,20 +148,14 @@ def segment(options: SegmentOptions) -> Segmented:
                 segmented = whole
     except ValueError as error:
         raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
-    written = list[Path]()
-    try:
-        with whole_file(options.output) as partial:
-            _write_labels(partial, segmented, options)
-        written.append(options.output)
-        write_whole(options.table, table_of(segmented))
-        written.append(options.table)
-        write_whole(
-            options.picture, picture_of(segmented.volume, segmented.unit, segmented.labels, segmented.particles)
+    picture = picture_of(segmented.volume, segmented.unit, segmented.labels, segmented.particles)
+    write_together(
+        (
+            (options.output, partial(_write_labels, segmented, options)),
+            (options.table, partial(write_whole, content=table_of(segmented))),
+            (options.picture, partial(write_whole, content=picture)),
         )
-    except BaseException:
-        for path in written:
-            path.unlink(missing_ok=True)
-        raise
+    )
     return segmented
 
 
@@ -232,11 +228,9 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
 
 
 def _is_scan(path: Path) -> bool:
-    try:
-        with open_scan(path):
-            return True
-    except DataError:
-        return False
+    with suppress(DataError), open_scan(path):
+        return True
+    return False
 
 
 def table_of(found: Segmented) -> str:
@@ -266,8 +260,8 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def _write_labels(partial: Path, found: Segmented, options: SegmentOptions) -> None:
-    with hdf5.created(partial) as file:
+def _write_labels(found: Segmented, options: SegmentOptions, output: Path) -> None:
+    with whole_file(output) as new, hdf5.created(new) as file:
         file.attrs["default"] = "entry"
         entry = file.create_group("entry")
         entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
@@ -293,7 +287,7 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     """Three slices, the same with each particle in a colour, and a histogram of diameters, as PNG."""
     z, y, x = volume.grid.coordinates()
     at = np.linspace(0, z.size - 1, _SLICES + 2).round().astype(int)[1:-1]
-    extent, column = slice_extent(volume.grid), WIDTH / _SLICES
+    column = WIDTH / _SLICES
     figure = new_figure((WIDTH, 2 * column * y.size / x.size + 3.2))
     ratios = (2 * column * y.size / x.size + 0.8, 2.4)
     upper, lower = np.ravel(figure.subfigures(2, 1, squeeze=False, height_ratios=ratios))
@@ -302,32 +296,24 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     # Neighbours in the order of labels get different colours; the same colour comes again after twelve.
     colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
     for column_of, k in zip(panels.T, at, strict=True):
-        for axes in column_of:
-            show_grey(axes, volume.data[k], window, extent)
-            axes.tick_params(labelsize=6)
+        n = np.unique(labels[k]).size - bool((labels[k] == 0).any())
+        for axes, title in zip(column_of, (f"z = {z[k]:.3g} {unit}", f"{n} particles here"), strict=True):
+            drawn = draw_slice(axes, volume.data[k], planes(volume.grid, unit)[0], title, window, size=7)
+            axes.label_outer()
         shown = np.where(labels[k] > 0, (labels[k] - 1) % _COLOURS + 1, 0)
         shown[1:][(labels[k][1:] != labels[k][:-1]) & (labels[k][:-1] > 0)] = 0  # a line between those that touch
         shown[:, 1:][(labels[k][:, 1:] != labels[k][:, :-1]) & (labels[k][:, :-1] > 0)] = 0
         column_of[1].imshow(
-            shown, cmap=colours, vmin=0, vmax=_COLOURS, extent=extent, interpolation="nearest", alpha=0.65
+            shown, cmap=colours, vmin=0, vmax=_COLOURS, extent=drawn.get_extent(), interpolation="nearest", alpha=0.65
         )
-        n = np.unique(labels[k]).size - bool((labels[k] == 0).any())
-        column_of[1].set_xlabel(f"x ({unit})", fontsize=7)
-        column_of[0].set_title(f"z = {z[k]:.3g} {unit}", fontsize=8)
-        column_of[1].set_title(f"{n} particles here", fontsize=8)
-    for axes in panels[:, 0]:
-        axes.set_ylabel(downwards("y", unit), fontsize=7)
     axes = lower.subplots()
     whole = ~particles.cut
     if particles.label.size:
         bins = np.histogram_bin_edges(particles.diameter, bins=min(30, max(5, particles.label.size // 4)))
         parts = [particles.diameter[whole], particles.diameter[~whole]]
         axes.hist(parts, bins.tolist(), stacked=True, color=["tab:blue", "0.7"], label=["whole", "cut by a face"])
-        axes.legend(fontsize=8)
-    axes.set_xlabel(f"equivalent diameter ({unit})", fontsize=8)
-    axes.set_ylabel("particles", fontsize=8)
-    axes.set_title(f"{particles.label.size} particles, {int(particles.cut.sum())} of them cut by a face", fontsize=9)
-    axes.tick_params(labelsize=7)
+    title = f"{particles.label.size} particles, {int(particles.cut.sum())} of them cut by a face"
+    finish(axes, f"equivalent diameter ({unit})", "particles", title, 8)
     return png(figure)
 
 

@@ -20,13 +20,14 @@ from beamline.core.files import refuse_existing
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM
-from beamline.report.figures import grey_window, new_figure, png
+from beamline.report.figures import grey_window
 from beamline.scenes.scene_file import SceneFile
 from beamline.simulate import LabelledRun, LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
+from recon.base.arrays import F32
 from simulators.effects.chain import Anomaly, Label
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.cost import FrameCost, explain
@@ -192,9 +193,8 @@ def cost_table(found: FrameCost) -> str:
     return "\n".join(lines)
 
 
-COLUMNS, PICTURES = 4, 8
-_COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")
-FLATTEST, TALLEST = 0.1, 3.0  # limits of a picture's height over its width; other frames get margins
+PICTURES = 8
+_COLOURS = ("orange", "cyan", "pink", "olive", "green", "red", "purple")
 MOST = 512  # pixels a side that a picture of 2 inches can resolve
 
 
@@ -204,39 +204,25 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     Args:
         marked: frames to include, such as those with anomalies.
     """
-    from matplotlib.patches import Rectangle  # here: it takes a second
+    from beamline.report.sheets import FlaggedFrame, contact_sheet  # here: matplotlib takes a second
 
-    numbers = _chosen(scan, marked)
-    chosen = [(n, scan.frame(n)) for n in numbers]
-    frames = [expose(scan.scene, planned.shot) for _, planned in chosen]
-    step = max(1, -(-max(scan.detector.shape) // MOST))
-    small = [frame[::step, ::step].astype(np.float32) for frame in frames]
-    views = [frame for frame, (_, planned) in zip(small, chosen, strict=True) if planned.kind is FrameKind.PROJECTION]
-    low, high = grey_window(views, 0.5, 99.8)
-    rows = -(-len(frames) // COLUMNS)
-    tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
-    figure = new_figure((10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), constrained=False)
+    numbers, shape = _chosen(scan, marked), scan.detector.shape
+    step, shown, views = max(1, -(-max(shape) // MOST)), list[FlaggedFrame](), list[F32]()
     anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
-    for place, ((number, planned), frame) in enumerate(zip(chosen, small, strict=True), start=1):
-        axes = figure.add_subplot(rows, COLUMNS, place)
-        axes.imshow(frame, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
-        axes.set_xticks([])
-        axes.set_yticks([])
-        kind = planned.kind.name.lower()
-        angle = f" at {np.degrees(planned.shot.angle):.1f}°" if planned.kind is FrameKind.PROJECTION else ""
-        axes.set_title(f"{number}: {kind}{angle}", fontsize=8)
+    for number in numbers:
+        planned = scan.frame(number)
+        small = expose(scan.scene, planned.shot)[::step, ::step].astype(np.float32)
+        angle = ""
+        if planned.kind is FrameKind.PROJECTION:
+            angle = f" at {np.degrees(planned.shot.angle):.1f}°"
+            views.append(small)
         labels = scan.scene.chain.labels(planned.shot)
-        kinds = list(dict.fromkeys(label.kind for label in labels))
-        for label in labels:
-            row = kinds.index(label.kind)
-            top, bottom, left, right = (edge / step for edge in label.region)
-            colour = _COLOURS[anomalies.index(label.kind) % len(_COLOURS)]
-            corner, size = (left - 0.5, top - 0.5), (right - left, bottom - top)
-            axes.add_patch(Rectangle(corner, *size, fill=False, color=colour, lw=1.2))
-            axes.text(0.02, 0.97 - 0.07 * row, label.kind, color=colour, fontsize=7, va="top", transform=axes.transAxes)
-    figure.suptitle(f"counts {low:.0f} (black) to {high:.0f} (white)", fontsize=8)
-    figure.tight_layout()
-    return png(figure)
+        colours = {label.kind: _COLOURS[anomalies.index(label.kind) % len(_COLOURS)] for label in labels}
+        boxes = [(label.region, f"tab:{colours[label.kind]}") for label in labels]
+        kinds = [f"{kind} ({colour})" for kind, colour in colours.items()]
+        shown.append(FlaggedFrame(small, shape, f"{number}: {planned.kind.name.lower()}{angle}", kinds, boxes))
+    low, high = window = grey_window(views, 0.5, 99.8)
+    return contact_sheet(shown, window, f"counts {low:.0f} (black) to {high:.0f} (white)")
 
 
 def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:

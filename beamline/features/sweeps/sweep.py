@@ -21,7 +21,7 @@ from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import WIDTH, new_figure, png, show_grey
+from beamline.report.figures import WIDTH, finish, new_figure, png, show_image
 from beamline.report.metrics import METRICS
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, F64, I64
@@ -259,7 +259,7 @@ def sweep_sheet(
     verdicts = [""] * len(slices) if scores is None else scores.verdicts
     for n, (each, image) in enumerate(zip(slices, images, strict=True)):
         axes = figure.add_subplot(panels[1 + n // across, n % across])
-        show_grey(axes, image, window)
+        show_image(axes, image, window)
         axes.set(xticks=[], yticks=[])
         if n == 0:
             axes.set(xlabel="x →", ylabel="← y")
@@ -283,9 +283,7 @@ def _draw_curve(axes: Axes, slices: Sequence[SweptSlice], scores: Scores, option
         axes.set_xscale("log")
     if not numbers:
         axes.set_xticks(range(len(slices)), option.values[: len(slices)])
-    axes.set_xlabel(option.name, fontsize=8)
-    axes.set_ylabel(METRICS["residual_held_out"].label, fontsize=8)
-    axes.tick_params(labelsize=7)
+    finish(axes, option.name, METRICS["residual_held_out"].label, size=8)
 
 
 def _changes_most(images: Sequence[NDArray[np.float32]]) -> tuple[slice, slice]:

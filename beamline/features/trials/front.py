@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from beamline.features.trials.trial import (
     TrialCost,
     TrialTable,
 )
-from beamline.report.figures import one_panel, png
+from beamline.report.figures import finish, one_panel, png
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
@@ -55,9 +55,8 @@ _FSC = (
 )
 
 
-def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
+def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Picture]]:
     """Quality against each cost, curves, and slices of each baseline and of the truth."""
-    pictures = []
     doses = [table.dose] if len({outcome.trial.views for outcome in table.compared}) > 1 else []
     for cost in (TIME, MEMORY, *doses):
         if table.front(cost):
@@ -65,8 +64,7 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
                 f"{QUALITIES[table.by][0]} of every trial against its {cost.words}. The line is the best quality "
                 "at each cost; its corners are the trials that no other beats in both."
             )
-            picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
-            pictures.append((f"quality_{cost.name}.png", picture))
+            yield f"quality_{cost.name}.png", Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
     curves = [o for o in table.compared if o.trial.group == "method" and len(o.curve) > 1]
     if curves:
         caption = (
@@ -75,13 +73,12 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
             "that of its Gaussians, which may lie between voxels and outside the volume; the table judges the "
             "volume."
         )
-        pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
+        yield "curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))
     if labels := slices.labels():
         caption = "The same slice by each method with its usual settings, all in the grey window of the first."
         if any(by_name(outcome.trial.method).traits.several for outcome in table.outcomes):
             caption += " Of several volumes, the one that the middle view shows, by its time or energy."
-        pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
-    return pictures
+        yield "slices.png", Picture("Slices", caption, slices.png(labels))
 
 
 def _duration(seconds: float) -> str:
@@ -202,8 +199,7 @@ def pareto_plot(
     if pick is not None:
         _, cost, quality = kept[pick]
         axes.scatter(cost, quality, s=220, facecolors="none", edgecolors="black", linewidths=1.4, zorder=5)
-    axes.set(xlabel=cost_label, ylabel=quality_label)
-    axes.grid(alpha=0.25)
+    finish(axes, cost_label, quality_label, grid=True)
     _legend(figure, axes, shown)
     lines = [f"{n + 1}  {t.label}: {quality:.2f} dB, {cost:.3g} {unit}" for n, (t, cost, quality) in enumerate(kept)]
     if pick is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -101,16 +101,10 @@ class TableLayout:
     title: str
     figures: Mapping[str, Figure]
     sentences: Callable[[TrialTable], Sequence[str]]
-    pictures: Callable[[TrialTable, SliceSheet], Sequence[tuple[str, Picture]]]
+    pictures: Callable[[TrialTable, SliceSheet], Iterable[tuple[str, Picture]]]
     question: str = ""
     facts: Mapping[str, str] | None = None
     front: bool = False
-
-    def known(self, table: TrialTable) -> dict[str, Figure]:
-        """The figures that any row has."""
-        return {
-            name: each for name, each in self.figures.items() if any(each.metric in o.metrics for o in table.outcomes)
-        }
 
     def marked(self, table: TrialTable) -> list[Outcome]:
         """The rows that stand out."""
@@ -265,7 +259,7 @@ def to_csv(table: TrialTable, layout: TableLayout) -> str:
 
 def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: SliceSheet) -> None:
     """Write the pictures that have data, and the page."""
-    pictures = layout.pictures(table, slices)
+    pictures = list(layout.pictures(table, slices))
     for name, picture in pictures:
         write_whole(folder / name, picture.png, replace=True)
     write_whole(folder / layout.page, to_html(table, layout, [picture for _, picture in pictures]), replace=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -162,15 +162,14 @@ def layout_of(study: Study) -> TableLayout:
     )  # fmt: skip
 
 
-def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
-    pictures = []
+def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Picture]]:
     if table.compared:
         caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
         axes = {
             each.short + " (dB)" * bool(METRICS[each.digits_of or each.metric].unit): each.of
             for each in known(table, FIGURES).values()
         }
-        pictures.append(("figures.png", Picture("Figures of all rows", caption, figures_of_rows(table, axes))))
+        yield "figures.png", Picture("Figures of all rows", caption, figures_of_rows(table, axes))
         caption = "Each frame of the scan has the same dose; one that several views share is counted once."
         dose = table.dose
         costs = {dose.axis: lambda o: dose.of(o) * dose.scale, "processor time (s)": lambda o: o.cpu_seconds}
@@ -182,30 +181,26 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
             }
         first = next((axis for axis in axes if axis.startswith("PSNR truth")), next(iter(axes)))
         picture = against_cost(table, first, axes[first], costs)
-        pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
+        yield "cost.png", Picture("Quality against dose and time", caption, picture)
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
-        picture = slices.png(slices.labels(method))
         title = f"{by_name(method).label}, slice by slice"
-        pictures.append((f"slices_{method}.png", Picture(title, caption, picture)))
-    return pictures
+        yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))
 
 
-def draws(table: TrialTable) -> list[str]:
+def draws(table: TrialTable) -> Iterator[str]:
     """Sentences: mean and range of the figures over the draws of one choice."""
     families: dict[tuple[str, str], list[Outcome]] = {}
     for outcome in table.compared:
         if outcome.trial.choice is not None and outcome.trial.choice.family:
             families.setdefault((outcome.trial.method, outcome.trial.choice.family), []).append(outcome)
-    sentences = []
     for (method, family), rows in families.items():
         parts = []
         for figure in known(table, FIGURES).values():
             values = [value for row in rows if (value := figure.of(row)) is not None]
             mean, low, high = (figure.words(float(of(values))) for of in (np.mean, min, max))
             parts.append(f"{figure.short} {mean} ({low} to {high})")
-        sentences.append(f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}.")
-    return sentences
+        yield f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}."
 
 
 def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:

@@ -22,7 +22,7 @@ from beamline.core.quantities import VoxelKind
 from beamline.core.text import size
 from beamline.energies import Spectra
 from beamline.reconstruct.memory import SHARE
-from beamline.report.figures import downwards, dpi_for, new_figure, planes, png
+from beamline.report.figures import dpi_for, draw_cuts, finish, new_figure, png
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
@@ -189,26 +189,16 @@ def picture(charge: ChargeMap) -> bytes:
     volume, unit = charge.record.volume, charge.record.length_unit
     filled = np.isfinite(volume.data)
     at = [int(filled.sum(axis=tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
-    images = (volume.data[at[0]], volume.data[:, at[1]], volume.data[:, :, at[2]])
     height = max(volume.grid.shape[1] / volume.grid.shape[2], volume.grid.shape[0] / volume.grid.shape[2], 0.3)
     figure = new_figure((11, 2.6 * height + 3.2), dpi_for(volume.grid.shape[2], 3.0))
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(2.6 * height + 0.8, 2.4))))
     panels = np.ravel(np.asarray(upper.subplots(1, 3)))
-    for axis, (axes, image, plane) in enumerate(zip(panels, images, planes(volume.grid), strict=True)):
-        across, down, h_edges, v_edges = plane
+    for axes in panels:
         axes.set_facecolor("0.85")
-        shown = axes.imshow(
-            image, cmap="viridis", vmin=0, vmax=1, extent=(*h_edges, *v_edges), interpolation="nearest",
-            aspect="equal" if image.shape[0] > 0.06 * image.shape[1] else "auto",
-        )  # fmt: skip
-        cut = volume.grid.coordinates()[axis][at[axis]]
-        axes.set_title(f"{'zyx'[axis]} = {cut:.3g} {unit}", fontsize=9)
-        axes.set_xlabel(f"{across} ({unit})", fontsize=8)
-        axes.set_ylabel(downwards(down, unit), fontsize=8)
-        axes.tick_params(labelsize=7)
+    shown = draw_cuts(list(panels), volume, at, unit, "", (0, 1), "viridis")
     upper.colorbar(shown, ax=list(panels), shrink=0.8).set_label(f"share of {charge.names[-1]}")
     counts = lower.subplots()
     counts.hist(volume.data[filled], bins=100, range=(0, 1), color="0.35")
-    counts.set(xlabel=f"share of {charge.names[-1]} (state of charge)", ylabel="voxels", xlim=(0, 1))
-    counts.grid(alpha=0.3)
+    counts.set_xlim(0, 1)
+    finish(counts, f"share of {charge.names[-1]} (state of charge)", "voxels", grid=True)
     return png(figure)

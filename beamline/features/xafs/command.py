@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -219,7 +219,7 @@ def _charge_map(
     sources: Sequence[str], volume: Path, spectra: Path | None, least: float, target: Path, as_json: bool
 ) -> None:
     """`--volume`: the state-of-charge map, and its picture."""
-    from beamline.core.files import refuse_existing, remove, write_whole
+    from beamline.core.files import refuse_existing, write_together, write_whole
     from beamline.energies import read_spectra
     from beamline.features.xafs.charge_map import charge_map, picture
     from beamline.storage.volumes.files import write_volume
@@ -233,11 +233,8 @@ def _charge_map(
         table = None if spectra is None else read_spectra(spectra)
         charge = charge_map(paths, table, least, answer.counting("slices"), answer.clock.now())
         drawn = picture(charge)
-        with ExitStack() as undo:
-            write_volume(volume, charge.record)
-            undo.callback(remove, volume)
-            write_whole(target, drawn)
-            undo.pop_all()
+        files = (volume, partial(write_volume, record=charge.record)), (target, partial(write_whole, content=drawn))
+        write_together(files)
         facts = {"volume": volume, "picture": target, **charge.data()}
         answer.done(facts, *charge.lines(), f"written     {volume}, {target}")
 

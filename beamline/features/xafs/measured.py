@@ -17,7 +17,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.core.flag import PixelBox
 from beamline.features.xafs.contrast import ContrastRegions, XafsCurve
-from beamline.features.xafs.series import EVERYTHING, FramePart, Radiographs, Series, line_integrals
+from beamline.features.xafs.series import EVERYTHING, FramePart, Radiographs, Series, counts_in, line_integrals
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.readers.base import ScanSource
@@ -83,16 +83,11 @@ def _all(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
 
 
 def _chosen(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
-    frames = _all(source, kind)
-    return spread(frames, _MOST_VIEWS)
+    return spread(_all(source, kind), _MOST_VIEWS)
 
 
 def _frame(source: ScanSource, index: int, part: FramePart) -> Reals:
-    counts = source.read(np.array([index]), part[0])[0][:, part[1]]
-    values = counts.astype(np.float64)
-    if counts.dtype.kind in "ui":
-        values[counts == np.iinfo(counts.dtype).max] = np.nan
-    return values
+    return counts_in(source.read(np.array([index]), part[0])[0][:, part[1]])
 
 
 def _mean(source: ScanSource, kind: FrameKind, part: FramePart) -> Reals:

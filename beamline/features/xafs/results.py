@@ -7,17 +7,17 @@ a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamline.core.files import refuse_existing, write_whole
+from beamline.core.files import refuse_existing, write_together, write_whole
 from beamline.core.text import csv_text
 from beamline.features.xafs.contrast import AbsorptionEdge, XafsCurve
-from beamline.report.figures import WIDTH, new_figure, one_panel, png
+from beamline.report.figures import WIDTH, finish, new_figure, one_panel, png
 from recon.prep.matter import HEAVIEST, TabulatedEdge, edges_of
 
 if TYPE_CHECKING:
@@ -128,11 +128,8 @@ def picture(result: XafsResult) -> bytes:
     panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))
     top = panels[0]
     top.plot(curve.energies, curve.absorption, color="0.25", lw=1.2, marker=".", ms=3)
-    top.set(ylabel=f"absorption ({curve.unit})", title=result.title)
     if cnr is not None:
         panels[1].plot(curve.energies, cnr, color="tab:green", lw=1.2, marker=".", ms=3)
-        panels[1].set(ylabel="contrast-to-noise a pixel")
-    panels[-1].set(xlabel="energy (keV)")
     for energy in curve.left_out:
         top.axvline(energy, color="0.85", lw=1.0, zorder=0)
     marks = (
@@ -143,9 +140,10 @@ def picture(result: XafsResult) -> bytes:
     for axes in panels:
         for energy, name, colour in marks:
             if energy is not None:
-                axes.axvline(energy, color=colour, lw=1.1, ls="--", label=f"{name} {energy:.4f} keV")
-        axes.grid(alpha=0.3)
-    top.legend(fontsize=8, title=None if edge.found else "no edge found")
+                axes.axvline(energy, color=colour, lw=1.1, ls="--", label=f"{name} {energy:.4f} keV" * (axes is top))
+    finish(panels[-1], "energy (keV)", "contrast-to-noise a pixel", grid=True)
+    found = "" if edge.found else ", no edge found"
+    finish(top, "energy (keV)", f"absorption ({curve.unit})", f"{result.title}{found}", grid=True)
     return png(figure)
 
 
@@ -182,11 +180,8 @@ def write_both(drawn: bytes, text: str, target: Path) -> None:
     Raises:
         DataError: one of them exists, or the disk refuses; then neither is there.
     """
-    with ExitStack() as undo:
-        for path, content in ((target, drawn), (table_beside(target), text.encode())):
-            write_whole(path, content)
-            undo.callback(path.unlink)
-        undo.pop_all()
+    contents = (target, drawn), (table_beside(target), text)
+    write_together((path, partial(write_whole, content=content)) for path, content in contents)
 
 
 def _beside(edge: TabulatedEdge, energy: float) -> str:
@@ -280,10 +275,7 @@ def picture_of_several(states: Sequence[XafsResult]) -> bytes:
         for energy, style in ((edge.energy, "--"), (edge.white_line, ":")):
             if energy is not None:
                 axes.axvline(energy, color=colour, lw=1.0, ls=style)
-    axes.set(xlabel="energy (keV)", ylabel=f"absorption ({_unit(states)})")
-    axes.set_title("edges dashed, white lines dotted", fontsize=9)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    finish(axes, "energy (keV)", f"absorption ({_unit(states)})", "edges dashed, white lines dotted", grid=True)
     return png(figure)
 
 

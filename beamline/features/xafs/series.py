@@ -113,9 +113,9 @@ class Radiographs:
             dark = _mean(self.darks, part)
             flat = None if self.flats is None or self.flats.ndim == 3 else _mean(self.flats, part) - dark
             for i in which:
-                frame = _counts(self.frames[i, part[0], part[1]])
+                frame = counts_in(self.frames[i, part[0], part[1]])
                 if self.flats is not None:
-                    own = _counts(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
+                    own = counts_in(self.flats[i, part[0], part[1]]) - dark if flat is None else flat
                     frame = line_integrals(frame - dark, own)
                 yield float(self.energies[i]), frame
         except OSError as error:  # h5py's form of HDF5's errors
@@ -127,12 +127,12 @@ def _mean(item: h5py.Dataset | None, part: FramePart) -> Reals:
     if item is None:
         return np.zeros(1)
     if item.ndim == 2:
-        return _counts(item[part])
-    total = sum((_counts(item[i, part[0], part[1]]) for i in range(item.shape[0])), start=np.zeros(1))
+        return counts_in(item[part])
+    total = sum((counts_in(item[i, part[0], part[1]]) for i in range(item.shape[0])), start=np.zeros(1))
     return np.asarray(total / item.shape[0])
 
 
-def _counts(values: Any) -> Reals:
+def counts_in(values: Any) -> Reals:
     """NaN where integers are the largest of their type: the pixel may be saturated."""
     counts = np.asarray(values, dtype=np.float64)
     if values.dtype.kind in "ui":

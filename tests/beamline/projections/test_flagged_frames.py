@@ -47,7 +47,7 @@ def test_the_worst_of_each_kind_come_first(most: int, rows: list[int]) -> None:
     found = worst_frames(source(), flags(), most)  # type: ignore[arg-type]
     assert [frame.title for frame in found] == [f"frame {row}, projection, {row:.1f}°" for row in rows]
     (worst,) = [frame for frame in found if "frame 11," in frame.title]
-    assert worst.alarm and worst.regions == [REGION]
+    assert worst.colour == "tab:red" and worst.regions == [(REGION, "tab:red")]
     assert worst.reasons == [f"{ONE} warn 1.1", f"{TWO} alarm -14"]
     assert worst.image.shape == (2, 200) and worst.extent == (6, 600)
 
