@@ -166,6 +166,8 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
     rows = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = (np.stack(cells_of(source, some)) for some in rows)
     some = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    if not some.size:
+        return
     views, written = read_known(source, some, _middle(source)).astype(np.float64), not (np.ptp(dark) or np.ptp(flat))
     end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
     air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
