@@ -46,12 +46,12 @@ def one_line(text: str, most: int = 200) -> str:
     return line if len(line) <= most else line[: most - 3] + "..."
 
 
-_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d) *(\..*)?$", re.IGNORECASE)  # of Windows, in any folder
 
 
 def safe_name(text: str, most: int = 120) -> str:
     """A name for a file or folder by a foreign text: one that stays in its folder, and that no file system, shell,
-    terminal or spreadsheet takes for anything else. It is its own safe name.
+    terminal or spreadsheet takes for anything else. A safe name is returned as it is.
 
     Args:
         most: bytes; what is beyond is cut off.
@@ -82,21 +82,21 @@ def with_points(numbers: Sequence[str]) -> list[str]:
     """Numbers of one file with a point before their decimals, where all of them have a comma there.
 
     Raises:
-        ValueError: the commas may be of thousands, or separate numbers.
+        ValueError: the commas may group thousands, or separate numbers.
     """
     commas, points = ([text.strip() for text in numbers if mark in text] for mark in ",.")
     thousands = all(re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", text) for text in commas)
     if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
         beside = f" beside {points[0]} with a point" if points else ""
         raise ValueError(
-            f"{commas[0]} has a comma{beside}, which may be of decimals or not: write decimals with a point"
+            f"{commas[0]} has a comma{beside}, which may stand before decimals or not: write decimals with a point"
         )
     return [text.replace(",", ".") for text in numbers]
 
 
 def are_a_count(texts: Sequence[str]) -> bool:
-    """Whether texts are whole numbers from one on, without a gap, in any order."""
-    numbers = {int(text) for text in texts if text.isdigit()}
+    """Whether texts are consecutive whole numbers, in any order."""
+    numbers = {int(text) for text in texts if text.isdecimal()}
     return len(numbers) == len(texts) == max(numbers, default=0) - min(numbers, default=1) + 1
 
 

@@ -179,7 +179,8 @@ def locate_axis(
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
-    lit = np.flatnonzero(~band.masked.all(axis=0))  # what slits hide is filled, and its noise has a long lever
+    hidden = band.masked.all(axis=0)  # columns behind slits, which were filled: their noise has a long lever
+    lit = np.flatnonzero(~hidden | hidden.all())
     angles = source.angles[band.view_ids]
     try:
         estimate = find_axis(band.data[..., lit[0] : lit[-1] + 1], angles)

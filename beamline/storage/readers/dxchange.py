@@ -129,7 +129,8 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
     of_views = datasets.attribute(file["exchange"].get("theta", item), "units")
-    angles = datasets.radians(item, default=of_views if of_views.lower() in datasets.ANGLE_UNITS else "degrees")
+    known = datasets.factor_of(of_views, datasets.ANGLE_UNITS) is not None
+    angles = datasets.radians(item, default=of_views if known else "degrees")
     return angles if np.isfinite(angles).all() else None
 
 

@@ -48,7 +48,8 @@ def test_a_safe_name_is_its_own_and_stays_in_its_folder(text: str, most: int) ->
     ("text", "name"),
     [
         ("walnut (1), 20 °C", "walnut (1), 20 °C"), ("..", "unnamed"), ("./../victim", "_.._victim"),
-        ("con", "_con"), ("LPT1.tif", "_LPT1.tif"), ("control", "control"), ("\x1b[2J\udcff", "_[2J_"),
+        ("con", "_con"), ("nul ", "_nul"), ("CON .txt", "_CON .txt"),
+        ("LPT1.tif", "_LPT1.tif"), ("control", "control"), ("\x1b[2J\udcff", "_[2J_"),
         ("=1+1", "1+1"), ("骨" * 50, "骨" * 40),
     ],
 )  # fmt: skip

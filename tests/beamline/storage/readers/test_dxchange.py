@@ -151,12 +151,12 @@ def test_what_is_no_real_number_is_refused(tmp_path: Path, parts: Parts, name: s
         (np.arange(8) * 111.246 % 180, [0, 0, 180, 180]),  # views in another order
     ],
 )
-@pytest.mark.parametrize("unit", ["deg", "rad"])
+@pytest.mark.parametrize("unit", ["deg", "radians"])
 def test_flats_of_both_ends_with_their_angles_stand_around_the_views(
     tmp_path: Path, theta: np.ndarray, white: list[int], unit: str
 ) -> None:
     """Nobody needs to say when the darks were taken, or again in which unit."""
-    said = np.radians if unit == "rad" else np.asarray
+    said = np.radians if unit == "radians" else np.asarray
     frames = {"data": np.full((8, 2, 3), 50), "data_white": np.arange(100, 124).reshape(4, 2, 3)}
     parts = frames | {"data_dark": np.zeros((2, 2, 3)), "theta": said(theta), "theta_white": said(white)}
     with open_scan(store(tmp_path / "s.h5", {k: v.astype(float) for k, v in parts.items()}, unit)) as source:
