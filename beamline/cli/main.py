@@ -53,16 +53,17 @@ class _Lasting(io.FileIO):
 
 class _Printable:
     """A text stream that shows control characters instead of sending them: names of files and texts in them may hold
-    some, whoever prints them. `acting` is the stream itself, for a progress bar."""
+    some, whoever prints them. `unfiltered` is the stream itself, for a progress
+    bar."""
 
     def __init__(self, stream: TextIO) -> None:
-        self.acting = stream
+        self.unfiltered = stream
 
     def write(self, text: str) -> int:
-        return self.acting.write(printable(text) if isinstance(text, str) else text)  # click tries bytes
+        return self.unfiltered.write(printable(text) if isinstance(text, str) else text)  # click tries bytes
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.acting, name)
+        return getattr(self.unfiltered, name)
 
 
 class Outputs:
@@ -247,7 +248,7 @@ def run() -> NoReturn:
     """
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
-    os.environ["MPLBACKEND"] = "agg"  # of a notebook that started this, which may be absent here: matplotlib refuses it
+    os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
     outputs, code = Outputs(), 0
     _say_begun(sys.argv[1:])
     try:

@@ -116,9 +116,9 @@ def _leading(ctx: click.Context) -> list[str]:
 
 
 def _from_anywhere(value: str, kind: object) -> str:
-    """A path made absolute, also in FILE:first:end."""
+    """A path made absolute, also in FILE:first:end; not a number of counts in its place."""
     if isinstance(kind, click.Path):
-        return os.path.realpath(value)  # `resolve` fails at links that go round
+        return value if value.isdecimal() and not os.path.lexists(value) else os.path.realpath(value)
     head, colon, tail = value.partition(":")
     return f"{Path(head).resolve()}{colon}{tail}" if "." in head and Path(head).is_file() else value
 

@@ -45,7 +45,8 @@ scan_options = together(
         "--darks",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of TIFFs, HDF5 file (FILE::DATASET), or counts of every pixel, for darks of the file.",
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file; or a number, "
+        "the counts of every pixel.",
     ),
     option(
         "--flats",
@@ -56,8 +57,8 @@ scan_options = together(
     option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout, or of several detectors: its projections, /raw/images, or with their "
-        "dimensions, /raw/images:frame,col,row.",
+        help="For an HDF5 file of any layout, or of several detectors: its projections, as /raw/images, with their "
+        "dimensions where these are not frame,row,col: /raw/images:frame,col,row.",
     ),
     option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),

@@ -66,7 +66,7 @@ class Terminal:
 
     def __init__(self, stream: TextIO) -> None:
         self._console = Console(
-            file=getattr(stream, "acting", stream), highlight=False, markup=False, emoji=False, soft_wrap=True
+            file=getattr(stream, "unfiltered", stream), highlight=False, markup=False, emoji=False, soft_wrap=True
         )
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),

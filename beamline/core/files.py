@@ -94,19 +94,20 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
 _DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF file", b"PK\3\4": "a .zip or .npz file"}
 
 
-_INSTEAD = {
+_SUBSTITUTES = {
     b"version https://git-lfs": "a pointer of Git LFS in its place: `git lfs pull` fetches the file",
     b"\x1f\x8b": "packed by gzip: `gunzip` unpacks it",
-    b"<!doctype html": "a page of the web, as of a login, in its place: download the file again",
-    b"<html": "a page of the web, as of a login, in its place: download the file again",
+    b"<!doctype html": "a web page, such as that of a login, in its place: download the file again",
+    b"<html": "a web page, such as that of a login, in its place: download the file again",
 }
 
 
-def refuse_instead(path: Path) -> None:
-    """Raise DataError for a file that is empty, packed as a whole, or stands for the data elsewhere."""
+def refuse_substitute(path: Path) -> None:
+    """Raise DataError for a file that is empty, packed as a whole, or lies in the place of the data: a pointer to them,
+    or a web page."""
     with path.open("rb") as file:
         head = file.read(64).lower()
-    why = "empty" if not head else next((why for begin, why in _INSTEAD.items() if head.startswith(begin)), "")
+    why = "empty" if not head else next((why for begin, why in _SUBSTITUTES.items() if head.startswith(begin)), "")
     if why and not path.name.lower().endswith(".nii.gz"):  # a volume, which is read as it is packed
         raise DataError(f"{path} is {why}. Nothing was read.")
 
@@ -234,7 +235,7 @@ def no_file(path: Path) -> str:
     return broken_link(path) or f"{path} {kind}."
 
 
-_BESIDE = 44  # bytes by which names of temporary files and of what lies beside a volume are longer than its own
+_BESIDE = 44  # bytes that names of temporary files, and of what is written beside an output, add to its name
 
 
 def refuse_existing(path: Path) -> None:
@@ -245,8 +246,9 @@ def refuse_existing(path: Path) -> None:
     longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
     if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
         raise DataError(
-            f"The name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} leave room for names of "
-            f"temporary files and of what lies beside {path}. Name another output. Nothing was written."
+            f"{path}: the name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} are possible, as "
+            "names of temporary files, and of what is written beside it, are longer. Name another output. Nothing was "
+            "written."
         )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")

@@ -38,14 +38,12 @@ class VoxelKind(Enum):
 
 
 _SAME = 1e-3  # share by which an angle may be off a quarter of a turn, half a turn or a turn in radians
-_IMPOSSIBLE = (
-    10.0  # times beyond its range a value is refused where another unit makes it plausible; nearer it is doubted
-)
+_IMPOSSIBLE = 10.0  # times beyond its range a value that another unit makes plausible is refused; nearer, doubted
 
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """The plausible range of the size of a quantity of an instrument; 0 is always plausible.
+    """The plausible range of a quantity of an instrument, whatever its sign; 0 is always plausible.
 
     Attributes:
         others: units that are mistaken for this one, each with its factor to this one.
@@ -57,11 +55,11 @@ class PlausibleRange:
     others: Mapping[str, float]
 
     def holds(self, value: float, wider: float = 1.0) -> bool:
-        """Whether the range, `wider` times on each side, has the value."""
+        """Whether the value lies in the range, extended by the factor `wider` at both ends."""
         return value == 0 or self.low / wider <= abs(value) <= self.high * wider
 
-    def meant(self, value: float) -> dict[str, float]:
-        """By units that are mistaken for this one: the value, in this one, if it is of them; the plausible ones."""
+    def plausible_as(self, value: float) -> dict[str, float]:
+        """The value converted to this unit as if it were in another; by that unit, those that are plausible."""
         return {other: value * factor for other, factor in self.others.items() if self.holds(value * factor)}
 
 
@@ -106,11 +104,12 @@ def range_of(name: str) -> PlausibleRange | None:
 
 
 def doubt(name: str, value: float | None) -> str:
-    """A sentence on an implausible value, with the unit that may be meant; empty for a plausible value."""
+    """A sentence on an implausible value, with the unit that may be meant; empty for a plausible value, and without a
+    range."""
     known = range_of(name)
     if value is None or known is None or known.holds(value):
         return ""
-    meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.meant(value).items()]
+    meant = [f"{each:.4g} {known.unit} ({value:.6g} {other})" for other, each in known.plausible_as(value).items()]
     return (
         f"{name}: {value:.6g} {known.unit} is {max(abs(value) / known.high, known.low / abs(value)):.2g} times beyond "
         f"the {known.low:g} to {known.high:g} {known.unit} of instruments of this kind"
@@ -121,7 +120,7 @@ def doubt(name: str, value: float | None) -> str:
 def is_impossible(name: str, value: float) -> bool:
     """Whether the value is far beyond its range, and plausible in a unit that is mistaken for its own."""
     known = range_of(name)
-    return known is not None and not known.holds(value, _IMPOSSIBLE) and bool(known.meant(value))
+    return known is not None and not known.holds(value, _IMPOSSIBLE) and bool(known.plausible_as(value))
 
 
 def doubt_span(span_deg: float) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.core.files import RECON, no_file, refuse_instead, require_regular
+from beamline.core.files import RECON, no_file, refuse_substitute, require_regular
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
@@ -91,7 +91,7 @@ def _is_numpy(path: Path) -> bool:
 
 def _from_tiff(path: Path) -> NDArray[np.generic]:
     require_regular(path)
-    refuse_instead(path)
+    refuse_substitute(path)
     with tifffile.TiffFile(path) as tif:
         require_possible(tif)
         series = tif.series[0]

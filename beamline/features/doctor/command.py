@@ -76,7 +76,7 @@ def _show(checks: Sequence[Diagnosis], compared: bool) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    out: Any = getattr(sys.stdout, "acting", sys.stdout)
+    out: Any = getattr(sys.stdout, "unfiltered", sys.stdout)
     console = Console(file=out, highlight=False, markup=False, emoji=False, width=None if out.isatty() else _WIDTH)
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for column in ("check", "verdict", "observed"):

@@ -25,7 +25,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import VIEWS, reference_groups, references_usable
-from beamline.storage.rules.scan import CONSTANT, SOURCE_RULES, altered_sentence, scan_ended
+from beamline.storage.rules.scan import CONSTANT_DARKS, SOURCE_RULES, altered_sentence, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
@@ -258,7 +258,9 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
         "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
-        "findings": [finding.message for finding in findings if finding.severity != "info" or finding.rule == CONSTANT]
+        "findings": [
+            finding.message for finding in findings if finding.severity != "info" or finding.rule == CONSTANT_DARKS
+        ]
         + ([altered_sentence(source)] if source.altered else [])
         + (_fringes(brief) if facts["reconstructable"] else []),
     }

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_instead
+from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -22,7 +22,7 @@ from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, sided
+from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.supplied import (
     Angles,
@@ -39,7 +39,7 @@ from beamline.storage.readers.wrapped import (
     cropped,
     in_parts,
     keyed,
-    parted,
+    kinds_and_views,
     selected,
     turned,
     type_wrapped,
@@ -160,7 +160,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
 def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
-    kinds, _ = parted(options.frames)
+    kinds, _ = kinds_and_views(options.frames)
     opening = Opening(follow, options.angles is None and options.angles_path is None, kinds is not None)
     with ExitStack() as opened:
 
@@ -186,9 +186,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     quantity = options.quantity
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
-        base = sided(base, side)
+        base = with_side_file(base, side)
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
-    _, views = parted(options.frames)
+    _, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
     if angles is not None:
         angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
@@ -294,7 +294,7 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
 
 def _open(path: Path, opening: Opening) -> ScanSource:
     if path.is_file() and not opening.follow:
-        refuse_instead(path)
+        refuse_substitute(path)
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):

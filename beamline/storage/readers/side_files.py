@@ -119,7 +119,7 @@ class SideFile:
         )
 
 
-def sided(base: ScanSource, side: SideFile) -> ScanSource:
+def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
     """A scan with the distances and the pixel size of a vendor's file; DataError where that has another number of
     projections.
     """

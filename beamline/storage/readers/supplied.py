@@ -177,8 +177,8 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
 
 
 Images = Path | str | NDArray[Any]
-"""A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), an array [frame, row, col], or the
-counts of every pixel, where no file has their number as its name."""
+"""A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), an array [frame, row, col], or a whole
+number, the counts of every pixel, unless a file has it as its name."""
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
 _LISTED = 8  # datasets that an error names
@@ -201,7 +201,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         return _stack(np.asarray(images), "The array of reference frames")
     name, _, dataset = str(images).partition("::")
     path = Path(name)
-    if name.isdigit() and shape is not None and not path.exists():
+    if name.isdecimal() and shape is not None and not path.exists():
         return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
     if path.is_file() and hdf5.is_hdf5(path):
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):

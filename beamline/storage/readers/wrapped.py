@@ -109,8 +109,8 @@ def keyed(base: ScanSource, kinds: str) -> ScanSource:
     return Frames(base, image_key=keys, **own)
 
 
-def parted(frames: str | None) -> tuple[str | None, slice | None]:
-    """The kinds and the views that --frames names, such as "darks=0:5,flats=5:10" and 0::2; None: it names none."""
+def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
+    """The kinds and the views that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
     words = [] if frames is None else frames.split(",")
     matches = [_VIEWS.fullmatch(word) for word in words]
     taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]

@@ -25,7 +25,7 @@ from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 from recon.base.views import spread
 
-CONSTANT = "constant-darks"  # a rule whose finding is no fault, and told by `info`
+CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
 TURNED = 12  # views by which the direction of the axis is told
@@ -105,7 +105,7 @@ def darks_measured(source: ScanSource) -> Iterator[Finding]:
     if darks is not None and darks.min() == darks.max():
         yield Finding(
             "info",
-            CONSTANT,
+            CONSTANT_DARKS,
             f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
             "light. If its darks were taken, give them with --darks.",
         )

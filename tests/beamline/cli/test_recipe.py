@@ -147,9 +147,10 @@ def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:
     scan = str(folder / "scan.h5")
     rest = "--method fbp --method sirt --draws 1 --output s_again"
     assert line == ["beamline", "study", "random", scan, *rest.split()]
-    context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif"])
+    context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif", "--flats", "60000"])
     line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
-    assert line == ["beamline", "tradeoff", scan, "--darks", str(folder / "d.tif"), "--full", "--output", "t_again"]
+    rest = ["--darks", str(folder / "d.tif"), "--flats", "60000", "--full", "--output", "t_again"]
+    assert line == ["beamline", "tradeoff", scan, *rest]
 
 
 def test_an_option_of_two_values_stands_once(folder: Path) -> None:

@@ -91,5 +91,5 @@ def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("letters", [212, 226, 246, 251, 300])
 def test_a_name_too_long_for_what_lies_beside_it_is_refused_before_the_work(tmp_path: Path, letters: int) -> None:
     refuse_existing(tmp_path / f"{'x' * 208}.h5")
-    with pytest.raises(DataError, match=f"too long: it has {letters + 3} bytes, and 211 leave room"):
+    with pytest.raises(DataError, match=f"too long: it has {letters + 3} bytes, and 211 are possible"):
         refuse_existing(tmp_path / f"{'x' * letters}.h5")
