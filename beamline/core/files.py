@@ -231,8 +231,8 @@ def broken_link(path: Path) -> str:
 
 def no_file(path: Path) -> str:
     """A sentence on a path that names no regular file."""
-    kind = "is a folder, a device or a pipe, and a file is expected" if path.exists() else "does not exist"
-    return broken_link(path) or f"{path} {kind}."
+    kind = f"is {'a folder' if path.is_dir() else 'a device or a pipe'}, and a file is expected"
+    return broken_link(path) or f"{path} {kind if path.exists() else 'does not exist'}."
 
 
 _BESIDE = 44  # bytes that names of temporary files, and of what is written beside an output, add to its name

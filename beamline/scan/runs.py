@@ -36,7 +36,7 @@ class Run:
         frames: in its files; None: not known.
         planned: frames that the first part was to have; None: not known.
         flags: frames that the monitor flagged: their number by check, then by level.
-        state: of its newest part, see docs/states.md; `died` if its process ended without writing another.
+        state: of its newest part, see docs/states.md; `died` if its process ended without writing its last one.
         bytes: of all files in the folder.
         parts: 1, and one for each time that it was resumed.
         next_step: what can be done with one that died, or whose state is not known; "" for others.

@@ -265,7 +265,7 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     if factor is None:
         raise DataError(
             f"{where} has {f'the units {unit!r}' if unit else 'no units attribute'}; expected degrees or radians. Set "
-            "the attribute, or give --angles FILE (degrees, one a line)."
+            "the attribute, give --angles FILE (degrees, one a line), or with --angles-path --angles-unit deg or rad."
         )
     return np.where(np.isfinite(angles), angles * factor, np.nan)
 

@@ -50,7 +50,7 @@ class Recovered:
 
     Attributes:
         changed: whether the file was changed.
-        frames: committed, and kept; None of the file of another program, of which only the mark is cleared.
+        frames: committed, and kept; None: a file of another program, whose mark alone was cleared.
         dropped: frames at the end that were not committed when the writer died, and are cut off.
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
@@ -89,12 +89,14 @@ class Recovered:
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
     """Clear the mark of the dead writer, truncate uncommitted data, and add what a writer adds at the end.
 
+    Of another program's file the mark is cleared alone, where all that it holds can be read.
+
     Args:
-        say: is told the room needed, before anything is written.
+        say: is told what is waited for, and the room needed before anything is written.
 
     Raises:
-        DataError: no scan of ours, a damaged file, one that a running program has open, or one that changed within
-            10 s: then nothing is changed. Or a disk that does not take it: then it can be run again.
+        DataError: no HDF5 file, a damaged one, one that a running program has open, or that changed within 10 s: then
+            nothing is changed. Or a disk that does not take it: then it can be run again.
     """
     if not path.is_file():
         raise DataError(f"{no_file(path)} Nothing was changed.")
@@ -129,7 +131,7 @@ def _checked(path: Path, say: Callable[[str], None]) -> Superblock:
         raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
     changed = path.stat().st_mtime
     if head.open_for_writing and not head.grows and 0 <= (age := _now_beside(path) - changed) < QUIET:
-        say(f"{path} changed {age:.0f} s ago: whether it still does is seen in {QUIET - age:.0f} s.")
+        say(f"{path} changed {age:.0f} s ago: whether it still changes is known in {QUIET - age:.0f} s.")
         time.sleep(QUIET - age)
     if head.open_for_writing and abs(age := _now_beside(path) - path.stat().st_mtime) < QUIET:
         raise DataError(

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 from beamline.core.files import CONFIG, RECORD, SETTINGS, bytes_below
 from beamline.storage.writer_lock import WriterLock, held
 
-DIED = "died"  # State of a part whose process has ended without writing another
+DIED = "died"  # State of a part whose process has ended without writing its last one
 EVERY = 1.0  # real s between two writes of the record while only its number of frames grows
 _TRIES, _PAUSE = 20, 0.01  # real s between tries to write the last record: Windows replaces no file that is being read
 

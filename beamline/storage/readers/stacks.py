@@ -206,11 +206,10 @@ def _frames(item: h5py.Dataset, order: tuple[int, int, int]) -> Any:
 
 
 def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
-    """Angles in radians of the dataset `where` of an HDF5 file, a list or a column, with the unit `unit` or its
-    attribute `units`.
+    """Angles in radians of the dataset `where` of an HDF5 file, a list or a column.
 
     Args:
-        unit: "deg" or "rad", whatever the attribute says; None: as that says.
+        unit: "deg" or "rad", whatever the file says; None: as it says.
 
     Raises:
         DataError: it is not there, is no list, or nothing says its unit.
@@ -219,10 +218,6 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
-        stated = unit or datasets.attribute(item, "units")
-        if datasets.factor_of(stated, datasets.ANGLE_UNITS) is None:
-            problem = f"the units {stated!r}" if stated else "no attribute `units`"
-            raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
         return datasets.radians(item, unit)
 
 

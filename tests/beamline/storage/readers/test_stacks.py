@@ -85,9 +85,11 @@ def test_what_is_not_named_is_not_there(path: Path, images: np.ndarray) -> None:
 def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarray) -> None:
     with h5py.File(path, "r+") as file:
         file["exchange/data"] = file["raw/images"]
-    with open_scan(SourceOptions(path, angles_path="/motors/omega")) as source:
-        assert source.format == "data_exchange"
-        np.testing.assert_allclose(source.angles, np.linspace(0, np.pi, 5))
+        file["motors/text"] = [f"{angle} deg" for angle in np.linspace(0, 180, 5)]
+    for where in ("/motors/omega", "/motors/text"):
+        with open_scan(SourceOptions(path, angles_path=where)) as source:
+            assert source.format == "data_exchange"
+            np.testing.assert_allclose(source.angles, np.linspace(0, np.pi, 5))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +104,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
         ({"angles_path": "/raw/before/one"}, r"is \(4, 6\); expected a list of angles"),
         ({"angles_path": "/note"}, "expected a list of angles"),
-        ({"angles_path": "/motors/plain"}, "has no attribute `units`: give --angles-unit"),
+        ({"angles_path": "/motors/plain"}, "has no units attribute; .* --angles-unit deg or rad"),
         ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),
         ({"angles": [0.0] * 5}, "--angles and --angles-path name the same thing twice"),
         ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path name the same thing twice"),
