@@ -45,8 +45,8 @@ scan_options = together(
         "--darks",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file; or a number, "
-        "the counts of every pixel.",
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file; or a "
+        "number, the counts of every pixel.",
     ),
     option(
         "--flats",

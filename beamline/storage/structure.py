@@ -185,8 +185,8 @@ def _refuse_foreign_bytes(dataset: Any, made: Any, path: Path, name: str) -> Non
             inside = root in within.parents and not any(part.startswith(".") for part in within.relative_to(root).parts)
             if dataset.dtype.kind not in "uif" or not inside:
                 raise DataError(
-                    f"{path} keeps the values of {name} in the file {other}. From such a file only numbers are read, and "
-                    "only where it lies below the folder of the scan. Nothing was read."
+                    f"{path} keeps the values of {name} in the file {other}. From such a file only numbers are read, "
+                    "and only where it lies below the folder of the scan. Nothing was read."
                 )
 
 

@@ -1,5 +1,4 @@
-"""Repeats: views that meet the same rays at two times show how the sample changed, in a cone and beyond the field,
-too."""
+"""Repeats: views of the same rays at two times show how the sample changed, also in a cone and beyond the field."""
 
 from __future__ import annotations
 
@@ -13,13 +12,13 @@ from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.views import spread
 
-_COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12  # that are looked at, at most; coarser pixels tell of whole samples
-_SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation, and those left out at either edge
-_EXACT, _NEAR = 0.1, 2.3  # pixels at the edge of the field between the same rays: with more, a line does not lead there
-_LATER, _LONGEST = 3, 0.9  # a third of the scan lies between two times; share of the longest time
-_PAIRS, _BANDS = 8, 4  # of views; of rows, each of which must tell the same
-_CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels that err together: those a Gaussian joins, twice
-_NOISY = 0.1  # noise over the structure of the views: with more, nothing is told
+_COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12  # columns after binning, about; fewer rows or views tell nothing
+_SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation of the smoothing, and those left out at either edge
+_EXACT, _NEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: beyond, the difference is not linear
+_LATER, _LONGEST = 3, 0.9  # a pair lies a third of the scan apart at least; share of the longest time between two
+_PAIRS, _BANDS = 8, 4  # pairs of views; bands of rows, whose disagreement is uncertainty
+_CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels whose errors are one: those that the Gaussian joins, twice
+_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is told
 
 
 def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int], float, F64, F64]]:
@@ -33,9 +32,9 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
         data: line integrals [view, row, col], in the order of time.
 
     Yields:
-        The first pair of views of some that are looked at, the time between two of them as a share of the scan, and
-        the change within it with its standard deviation, float64 [4] each: rows by which the sample sinks, and shares
-        by which its line integrals, its size across the axis and its size along the axis grow.
+        The first of the pairs of views that are looked at, the mean time between the views of a pair as a share of the
+        scan, and the change in that time with its standard deviation, float64 [4] each: rows by which the sample sinks,
+        and shares by which its line integrals, its size across the axis and its size along the axis grow.
     """
     side = -(-data.shape[2] // _COLUMNS)
     if len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS * side:
@@ -49,9 +48,9 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
         if too_noisy or np.linalg.matrix_rank(total) < len(total):
             continue
         shares = np.linalg.solve(total, of_all)
-        left = max(float(squares.sum() - shares @ of_all), 0.0) / sizes.sum()
+        unexplained = max(float(squares.sum() - shares @ of_all), 0.0) / sizes.sum()
         without = np.linalg.solve(total - normal, (of_all - right)[..., None])[..., 0]
-        alone = np.sqrt(np.diag(np.linalg.inv(total)) * left * _CORRELATED)
+        alone = np.sqrt(np.diag(np.linalg.inv(total)) * unexplained * _CORRELATED)
         sigma, pixels = np.hypot(np.sqrt((len(sums) - 1) * without.var(axis=0)), alone), np.array([side, 1, 1, 1])
         apart = float(np.mean([later - first for first, later in pairs])) / (len(data) - 1)
         yield pairs[0], apart, shares[:4] * pixels, sigma[:4] * pixels

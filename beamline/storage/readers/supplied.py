@@ -177,8 +177,8 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
 
 
 Images = Path | str | NDArray[Any]
-"""A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), an array [frame, row, col], or a whole
-number, the counts of every pixel, unless a file has it as its name."""
+"""A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), an array [frame, row, col], or a
+whole number, the counts of every pixel, unless a file has it as its name."""
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
 _LISTED = 8  # datasets that an error names
