@@ -269,7 +269,8 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     columns = [*zip(*(word.split(",") for word in words if "," in word), strict=False)]
     if any(map(are_a_count, columns)) and all(len({*column}) > 1 for column in columns):
         raise ValueError(
-            f"it holds {words[-1]!r}, a number of the view and its angle, or decimals; expected one angle a line"
+            f"it holds {[word for word in words if ',' in word][-1]!r}, which may be the number of a view and its "
+            "angle, or have decimals; expected one angle a line"
         )
     degrees = []
     for number, (word, plain) in enumerate(zip(words, with_points(words), strict=True), start=1):

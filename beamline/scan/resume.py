@@ -270,8 +270,8 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     with _alone(run):
         files, left_out = _files(run)
         if not files:
-            why = left_out[0] if left_out else f"it is not the folder of a run, without a {SCAN}."
-            raise DataError(f"{run} has no frame: {why} {_UNTOUCHED}")
+            why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."
+            raise DataError(f"{run} {why} {_UNTOUCHED}")
         done = [recover(part, say) for part in files]
         if len(parts := [one.path for one in done if one.frames]) > 1:
             changed = not is_joined(run / JOINED)

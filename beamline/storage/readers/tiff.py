@@ -97,7 +97,7 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[tuple[Used, ...], tuple[
         sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', pixels) if int(n) > 1}
         listed += math.prod(sizes.values())
         if len(sizes) > 1:
-            raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, as one.")
+            raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, along one.")
     images, turned = images_of(tif), orientation(tif)
     copies = sum(len(part.levels) for part in tif.series) - len(images)
     used = (Used("orientation (tag 274)", str(turned), "images are turned upright"),) if turned != 1 else ()

@@ -140,8 +140,8 @@ def test_decimals_may_follow_a_comma(step: float) -> None:
         ("0\n\nnan\n", "line 3 holds 'nan'"),
         ("# nothing\n\n", "no angle"),
         ("0,5,1.0\n1,0,1.5", "0,1.5.*one angle a line"),
-        ("0,0\n1,2\n2,4", "a number of the view and its angle"),
-        ("0,0\n2,1\n4,2", "a number of the view and its angle"),
+        ("0,0\n1,2\n2,4\n# end", "the number of a view and its angle"),
+        ("0,0\n2,1\n4,2", "the number of a view and its angle"),
         ("0,5\n1.0", "0,5 has a comma beside 1.0 with a point"),
     ],
 )

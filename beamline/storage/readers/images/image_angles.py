@@ -69,7 +69,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     elif not words and chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not in_even_steps(distinct)):
         doubt = doubt or "the numbers that have signs are in no even steps within a turn"
     elif distinct.size < _DISTINCT * degrees.size:
-        doubt = doubt or f"{degrees.size} names give {distinct.size} angles alone; are signs or decimals lost?"
+        doubt = doubt or f"{degrees.size} names give only {distinct.size} angles; are signs or decimals lost?"
     if doubt:
         doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
@@ -118,7 +118,7 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
     for beside in (following, [_PRECEDING.search(text) for text in before]):
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not in_even_steps(halves):
-            return degrees, "a number beside them counts nothing; are they a whole and its decimals?"
+            return degrees, "the number beside each counts no images; are the two a whole number and its decimals?"
     if len({re.sub(r"\d+", "", text) for text in before}) > 1:
         return degrees, "names differ before the angle, as by a sign that was replaced"
     return np.where(minus, -degrees, degrees), ""

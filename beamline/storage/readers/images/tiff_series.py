@@ -145,7 +145,7 @@ class TiffSeriesSource(ScanSource):
         if (n := self._size(name)) > most:
             raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
-            raise OSError(errno.EFBIG, f"it is packed {size(n)}, all alike, which no image is")
+            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of values nearly all alike, which no image has")
         return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
 
     @contextmanager
@@ -194,7 +194,9 @@ class TiffSeriesSource(ScanSource):
         if not shape or math.prod(shape) == 0:
             raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
         if len(shape) != 2:
-            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file, or FILE --then FILE.")
+            raise DataError(
+                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --then FILE."
+            )
         require_real(dtype, f"{name} in {self.path}")
         return shape
 

@@ -171,7 +171,7 @@ def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
     source = scan(WITHIN, true, np.repeat(true[::stands], stands))
     (finding,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
     assert (
-        f"Angles stand for {stands} frames each that differ (frames 8 and {7 + stands}, both stated at 0"
+        f"Angles stand for {stands} frames each, which differ (frames 8 and {7 + stands}, both stated at 0"
         in finding.message
     )
     assert "--angles FILE" in finding.message

@@ -54,7 +54,7 @@ ASKED: dict[str, tuple[NDArray[np.float64], Name, str]] = {
     "n": (UP, lambda a, i: f"bone_n{a:.0f}deg_{i:04d}", "the n before"),
     "an underscore for minus": (BOTH, lambda a, i: f"bone_angle{'_' * (a < 0)}{abs(a):.0f}_{i:04d}", "replaced"),
     "another separator for plus": (BOTH, lambda a, i: f"a{'-' if a < 0 else '_'}{abs(a):.1f}deg_{i}", "replaced"),
-    "no sign at all": (BOTH, lambda a, i: f"bone_{abs(a):.1f}deg_{i:04d}", "90 names give 46"),
+    "no sign at all": (BOTH, lambda a, i: f"bone_{abs(a):.1f}deg_{i:04d}", "90 names give only 46"),
     "an underscore for the point": (FINE, lambda a, i: f"a_angle_{a:06.2f}_{i:04d}".replace(".", "_"), "decimals"),
     "the decimals beside the unit": (GOLDEN, lambda a, i: f"a_{a:07.3f}deg_{i:04d}".replace(".", "_"), "decimals"),
     "the counter after a point": (UP, lambda a, i: f"bone_angle{a:03.0f}.{i:04d}", "counts"),
