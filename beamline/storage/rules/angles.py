@@ -247,7 +247,7 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
             "angle-spread",
             f"Angles stand for {n} frames each, which differ (frames {firsts[0]} and {ends[0]}, both stated at "
             f"{degrees[runs[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were read "
-            f"back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views with "
+            f"back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views by "
             f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly.",
         )
 
