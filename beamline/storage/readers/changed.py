@@ -94,7 +94,7 @@ class AveragedSource(Frames):
             frames_per_view=n,
             frame_bytes=lambda each: each * n,
             image_key=self._kinds,
-            exposures=lambda known: known[self._first()],
+            **dict.fromkeys(("exposures", "triggers", "framestamps"), lambda known: known[self._first()]),
             **dict.fromkeys(("angles", *BY_FRAME), self._means),
             attributes=self._and_joined,
             flags=lambda flags: None if flags is None else flags.of_groups(self._used),

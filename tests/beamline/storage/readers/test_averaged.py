@@ -45,6 +45,7 @@ def test_a_view_is_the_mean_of_its_frames_and_references_stay(dtype: Any) -> Non
     np.testing.assert_allclose(read.read([3, 4, 1]), means(base, [3, 4, 5], [6, 7, 8], [1]), rtol=6e-8)
     np.testing.assert_allclose(read.read([4], slice(1, 2)), means(base, [6, 7, 8])[:, 1:2], rtol=6e-8)
     assert read.dtype == np.float32 and read.frames_per_view == 3
+    assert read.triggers.tolist() == [0, 1, 2, 3, 6, 9] and read.framestamps.tolist() == [7] * 6
 
 
 def test_how_far_apart_the_frames_of_a_view_are_is_an_attribute() -> None:
