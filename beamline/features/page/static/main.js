@@ -245,8 +245,7 @@ function point(line, x, y) {
   else { line.x.push(x); line.y.push(y); }
 }
 
-/** A line of the log; of a flag it leads to its frame. */
-const findings = {};
+const findings = {}; // by check: the newest one
 /** A finding of several frames that goes on, such as a crumb that crosses the field, is one line with their number. */
 function logFlag(data) {
   const before = findings[data.check], own = data.first ?? data.frame;
@@ -258,6 +257,7 @@ function logFlag(data) {
   findings[data.check] = { first, frame: data.frame, level: data.level, item };
 }
 
+/** A line of the log, which is returned; of a flag it leads to its frame. */
 function log(data, text, kind = "", at = null) {
   const item = element("li", "", kind), time = element("time", new Date(1000 * data.time).toLocaleTimeString());
   item.append(time, element("span", text));
