@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, angles_stand, coarse_views
+from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, angles_seen, coarse_views
 from beamline.storage.rules.references import VIEWS
 from recon.base.views import spread
 
@@ -18,6 +18,8 @@ _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
 _AROUND, _RETRACED = 3, 1.5  # pairs about such frames; times a step: symmetric samples 0.1 to 1.2, two sides 1.75 to 3
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
 _MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
+_STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
+_EQUAL = 1e-6  # 1 minus the correlation of equal frames, which rounding makes a little more or less than 0
 
 RULE = "angle-order"
 
@@ -28,6 +30,35 @@ def angles_shown(source: ScanSource) -> Iterator[Finding]:
         yield from angles_stand(seen)
         yield from angles_seen(seen)
         yield from angles_in_order(seen)
+
+
+def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
+    """Frames in a row that are stated at one angle look alike, as those that are averaged do.
+
+    Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
+    """
+    starts = np.flatnonzero(np.diff(seen.source.angles[seen.rows], prepend=np.nan) != 0)
+    lengths = np.diff(starts, append=seen.rows.size)
+    runs = starts[some := spread(np.flatnonzero(lengths >= _STANDS), PAIRS)]
+    ends, firsts = seen.rows[runs + lengths[some] - 1], seen.rows[runs]
+    if not runs.size or not seen.lit(np.concatenate([firsts, ends])).all():
+        return
+    pairs = (
+        [[pair] for pair in zip(firsts.tolist(), rows.tolist(), strict=True)] for rows in (seen.rows[runs + 1], ends)
+    )
+    beside, across = (
+        max(_EQUAL, float(np.median([seen.unlike_pairs(pair, False) for pair in each]))) for each in pairs
+    )
+    if across > _TURNED * beside:
+        n, degrees = int(np.median(lengths[lengths >= _STANDS])), np.degrees(seen.source.angles[seen.rows])
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"Angles stand for {n} frames each, which differ (frames {firsts[0]} and {ends[0]}, both stated at "
+            f"{degrees[runs[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were read "
+            f"back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views by "
+            f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly.",
+        )
 
 
 def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:

@@ -23,7 +23,6 @@ _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
-_STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
 # Of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses; minutes; thousandths of rad.
@@ -221,35 +220,6 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
     light = ViewLight.of(source, reference_groups(source).good() if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
     return CoarseViews(source, light, views) if views.size >= _LEAST_SEEN else None
-
-
-def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
-    """Frames in a row that are stated at one angle look alike, as those that are averaged do.
-
-    Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
-    """
-    starts = np.flatnonzero(np.diff(seen.source.angles[seen.rows], prepend=np.nan) != 0)
-    lengths = np.diff(starts, append=seen.rows.size)
-    runs = starts[some := spread(np.flatnonzero(lengths >= _STANDS), PAIRS)]
-    ends, firsts = seen.rows[runs + lengths[some] - 1], seen.rows[runs]
-    if not runs.size or not seen.lit(np.concatenate([firsts, ends])).all():
-        return
-    beside, across = (
-        float(
-            np.median([seen.unlike_pairs([pair], False) for pair in zip(firsts.tolist(), other.tolist(), strict=True)])
-        )
-        for other in (seen.rows[runs + 1], ends)
-    )
-    if across > _TURNED * beside:
-        n, degrees = int(np.median(lengths[lengths >= _STANDS])), np.degrees(seen.source.angles[seen.rows])
-        yield Finding(
-            "warning",
-            "angle-spread",
-            f"Angles stand for {n} frames each, which differ (frames {firsts[0]} and {ends[0]}, both stated at "
-            f"{degrees[runs[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were read "
-            f"back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views by "
-            f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly.",
-        )
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
