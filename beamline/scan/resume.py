@@ -8,7 +8,7 @@ file joins them all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -267,7 +267,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
         ConfigError: a process takes it, recovers it or goes on with it.
         DataError: no run, or a part that cannot be recovered; those before it are recovered.
     """
-    with _alone(run):
+    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # copies of its files have no process
         files, left_out = _files(run)
         if not files:
             why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."

@@ -199,6 +199,18 @@ def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_pa
         pass
 
 
+def test_the_files_of_a_run_without_its_events_are_recovered_and_a_folder_without_a_scan_is_no_run(
+    tmp_path: Path,
+) -> None:
+    run = _run(tmp_path, 9)
+    for name in ("events.jsonl", "state.json"):
+        (run / name).unlink()
+    assert [done.frames for done in recover_run(run)[0]] == [10]
+    (run / "scan.h5").unlink()
+    with pytest.raises(DataError, match=r"is not the folder of a run: it has no scan\.h5\. Nothing was changed"):
+        recover_run(run)
+
+
 def test_what_lives_is_neither_resumed_nor_recovered_and_what_is_recovered_is_in_preparation(tmp_path: Path) -> None:
     run = _run(tmp_path, 9)
     file = RecordFile(run, RunRecord(State.FINISHING, sample="battery"))
