@@ -18,6 +18,7 @@ from recon.base.registry import did_you_mean
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
+_MOST_VALUES = 100_000
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
@@ -81,6 +82,8 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
     origins.setdefault(path, f"{name}:{node.start_mark.line + 1}")
+    if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
+        raise ConfigError(f"{name} has more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
     of_keys = isinstance(node, yaml.MappingNode)
     for index, item in enumerate([] if isinstance(node, yaml.ScalarNode) else node.value):
         key, child = item if of_keys else (item, item)

@@ -66,7 +66,7 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     index, step = _lattice(angles, abs(scale.per_count))
     exact = step / abs(scale.per_count)
     whole = round(exact)
-    if whole < 1 or (whole == 1 and abs(whole / exact - 1) > _OTHER_SPAN):
+    if abs(whole / exact - 1) > _OTHER_SPAN:
         raise ValueError(
             f"views {math.degrees(step):.3g}° apart are {exact:.3g} counts of the stage "
             f"({math.degrees(abs(scale.per_count)):.3g}° each), which gives pulses at whole ones: they would span "

@@ -145,6 +145,15 @@ def test_hostile_values_are_refused_in_a_line(tmp_path: Path, value: str, said: 
         assert said in text and "\n" not in text
 
 
+_BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9)
+)
+
+
+def test_a_few_lines_that_stand_for_billions_are_refused(tmp_path: Path) -> None:
+    assert "more than 100000 values" in faults(tmp_path, _BOMB)
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.yaml does not exist"):
         load(tmp_path / "absent.yaml")
