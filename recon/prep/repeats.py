@@ -45,7 +45,7 @@ def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int
         normal, right, squares, structure, sizes = (np.stack(each) for each in zip(*sums, strict=True))
         total, of_all = normal.sum(axis=0), right.sum(axis=0)
         too_noisy = noise**2 / (2 * np.pi * _SMOOTH**2) * sizes.sum() > _NOISY**2 * structure.sum()
-        if too_noisy or np.linalg.matrix_rank(total) < len(total):
+        if too_noisy or np.linalg.matrix_rank(total - normal).min() < len(total):  # a band may hold all there is
             continue
         shares = np.linalg.solve(total, of_all)
         unexplained = max(float(squares.sum() - shares @ of_all), 0.0) / sizes.sum()

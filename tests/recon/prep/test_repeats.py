@@ -67,3 +67,11 @@ def test_views_that_are_too_noisy_too_few_or_too_far_apart_tell_nothing() -> Non
     geometry, views = Geometry.parallel(angles, SHAPE, axis_col=AXIS), np.zeros((20, *SHAPE), np.float32)
     assert not list(changes_seen(0.05 * lines_of(BALLS, angles, SHAPE, AXIS).astype(np.float32), geometry))
     assert not list(changes_seen(views[:, :4], Geometry.parallel(angles, (4, 64), axis_col=AXIS)))
+
+
+def test_a_sample_in_one_band_of_rows_is_not_compared() -> None:
+    """Bands are left out in turn; what is left of this one is empty."""
+    angles = np.linspace(0, np.pi, 60, endpoint=False)
+    data = np.zeros((60, 40, 64), np.float32)
+    data[:, :2] = 0.05 * lines_of(WIDE, angles, (2, 64), AXIS, None, rest)
+    assert not list(changes_seen(data, Geometry.parallel(angles, (40, 64), axis_col=AXIS)))
