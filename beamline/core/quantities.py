@@ -37,7 +37,7 @@ class VoxelKind(Enum):
         return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
 
 
-_SAME = 1e-3  # share by which an angle may be off a quarter of a turn, half a turn or a turn in radians
+_SAME = 5e-3  # share by which an angle may be off a quarter of a turn, or whole half turns, in radians: 3.15, 6.3
 _IMPOSSIBLE = 10.0  # times beyond its range a value that another unit makes plausible is refused; nearer, doubted
 
 
@@ -66,7 +66,7 @@ class PlausibleRange:
 _MS, _COUNTS = {"ms": 1e-3, "us": 1e-6}, "counts of 0.001 degrees"
 RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
     {
-        "pixel_size_um": PlausibleRange(0.05, 5000.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
+        "pixel_size_um": PlausibleRange(0.01, 5000.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
         **dict.fromkeys(("kev", "energy", "energies"), PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3})),
         "tolerance_ev": PlausibleRange(1e-3, 100.0, "eV", {"keV": 1e3, "meV": 1e-3}),
         "distance_mm": PlausibleRange(0.0, 2e4, "mm", {"um": 1e-3, "nm": 1e-6}),
@@ -82,8 +82,8 @@ RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
         "s": PlausibleRange(0.0, 3600.0, "s", _MS),
         "seconds": PlausibleRange(0.0, 2e5, "s", _MS),
         "deg": PlausibleRange(0.0, 1e5, "degrees", {_COUNTS: 1e-3, "arcseconds": 1 / 3600}),
-        "deg_s": PlausibleRange(1e-5, 3600.0, "degrees/s", {f"{_COUNTS}/s": 1e-3}),
-        "deg_s2": PlausibleRange(1e-4, 2e4, "degrees/s²", {f"{_COUNTS}/s²": 1e-3}),
+        "deg_s": PlausibleRange(1e-6, 3600.0, "degrees/s", {f"{_COUNTS}/s": 1e-3}),
+        "deg_s2": PlausibleRange(1e-6, 2e4, "degrees/s²", {f"{_COUNTS}/s²": 1e-3}),
         "counts_per_turn": PlausibleRange(100, 2e8, "counts", {}),
         "counts": PlausibleRange(0, 5000, "counts", {}),
         "views": PlausibleRange(1, 1e5, "views", {}), "count": PlausibleRange(1, 5000, "frames", {}),
@@ -91,9 +91,9 @@ RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
         "baudrate": PlausibleRange(110, 4e6, "baud", {}),
     }
 )  # fmt: skip
-"""By the name of a setting or its last words, as its unit: from pixels behind X-ray lenses to those of a scanner of
-patients, from carbon's edge to tubes of 600 kV, the longest hutches, the longest exposures that a ring lasts, stages of
-ten turns a second, hundreds of turns, and motors and encoders of up to 27 bits."""
+"""By the name of a setting or its last words, as its unit: from pixels of zone plates to those of scanners of patients,
+from carbon's edge to tubes of 600 kV, the longest hutches, the longest exposures that a ring lasts, stages of ten turns
+a second, hundreds of turns, and motors and encoders of up to 27 bits."""
 
 
 def range_of(name: str) -> PlausibleRange | None:
@@ -124,8 +124,8 @@ def is_impossible(name: str, value: float) -> bool:
 
 
 def doubt_span(span_deg: float) -> str:
-    """A sentence on a span that looks like radians (a quarter of a turn, half a turn or a turn); empty for others."""
-    for turn in (math.pi / 2, math.pi, 2 * math.pi):
+    """A sentence on a span that looks like radians (of a quarter of a turn to two turns); empty for others."""
+    for turn in (math.pi / 2, math.pi, 2 * math.pi, 4 * math.pi):
         if abs(abs(span_deg) / turn - 1) < _SAME:
             return (
                 f"scan.angles: a span of {span_deg:g} degrees is {math.degrees(turn):.0f} degrees in radians: did you "

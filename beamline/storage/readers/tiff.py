@@ -76,7 +76,7 @@ def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
 def orientation(tif: tifffile.TiffFile) -> int:
     """Which sides of an image its first row and column are: 1 to 8, as in tag 274 of TIFF 6.0."""
     tag = images_of(tif)[0].keyframe.tags.get(274)
-    return int(tag.value) if tag is not None else 1
+    return int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
 
 
 def upright(images: NDArray[Any], orientation: int) -> NDArray[Any]:

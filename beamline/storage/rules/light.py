@@ -45,6 +45,8 @@ BELOW, OF_VIEWS = (
     0.25,
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
 CUT, SOLID = 0.01, 0.9  # shares: of pixels with such neighbours; of these, that hold the end; clipped noise has half
+QUARTILE = 0.3186  # of the size of normal values, in standard deviations
+SHOT = 1e-3  # of the largest count, which shot noise has at least: of a million electrons
 AS_FLATS = 0.4  # of the noise of flats, which views of less light have: without noise, the sample's edges have 0.2
 WHITE = 0.8  # change from pixel to pixel over that of the next but one: noise has 1, structure a quarter to a half
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
@@ -171,14 +173,15 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
     views, written = read_known(source, some, _middle(source)).astype(np.float64), not (np.ptp(dark) or np.ptp(flat))
     end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
     air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
-    noise = _white_noise(views, end)
+    noise, least = _white_noise(views, end)
     if not (noise or written):  # where the sample varies more
         noise = noise_level(np.where(views < end, views, np.nan).astype(np.float32))
         noise *= noise > AS_FLATS * _change(source, groups) > 0
     at = (views == end) & (read_known(source, rows[0][:1], _middle(source)) < end)
     around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
     refused = written and not accepted
-    if noise > 0 and around.size and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
+    ends = around.size > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID
+    if noise > 0 and ends:
         sentence = (
             f"{'Every pixel of the flats, and ' * written}{at.mean():.0%} of the pixels of the views looked at hold "
             f"{end:g} without the noise of the others ({noise:.3g} from pixel to pixel): counts end there, they are "
@@ -186,7 +189,11 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
         )
         sentence += " --references accept uses these as they are." if refused else ""
         yield Finding("error" if refused else "warning", "light", sentence)
-    elif written and dark.any() and source.dtype.kind in "ui" and abs(air / end - 1) > NEAR:
+    elif (
+        written
+        and dark.any()
+        and ((ends and least > SHOT * end) or (source.dtype.kind in "ui" and abs(air / end - 1) > NEAR))
+    ):
         sentence = (
             f"Every pixel of the darks holds {dark.flat[0]:g} and every pixel of the flats {end:g}, which no camera "
             f"gives; the views reach {air:.5g}. Right if both numbers are known for all pixels; else the flats are "
@@ -195,14 +202,16 @@ def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> 
         yield Finding("warning", "light", sentence)
 
 
-def _white_noise(views: F64, end: float) -> float:
-    """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more."""
+def _white_noise(views: F64, end: float) -> tuple[float, float]:
+    """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more. And
+    that of the smoothest parts.
+    """
     below = np.where(views < end, views, np.nan)
-    near, far = (
-        median_deviation(below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n]) / 2
-        for n in (1, 2)
-    )
-    return near if near > WHITE * far else 0.0
+    changes = [below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n] for n in (1, 2)]
+    near, far = (median_deviation(change) / 2 for change in changes)
+    known = np.abs(changes[0][np.isfinite(changes[0])])
+    smoothest = float(np.percentile(known, 25)) / 2 / QUARTILE if known.size else 0.0
+    return near if near > WHITE * far else 0.0, smoothest
 
 
 def _middle(source: ScanSource) -> slice:

@@ -310,7 +310,7 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
     width, height = source.pixel_size_mm, source.row_pitch_mm
     if height is None:
         return
-    if width is None or not 0.01 < height / width < 100:
+    if not width or not 0.01 < height / width < 100:
         width_text = "unknown" if width is None else f"{width:g} mm"
         yield Finding(
             "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {width_text}. That cannot be."

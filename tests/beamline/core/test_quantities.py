@@ -38,8 +38,8 @@ def numbers_of(schema: Mapping[str, Any]) -> set[str]:
 
 MISTAKEN = [
     ("energy_kev", 25000.0, "42 times", "25 keV (25000 eV)"),
-    ("pixel_size_um", 0.0046, "11 times", "4.6 um (0.0046 mm)"),
-    ("pixel_size_um", 0.03, "1.7 times", "30 um (0.03 mm)"),
+    ("pixel_size_um", 0.0009, "11 times", "0.9 um (0.0009 mm)"),
+    ("pixel_size_um", 0.003, "3.3 times", "3 um (0.003 mm)"),
     ("distance_mm", 100000.0, "5 times", "100 mm (100000 um)"),
     ("max_speed_deg_s", 4000.0, "1.1 times", "4 degrees/s (4000 counts of 0.001 degrees/s)"),
     ("in_deg", -180000.0, "1.8 times", "-180 degrees (-180000 counts of 0.001 degrees)"),
@@ -50,7 +50,7 @@ MISTAKEN = [
 def test_a_mistaken_unit(name: str, value: float, beyond: str, meant: str) -> None:
     said = doubt(name, value)
     assert beyond in said and f"did you mean {meant}" in said
-    assert is_impossible(name, value) is (name in ("energy_kev", "pixel_size_um") and value != 0.03)
+    assert is_impossible(name, value) is (name in ("energy_kev", "pixel_size_um") and value != 0.003)
 
 
 TYPICAL = {  # by the names of the ranges
@@ -112,7 +112,7 @@ def test_a_span_in_radians() -> None:
             "energy_kev=25000: optics.* did you mean 25 keV .*eV\\)\\? Nothing",
             2,
         ),
-        (["optics.pixel_size_um=0.03"], "Warning: optics.pixel_size_um: .*did you mean 30 um", 0),
+        (["optics.pixel_size_um=0.003"], "Warning: optics.pixel_size_um: .*did you mean 3 um", 0),
         (["devices.stage.max_speed_deg_s=4000"], "Warning: devices.stage.max_speed_deg_s: 4000 degrees/s is", 0),
         (["scan.angles.span_deg=3.14159"], "Warning: .*did you mean 180", 0),
         (["scan.angles.span_deg=3.14159", "scan.angles.views=3600"], "0.873 counts .* span 1.15 times the angles", 2),
@@ -134,6 +134,6 @@ def test_a_reconstruction_warns() -> None:
     scan.quantity = "line_integrals"
 
     told: list[str] = []
-    prepare._warn_of_units(scan, replace(Selection(), pixel_size_mm=3e-5), told.append)  # type: ignore[arg-type]
+    prepare._warn_of_units(scan, replace(Selection(), pixel_size_mm=3e-6), told.append)  # type: ignore[arg-type]
     (sentence,) = told
-    assert "30 um (0.03 mm)" in sentence
+    assert "3 um (0.003 mm)" in sentence
