@@ -16,7 +16,7 @@ import h5py
 
 from beamline.config.load import NO_LIVE, Config, changed, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import CONFIG, EVENTS, JOINED, RECORD, SCAN, create_part, parts_of
+from beamline.core.files import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
@@ -198,7 +198,7 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     these."""
     files = files_with_frames(run)
     empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
-    return files, [f"{scan} is left out: no frame can be read in it, and its {RECORD} has none." for scan in empty]
+    return files, [f"{scan} is left out: no frame can be read in it, and its {EVENTS} names none." for scan in empty]
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import JOINED, SCAN, parts_of, run_of, whole_file
+from beamline.core.events import LARGEST_LOG, LONGEST
+from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
-from beamline.storage.run_record import read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import (
@@ -161,16 +161,18 @@ def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """Whether a part may have frames: its file has one, or is unreadable and its record does not say that it has none.
+    """Whether a part may have frames: its file has one, or its log of events (perhaps not all) names one.
 
     A part that ended before its first frame does not count.
     """
     if not part.is_file():
         return False
     with suppress(DataError), hdf5.open_hdf5(part) as file, hdf5.readable(part):
-        return bool(file[layout.COMMITTED][()])
-    record = read_record(part.parent)
-    return record is None or record.frames != 0
+        if file[layout.COMMITTED][()]:
+            return True
+    with suppress(OSError), open_below(part.parent, EVENTS, LARGEST_LOG) as log:
+        return any(b'"event": "frame"' in line for line in iter(lambda: log.readline(LONGEST), b""))
+    return True
 
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
