@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, unseen_axis
 from recon.base.method import Clock, Progress
 from recon.base.units import look_like_degrees, warn_of_degrees
 from recon.base.volume import Grid, Volume
@@ -75,8 +75,8 @@ class StreamingFit:
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
 
     Raises:
-        ValueError: for no Gaussians, settings with `joined_pixels`, or a template whose views differ in shift, roll
-            or tilt.
+        ValueError: for no Gaussians, settings with `joined_pixels`, an axis outside the detector, or a template whose
+            views differ in shift, roll or tilt.
     """
 
     def __init__(
@@ -92,6 +92,8 @@ class StreamingFit:
         now: Clock = time.perf_counter,
     ) -> None:
         check_arguments(StreamingFit.__init__, locals())
+        if sentence := unseen_axis(template.axis_col + template.offsets[:, 0], template.detector_shape[1]):
+            raise ValueError(sentence)
         self._template, self._grid = template.at([0.0]), grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
         if gaussians is not None and gaussians < 1:

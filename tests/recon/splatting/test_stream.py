@@ -321,6 +321,11 @@ def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np
     np.testing.assert_allclose(found[1], found[0], atol=1e-3 * float(found[0].max()))
 
 
+def test_an_axis_outside_the_detector_is_refused() -> None:
+    with pytest.raises(ValueError, match="axis"):
+        StreamingFit(Geometry.parallel([0.0], (8, 64), axis_col=400.0))
+
+
 def test_the_count_follows_the_grid() -> None:
     assert count_for(Grid((4, 4, 4)), cone=False) == 2000
     assert count_for(Grid((100, 200, 200)), cone=False) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)
