@@ -139,9 +139,10 @@ def record_sink(file: RecordFile) -> Sink:
 
 
 def record_of(part: Path) -> RunRecord:
-    """The record of a part; frames and flags of one that died, and all of a part without a record, by its file.
+    """The record of a part; frames of one that died, and all of a part without a record, by its file.
 
-    Where that cannot be read, as when a kill came while it was made, the frames stay as they were written last.
+    Where that cannot be read, as when a kill came while it was made, the frames stay as they were written last. Flags
+    stay where the file was closed before the process died: the file has none of the level `info`.
     """
     record = read_record(part)
     if record is not None and record.state != DIED:
@@ -150,7 +151,7 @@ def record_of(part: Path) -> RunRecord:
     if record is None:
         return by_file
     frames = record.frames if by_file.frames is None else by_file.frames
-    return replace(record, frames=frames, flags=by_file.flags, joined=False)
+    return replace(record, frames=frames, flags=record.flags or by_file.flags, joined=False)
 
 
 def end_record(part: Path) -> None:

@@ -284,7 +284,7 @@ def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
 
 
 def _read(folder: Path) -> list[BatchRow]:
-    """The table of an earlier call.
+    """The table of an earlier call; a row whose volume is no longer there waits.
 
     Raises:
         DataError: it cannot be read.
@@ -294,13 +294,19 @@ def _read(folder: Path) -> list[BatchRow]:
     path = folder / TABLE
     try:
         with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
-            rows = [{name: value for name, value in row.items() if name and value} for row in csv.DictReader(file)]
+            reader = csv.DictReader(file)
+            rows = [{name: value for name, value in row.items() if name and value} for row in reader]
+            if not {"name", "scan"} <= {*(reader.fieldnames or ())}:
+                raise ValueError(f"expected a first line with name and scan, not {reader.fieldnames}")
         table = TypeAdapter(list[BatchRow]).validate_python(rows)
         folded = [TABLE, RECIPE, *(row.name.casefold() for row in table)]
         for n, row in enumerate(table, start=2):
             if row.name != safe_name(row.name) or folded[n] in folded[:n]:
                 raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
-        return table
+        return [
+            BatchRow(row.name, row.scan) if row.has_volume and not (folder / row.name / RECON).is_file() else row
+            for row in table
+        ]
     except ValidationError as error:
         first = error.errors()[0]
         place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"

@@ -79,15 +79,15 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     if completion_cut_short(path):
         sentence = f"Its writer was killed when it became the output; recon --resume {path} makes that of it."
         return [Finding("error", "partial", sentence)]
-    kind = volume_format(path)
-    findings = _as_hdf5(path) if kind is None else []
+    findings = list[Finding]()
     try:
-        if kind is not None:
+        if volume_format(path) is not None:
             of_all: dict[Finding, None] = {}
             for at in range(len(times_of(path))) or (None,):
                 with opened_volume(path, at=at) as record, hdf5.readable(path):
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]
+        findings += _as_hdf5(path)
         with open_scan(scan) as source:
             findings += source_findings(source)
             findings += views_lit(source, deep is not None)
@@ -175,7 +175,7 @@ def _as_hdf5(path: Path) -> list[Finding]:
     if not path.is_file():
         return []
     try:
-        with hdf5.open_hdf5(path) as file:
+        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return nexus_findings(file)
     except DataError:
         return []  # not HDF5, or without frames: open_scan says what is wrong

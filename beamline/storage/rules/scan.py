@@ -308,7 +308,7 @@ def stated_used(source: ScanSource) -> Iterator[Finding]:
 def pixels_square(source: ScanSource) -> Iterator[Finding]:
     """Pixels are square, or each row is a separate slice."""
     width, height = source.pixel_size_mm, source.row_pitch_mm
-    if height is None:
+    if height is None or width == 0:  # a width of 0 is another rule's
         return
     if not width or not 0.01 < height / width < 100:
         width_text = "unknown" if width is None else f"{width:g} mm"

@@ -38,11 +38,12 @@ class NXtomoproc:
     def holds(self, path: Path) -> bool:
         if not path.is_file() or not hdf5.is_hdf5(path):
             return False
-        try:
-            with hdf5.open_hdf5(path) as file:
-                return datasets.text_at(file, "entry/definition") == DEFINITION
-        except (DataError, OSError, TypeError):
-            return False
+        with hdf5.readable(path):
+            try:
+                with hdf5.open_hdf5(path) as file:
+                    return datasets.text_at(file, "entry/definition") == DEFINITION
+            except (DataError, OSError, TypeError):
+                return False
 
     @contextmanager
     def open(self, path: Path) -> Iterator[ReconRecord]:

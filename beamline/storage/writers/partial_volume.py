@@ -8,6 +8,7 @@ added by half is taken out again when the file is opened.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -201,7 +202,7 @@ def _save_structure(path: Path) -> None:
 def _put_back(path: Path) -> None:
     """Undo a completion that was cut short, if there was one. Shared slices are lost, which no slab needs any more."""
     saved = _structure_of(path)
-    if not (saved.is_file() and path.is_file()) or held(path):
+    if not completion_cut_short(path) or held(path):
         return
     with saved.open("rb") as source, path.open("r+b") as out:
         ends = [int.from_bytes(source.read(8), "little") for _ in range(4)]
@@ -260,7 +261,8 @@ def is_partial(path: Path) -> bool:
 
 def completion_cut_short(path: Path) -> bool:
     """Whether the completion of a partial volume was interrupted; opening the file to add slabs undoes it."""
-    return path.is_file() and _structure_of(path).is_file()
+    structure = _structure_of(path)
+    return path.is_file() and os.path.isfile(structure)  # noqa: PTH113 - Path.is_file raises for a name too long
 
 
 def _shared(slab: Slab) -> list[int]:

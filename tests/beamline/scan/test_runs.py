@@ -176,12 +176,14 @@ def test_of_a_kill_in_the_last_fit_the_run_has_died_and_recover_says_that_it_is_
     run = _run(tmp_path)
     record = read_record(run)
     assert record is not None
-    write_record(run, replace(record, state=State.FINISHING, over=False))
+    flags = {"mass": {"info": 2, "warn": 1}}  # the file has none of the level info
+    write_record(run, replace(record, state=State.FINISHING, over=False, flags=flags))
     died = describe(run)
-    assert (died.state, died.frames) == ("died", FRAMES)
+    assert (died.state, died.frames, died.flags) == ("died", FRAMES, flags)
     assert f"`beamline recover {run}` ends the run" in died.next_step
     recover_run(run)
     assert (describe(run).state, describe(run).frames, describe(run).next_step) == ("done", FRAMES, "")
+    assert describe(run).flags == flags
 
 
 def test_of_a_kill_before_the_first_frame_nothing_that_refuses_is_advised(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -94,7 +95,9 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share_a_folder(folder: Path) -> None:
+def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_and_two_batches_do_not_share_a_folder(
+    folder: Path,
+) -> None:
     Path("recipe.yaml").write_text("method: fbp\n")
     given = ("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
     assert beamline(*given).exit_code == 0
@@ -103,6 +106,9 @@ def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share
     assert beamline(*given).exit_code == 0
     assert (folder / "out" / "scan" / "recon.h5").stat().st_mtime_ns == before
     assert _table(folder / "out")["scan"]["state"] == "done"
+    shutil.rmtree(folder / "out" / "scan")
+    assert "1; 1 to be reconstructed" in beamline(*given, "--dry-run").stdout
+    assert beamline(*given).exit_code == 0 and (folder / "out" / "scan" / "recon.h5").is_file()
     other = WriterLock(folder / "out" / "recipe.yaml")
     refused = beamline(*given)
     other.release()
@@ -310,11 +316,20 @@ def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_
     assert children and not psutil.wait_procs(children, 30)[1]
 
 
-def test_a_table_that_somebody_changed_is_refused_with_the_place(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        (b"\xef\xbb\xbfname,scan,state\na,a.h5,broken\n", "row 1, state"),
+        (b"\xff\xfe\0", "expected a first line with name and scan"),
+        (b"sample,date\n", "expected a first line with name and scan, not ['sample', 'date']"),
+    ],
+)
+def test_a_table_that_somebody_changed_is_refused_with_the_place(folder: Path, table: bytes, sentence: str) -> None:
     Path("recipe.yaml").write_text("method: fbp\n")
     Path("out").mkdir()
     Path("out/recipe.yaml").write_text("method: fbp\n")
-    Path("out/batch.csv").write_text("name,scan,state\na,a.h5,broken\n", encoding="utf-8-sig")
+    Path("out/batch.csv").write_bytes(table)
     result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
     assert result.exit_code == 5
-    assert "row 1, state" in result.stderr
+    assert sentence in result.stderr
+    assert Path("out/batch.csv").read_bytes() == table

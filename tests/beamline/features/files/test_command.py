@@ -290,6 +290,19 @@ def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command:
     assert len(parts) > 1 and "damaged" in result.output
 
 
+@pytest.mark.parametrize("entry", ["entry", "entry0000"])  # where volumes are, and other scans
+def test_a_group_that_cannot_be_listed_is_called_damaged(tmp_path: Path, entry: str) -> None:
+    path = tmp_path / f"{'x' * 250}.h5"  # longer than a name beside it can be
+    with h5py.File(path, "w") as file:
+        file[f"{entry}/definition"] = "NXtomo"
+        file[f"{entry}/instrument/detector/data"] = np.ones((3, 4, 5), np.uint16)
+    *above, instrument, detector = path.read_bytes().split(b"SNOD")  # where HDF5 keeps the names in a group
+    path.write_bytes(b"SNOD".join([*above[:-1], above[-1] + b"?NOD" + instrument, detector]))
+    for command in ("info", "validate"):
+        result = beamline(command, path)
+        assert result.exit_code == 5 and "damaged" in result.output, result.output
+
+
 def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:
     scan = write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
     result = beamline("info", scan, "--statistics", "-o", tmp_path / "h.png")

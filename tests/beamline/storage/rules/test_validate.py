@@ -195,6 +195,7 @@ def huge_pixels(file: h5py.File) -> None:
         ),
         (repainted(range(5, 14), lambda *_: np.full(SHAPE, 65535, np.uint16)), "error", "pixels", "is 65535"),
         (huge_pixels, "error", "pixel-size", "4600 mm"),
+        (put(f"{DETECTOR}/x_pixel_size", 0.0), "error", "pixel-size", "size of 0 mm cannot be"),
     ],
 )  # fmt: skip
 def test_each_rule_finds_what_it_is_for(
