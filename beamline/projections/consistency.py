@@ -342,8 +342,11 @@ def _turned(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:
 
 
 def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> Law:
-    """Views of the same rays, early and late, show one sample, in any beam and however wide it is; the least changes are
-    larger where it is faint, as a beam that changes its shape by 1 % looks like more of them."""
+    """Views of the same rays, early and late, show one sample, in any beam and however wide it is.
+
+    Args:
+        faint: the least changes that are told are so many times as large: a beam whose shape drifts looks like them.
+    """
     worst, sentence = np.nan, ""
     for (first, later), between, change, sigma in changes_seen(data, geometry):
         off = np.where(np.abs(change) > _REPEATED_SIGMAS * sigma, np.abs(change) / (_REPEATED * faint * between), 0.0)
