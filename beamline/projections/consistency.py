@@ -50,7 +50,7 @@ _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.
 _TURNED, _TURNED_SIGMAS = np.radians(4.0), 9.0  # of errors of angles along a scan; 240 scans at rest have up to 8.8
 _TURNED_LEFT = 0.95  # of the variance of moments: at angles that are wrong, others explain it; a tooth leaves 0.96
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
-_FAINT = 0.3  # line integral
+_FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
 _AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
 _SURE = 4.0  # standard deviations
@@ -101,16 +101,16 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
     edges = FieldEdges.of(data, geometry)
-    wide, air_is_off = edges.beyond() or edges.passing(), _air_is_off(data, some)
+    wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
     laws = list[Law]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
-        if wide or air_is_off:
+        if wide or faint > 1 or air_is_off:
             frames = prepared.projections.view_ids[some]
             laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         elif data.shape[1] >= _LEAST_ROWS and selection.rows is None:
             laws = _laws_within_the_field(prepared, selection, some)
     if (wide or not air_is_off) and not any(law.broken for law in laws):
-        laws.append(_at_rest(data, geometry, prepared.projections.view_ids))
+        laws.append(_at_rest(data, geometry, prepared.projections.view_ids, max(faint, 1.0)))
     return _reported(laws, warn)
 
 
@@ -175,12 +175,12 @@ def compare_with_flats(
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
 
 
-def _air_is_off(data: F32, some: NDArray[np.intp]) -> bool:
-    """Matter is faint beside errors of the air, or the edges are far from 0, as where the light drifts without --air:
-    air has moments, too."""
+def _faint_or_off(data: F32, some: NDArray[np.intp]) -> tuple[float, bool]:
+    """How faint matter is: above 1 it may leave the field unnoticed, corrected as air, which moments do not bear.
+    Whether edges are far from 0, as where the light drifts without --air: such air has moments, too."""
     edges = np.abs([np.median(data[view][:, [0, -1]]) for view in some])
     deepest = float(np.median([data[view].max() for view in some]))
-    return deepest < _FAINT or float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
+    return _FAINT / max(deepest, 1e-6), float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
 
 
 def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[float, float]:
@@ -341,11 +341,15 @@ def _turned(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:
     return Law("moments, angle of each view", size if known else np.nan, tolerance, "degrees", sentence)
 
 
-def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64]) -> Law:
-    """Views of the same rays, early and late, show one sample, in any beam and however wide it is."""
+def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> Law:
+    """Views of the same rays, early and late, show one sample, in any beam and however wide it is.
+
+    Args:
+        faint: the least changes that are told are so many times as large: a beam whose shape drifts looks like them.
+    """
     worst, sentence = np.nan, ""
     for (first, later), between, change, sigma in changes_seen(data, geometry):
-        off = np.where(np.abs(change) > _REPEATED_SIGMAS * sigma, np.abs(change) / (_REPEATED * between), 0.0)
+        off = np.where(np.abs(change) > _REPEATED_SIGMAS * sigma, np.abs(change) / (_REPEATED * faint * between), 0.0)
         sizes = f"{abs(change[0]):.1f} rows", *(f"{abs(share):.1%}" for share in change[1:])
         words = [f"{size} {way[int(by > 0)]}" for size, way, by in zip(sizes, _COMPARED, change, strict=True)]
         if not off.max() <= worst:

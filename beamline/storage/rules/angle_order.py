@@ -51,13 +51,15 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
     )
     if across > _TURNED * beside:
         n, degrees = int(np.median(lengths[lengths >= _STANDS])), np.degrees(seen.source.angles[seen.rows])
+        first_of_each = f" Or --frames 0::{n} takes the first view of each angle." if (lengths[:-1] == n).all() else ""
         yield Finding(
             "warning",
             "angle-spread",
             f"Angles stand for {n} frames each, which differ (frames {firsts[0]} and {ends[0]}, both stated at "
             f"{degrees[runs[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were read "
             f"back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} views by "
-            f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly.",
+            f"--angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly."
+            f"{first_of_each}",
         )
 
 

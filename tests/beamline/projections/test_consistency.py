@@ -14,7 +14,9 @@ from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
+from tests.bench.clean_scans import lines_of
 from tests.recon.prep.balls import Balls
+from tests.recon.prep.test_repeats import BALLS, shrinks
 
 ANGLES, AXIS = np.linspace(0, np.pi, 45, endpoint=False), 36.8
 VIEWS = Balls(ANGLES, (24, 72), AXIS).views() + np.random.default_rng(3).normal(0, 0.01, (45, 24, 72))
@@ -63,6 +65,17 @@ def test_a_sample_that_sinks() -> None:
     views = VIEWS.copy()
     views[22:, 2:], views[22:, :2] = VIEWS[22:, :-2], VIEWS[22:, :1]
     assert any("up to 2." in sentence and "--calibrate shifts" in sentence for sentence in told(views))
+
+
+def test_a_faint_sample_that_shrinks_is_told_by_views_of_the_same_rays() -> None:
+    twice = np.linspace(0, 4 * np.pi, len(VIEWS))  # view 44 sees the rays of view 0
+    noise = np.random.default_rng(3).normal(0, 0.002, VIEWS.shape)
+    still = 0.012 * lines_of(BALLS, twice, VIEWS.shape[1:], AXIS)
+    smaller = 0.012 * lines_of(BALLS, twice, VIEWS.shape[1:], AXIS, change=shrinks)
+    assert still.max() < 0.25
+    assert told(still + noise, angles=twice) == []
+    (sentence,) = told(smaller + noise, angles=twice)
+    assert "see the same rays" in sentence and "narrower" in sentence
 
 
 def test_a_sample_that_shakes() -> None:

@@ -175,6 +175,10 @@ def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
         in finding.message
     )
     assert "--angles FILE" in finding.message
+    assert f"--frames 0::{stands} takes" in finding.message
+    source.angles[source.image_key == 0] = np.concatenate([true[:1], np.repeat(true[1::stands], stands)])[:120]
+    (uneven,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
+    assert "--angles FILE" in uneven.message and "--frames" not in uneven.message
 
 
 @pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
