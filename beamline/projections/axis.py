@@ -183,7 +183,7 @@ def locate_axis(
     lit = np.flatnonzero(~hidden | hidden.all())
     angles = source.angles[band.view_ids]
     try:
-        estimate = find_axis(band.data[..., lit[0] : lit[-1] + 1], angles)
+        estimate = find_axis(np.ascontiguousarray(band.data[..., lit[0] : lit[-1] + 1]), angles)
         estimate = replace(estimate, value=estimate.value + lit[0], candidates=estimate.candidates + lit[0])
         if lit.size < band.data.shape[2] and not estimate.confident:
             estimate = find_axis(band.data, angles)

@@ -4,7 +4,7 @@ The commands are those of users, so that the test holds whatever the inside look
 does: after a change that must not change results, no digest may differ. Where one was meant to change, say so in
 CHANGELOG.md and record all of them anew:
 
-    python -m tests.beamline.test_same_bits [CASE ...]
+    OPENBLAS_NUM_THREADS=1 python -m tests.beamline.test_same_bits [CASE ...]
 
 Digests are of one environment (versions and processor); elsewhere the test is skipped. Real scans that are not beside
 the checkout are skipped one by one.
@@ -12,6 +12,7 @@ the checkout are skipped one by one.
 
 import hashlib
 import json
+import os
 import platform
 import sys
 import tempfile
@@ -106,6 +107,7 @@ def environment() -> dict[str, str]:
         "python": platform.python_version(),
         "processor": _processor(),
         **{name: version(name) for name in packages},
+        "threads of BLAS": os.environ.get("OPENBLAS_NUM_THREADS", "all"),  # 1 in workers of pytest
     }
 
 
