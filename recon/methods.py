@@ -73,12 +73,12 @@ def names_compared(emission: bool = False) -> tuple[str, ...]:
 
 
 def streams(name: str) -> bool:
-    """Whether a method's volume can grow while views arrive; imports nothing.
+    """Whether a method's volume can grow while views arrive, which AUTO does not promise; imports nothing.
 
     Raises:
         ValueError: for an unknown name.
     """
-    return METHODS[name].streams
+    return name != AUTO and METHODS[name].streams
 
 
 def by_name(name: str) -> type[Method]:

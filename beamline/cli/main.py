@@ -52,9 +52,10 @@ class _Lasting(io.FileIO):
 
 
 class _Printable:
-    """A text stream that shows control characters instead of sending them: names of files and texts in them may hold
-    some, whoever prints them. `unfiltered` is the stream itself, for a progress
-    bar."""
+    """A text stream that shows control characters instead of sending them, as names of files and texts in them hold.
+
+    `unfiltered` is the stream itself, for a progress bar.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.unfiltered = stream

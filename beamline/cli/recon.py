@@ -181,7 +181,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
     if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
-    for step in chosen_steps(values) if values["follow"] and method != AUTO and streams(method) else ():
+    for step in chosen_steps(values) if values["follow"] and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
     return method

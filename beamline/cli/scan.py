@@ -90,6 +90,13 @@ class ScanRequest:
         """The configuration of a single scan."""
         return self.files[0] if self.files else None
 
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """The overrides, with those of --no-live, which a resumed run keeps."""
+        from beamline.config.load import NO_LIVE
+
+        return *self.overrides, *(NO_LIVE if self.no_live else ())
+
 
 @click.command()
 @with_request(ScanRequest)
@@ -107,7 +114,7 @@ def scan(request: ScanRequest) -> None:
     Exit codes: see `beamline --help`. 6 means that darks or flats cannot be used. 7 means that the scan is complete,
     but frames have an alarm of the monitor, or darks or flats a fault.
     """
-    from beamline.config.load import NO_LIVE, load
+    from beamline.config.load import load
     from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
     file, run = request.file, request.run
@@ -116,7 +123,7 @@ def scan(request: ScanRequest) -> None:
         _queue().take_all(request)
         return
     with json_events(request.as_json) as json_sink, ExitStack() as held:
-        settings = *request.overrides, *(NO_LIVE if request.no_live else ())  # which a resumed run keeps
+        settings = request.settings
         config = None if file is None else load(file, settings, rehearse=request.rehearse)
         of_energies = _config_of_energies(config, run, request.documents)
         if of_energies is not None:

@@ -185,7 +185,7 @@ class ReconSection(Section):
             raise ValueError(
                 "stop_when needs live: true, because the live reconstruction decides when the views suffice"
             )
-        if self.stop_when is not None and (self.method == AUTO or not streams(self.method)):
+        if self.stop_when is not None and not streams(self.method):
             raise ValueError(
                 f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
             )

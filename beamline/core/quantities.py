@@ -37,7 +37,7 @@ class VoxelKind(Enum):
         return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
 
 
-_SAME = 5e-3  # share by which an angle may be off a quarter of a turn, or whole half turns, in radians: 3.15, 6.3
+_SAME = 5e-3  # relative difference from pi/2, pi, 2 pi or 4 pi that is rounding: 3.15 and 6.3 are 0.3 % off
 _IMPOSSIBLE = 10.0  # times beyond its range a value that another unit makes plausible is refused; nearer, doubted
 
 

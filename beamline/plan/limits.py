@@ -48,7 +48,7 @@ class Flight:
         return np.concatenate([train.start + train.interval * np.arange(train.n) for train in self.trains])
 
 
-_OTHER_SPAN = 0.05  # share by which rounding to counts may change the span: 9 degrees of half a turn
+_OTHER_SPAN = 0.05  # relative change of the span by rounding to counts that is accepted: 9 degrees of half a turn
 
 
 def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) -> Flight:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 
 import numpy as np
@@ -197,11 +197,7 @@ def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None
     size_mm = pixel_size(source, selection)
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
-        stated += [
-            (each.name, getattr(step, each.name))
-            for each in fields(step)  # type: ignore[arg-type]
-            if each.name in ("pixel_size_um", "energy_kev", "distance_mm")
-        ]
+        stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)

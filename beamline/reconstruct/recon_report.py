@@ -278,8 +278,8 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     if axis is not None:
         yield Picture(
             "Rotation axis",
-            f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): lower is "
-            "better, 0 is perfect agreement, about 1 is none. Columns of the binned detector.",
+            f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 where "
+            "they agree, about 1 where they have nothing in common. Columns are those of the binned detector.",
             figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))

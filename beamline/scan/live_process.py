@@ -27,7 +27,6 @@ from beamline.core.process import ChildProcess, ProcessEnd, json_object
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import describe
 from beamline.scan.live_plan import LivePlan, live_plan
-from recon.base.choices import AUTO
 from recon.methods import streams
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     method = config.recon.method
     if not config.recon.live:
         return Commands()
-    if method == AUTO or not streams(method):
+    if not streams(method):
         remark = f"{method} needs the complete scan: the volume comes after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:

@@ -34,7 +34,6 @@ from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
-from recon.base.choices import AUTO
 from recon.methods import streams
 
 Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earlier files of the same scan
@@ -177,7 +176,7 @@ def _worked(
     """The timeline, with a remark on the live volume."""
     axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.method
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
-    if not config.recon.live or method == AUTO or not streams(method):
+    if not config.recon.live or not streams(method):
         return worked
     need = live_need(camera.shape, plan.n_views, free_memory())
     return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))

@@ -38,9 +38,10 @@ def scan_file(path: str | Path) -> Path:
 
 
 def whole_scan(path: Path) -> Path:
-    """The scan file at a path, without links: of a run's folder, or a part of one that was resumed, that of all parts.
+    """The scan file that a path stands for, with links resolved. A run's folder, or any part of a resumed run, stands
+    for the file that joins all parts.
 
-    Where there is none the path itself, of which no scan can be opened; the error then says why.
+    A path at which there is no scan is returned as it is: opening it raises the error that says why.
     """
     with suppress(DataError, RuntimeError):  # RuntimeError: links in a circle
         joined = None if path.is_dir() else joined_file_of(path)

@@ -17,7 +17,7 @@ import click
 
 from beamline.cli.options import json_events
 from beamline.cli.scan import TABLE, ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
-from beamline.config.load import NO_LIVE, Config, load
+from beamline.config.load import Config, load
 from beamline.core.errors import AlarmError, BeamlineError, ConfigError, ScanStopped, exit_code, user_message
 from beamline.core.events import Done, Event, RunStarted, Sink, StateEntered
 from beamline.core.files import SETTINGS, text_in
@@ -287,7 +287,7 @@ def _seconds(worked: DryRun) -> float:
 def take_all(request: ScanRequest) -> None:
     """Run the scans of a queue, or compute their needs, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
-        settings = *request.overrides, *(NO_LIVE if request.no_live else ())
+        settings = request.settings
         queue = load_queue(request.files, settings, rehearse=request.rehearse)
         if request.discard and (series := [scan.name for scan in queue if scan.config.scan.energies is not None]):
             names = ", ".join(series)

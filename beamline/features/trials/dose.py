@@ -84,7 +84,7 @@ class _Instrument:
     axis_col: float
 
     def take(self, plan: DosePlan, warn: Warn, begun: int = 0) -> tuple[PreparedProjections, ViewChoice, F32]:
-        """The views, those of its row, the first of which has the number `begun`, and the truth [z, y, x].
+        """The corrected views, the choice of views of this row, counted from `begun`, and the truth [z, y, x].
 
         Raises:
             ConfigError: the instrument cannot take such a scan.

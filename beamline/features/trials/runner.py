@@ -74,8 +74,9 @@ def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
 def trials_left(done: Sequence[Outcome], trials: Sequence[Trial], expected: Expected) -> float | None:
     """s that the trials to come will take, from those done; None before the first.
 
-    Each takes the same time to start and measure, and what is expected of it, at the pace of its method's trials that
-    are done, or of all. One of which nothing is expected takes what those of its method did, or all.
+    Starting and measuring take the same time in each trial. The rest takes the expected time, scaled by how much longer
+    than expected the finished trials of its method took (or all finished trials). A trial without an expected time
+    takes as long as these did.
     """
     if not done:
         return None

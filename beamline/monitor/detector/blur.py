@@ -60,8 +60,8 @@ class BlurCheck(Logged):
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
     is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well. Fringes
-    are a fact, too. Their score is the share of an outer edge's step by which line integrals beside it lie below the
-    air.
+    are a fact, too: their score is how far line integrals beside an outer edge fall below the air, as a share of the
+    step at the edge.
     """
 
     name: ClassVar[str] = "blur"

@@ -220,7 +220,7 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
 
 
 def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str, float | None]:
-    """The numbers that the texts of these keys begin with, by their names in MakerKeys; None where there is none."""
+    """The number at the beginning of the text of each key, by the names in MakerKeys; None for a text without one."""
     names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:

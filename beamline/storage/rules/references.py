@@ -40,7 +40,7 @@ from recon.base.views import spread
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-BRIGHTER = 0.02  # share of the light by which views may be brighter than flats: a beam drifts by so much
+BRIGHTER = 0.02  # share of the light by which views may exceed flats: the drift of a beam
 _SORTED = 2**20  # pixels, about, whose values are counted
 CELLS = 32  # across the frame, about, by which flats are compared with views
 

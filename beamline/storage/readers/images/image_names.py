@@ -102,7 +102,7 @@ class NamedImages:
         numbers: int64 [file], -1 of references that do not count with the series; None where files are not numbered.
         of_series: int64 [projection], the numbers of the series; None where they count no images.
         plain: the names of the projections without their angles.
-        doubt: why angles in the names are not used; "" where they are, or there are none.
+        doubt: why the angles in the names are not used; empty if they are used or the names have none.
     """
 
     names: list[str]
