@@ -87,9 +87,10 @@ def with_points(numbers: Sequence[str]) -> list[str]:
     commas, points = ([text.strip() for text in numbers if mark in text] for mark in ",.")
     thousands = all(re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", text) for text in commas)
     if commas and (points or thousands or any(text.count(",") > 1 for text in commas)):
-        beside = f" beside {points[0]} with a point" if points else ""
+        beside = f" beside {one_line(points[0], 40)} with a point" if points and points[0] != commas[0] else ""
         raise ValueError(
-            f"{commas[0]} has a comma{beside}, which may stand before decimals or not: write decimals with a point"
+            f"{one_line(commas[0], 40)} has a comma{beside}, which may stand before decimals or not: write one number "
+            "a line, its decimals after a point"
         )
     return [text.replace(",", ".") for text in numbers]
 
