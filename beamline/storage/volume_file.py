@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import zlib
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import h5py
 import numpy as np
@@ -22,8 +20,8 @@ from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.tiff import require_possible
 from beamline.storage.structure import require_npy
 
-LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
-"""mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
+LENGTHS = MappingProxyType({"unknown": 1.0, "meter": 1e3, "mm": 1.0, "micron": 1e-3})
+"""mm of the units of NIfTI; an unstated unit counts as mm."""
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")
 
 
@@ -144,57 +142,28 @@ def _check_size(path: Path, n: int) -> None:
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
-    """Single-file NIfTI-1 (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
+    """NIfTI: values scaled as the header says, and mm between voxels along z, y, x.
 
     Scaled values are float32, others of the file's type. The orientation of the patient is not applied.
     """
     try:
-        from nibabel import Nifti1Header
-        from nibabel.openers import ImageOpener
-        from nibabel.spatialimages import HeaderDataError
-        from nibabel.wrapstruct import WrapStructError
+        import nibabel
     except ImportError as error:
         raise DataError(
             f"{path} is a NIfTI volume; install nibabel to read it: pip install splatline[nifti]."
         ) from error
-    try:
-        with ImageOpener(str(path)) as file:
-            header = Nifti1Header.from_fileobj(file, check=False)
-            dtype, size = _checked_nifti(path, header)
-            _check_size(path, size)
-            stored = np.asarray(header.raw_data_from_fileobj(file))  # [x, y, z], then any axes of length 1
-            values = stored.T.reshape(header["dim"][3:0:-1])
-    except (EOFError, HeaderDataError, WrapStructError, OSError, OverflowError, ValueError, zlib.error) as error:
-        raise DataError(
-            f"{path} cannot be read as NIfTI: it is cut or damaged ({str(error).splitlines()[0]})."
-        ) from error
-    unit = LENGTHS[int(header["xyzt_units"]) & 7]
-    x, y, z = (abs(float(size)) * unit for size in header["pixdim"][1:4])
-    values = values.astype(dtype.newbyteorder("="))
-    slope, intercept = (float(header[name]) for name in ("scl_slope", "scl_inter"))
-    if not math.isfinite(slope) or slope == 0 or (slope == 1 and intercept == 0):
-        return values, (z, y, x)
-    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite; the caller refuses them
-        return values.astype(np.float32) * np.float32(slope) + np.float32(intercept), (z, y, x)
-
-
-def _checked_nifti(path: Path, header: Any) -> tuple[np.dtype[Any], int]:
-    """Type and bytes of the values; DataError for a header that no volume of real numbers has."""
-    magic = bytes(header["magic"]).rstrip(b"\0")
-    if int(header["sizeof_hdr"]) != 348 or magic != b"n+1":
-        raise DataError(f"{path} is no NIfTI-1 in one file (header of {header['sizeof_hdr']} bytes, magic {magic!r}).")
-    dtype, dims = header.get_data_dtype(), header["dim"].tolist()
-    if dtype.kind not in "iuf" or int(header["bitpix"]) != 8 * dtype.itemsize or dtype.itemsize > 8:
-        kind, bits = header["datatype"], header["bitpix"]
-        raise DataError(f"{path} holds values of type {kind} with {bits} bits; real numbers of 8 to 64 bits are read.")
-    if not (3 <= dims[0] <= 7 and min(dims[1:4]) >= 1 and all(n == 1 for n in dims[4 : dims[0] + 1])):
-        raise DataError(f"{path} has the axes {dims[1 : max(dims[0], 0) + 1]}; a volume has three.")
-    sizes, offset = header["pixdim"][1:4], float(header["vox_offset"])
-    if not (np.isfinite(sizes).all() and sizes.all() and math.isfinite(offset) and offset >= 348):
-        raise DataError(f"{path}: voxels of {sizes.tolist()}, values from byte {offset:g} on: the header is damaged.")
-    if (unit := int(header["xyzt_units"]) & 7) not in LENGTHS:
-        raise DataError(f"{path}: lengths in unit {unit} of xyzt_units; 1, 2 and 3 (m, mm, um) are known.")
-    return dtype, math.prod(dims[1:4]) * dtype.itemsize
+    image = nibabel.load(path)
+    dtype, header = image.get_data_dtype(), image.header
+    if len(image.shape) < 3 or min(image.shape) < 1 or any(n != 1 for n in image.shape[3:]) or dtype.kind not in "iuf":
+        raise DataError(f"{path} holds {dtype} of the axes {image.shape}; a volume has three, of real numbers.")
+    unit = LENGTHS[header.get_xyzt_units()[0]]
+    x, y, z = (abs(float(size)) * unit for size in header.get_zooms()[:3])
+    if not all(0 < size < math.inf for size in (x, y, z)):
+        raise DataError(f"{path} states voxels of {z} x {y} x {x} mm; expected lengths above 0.")
+    _check_size(path, math.prod(image.shape) * dtype.itemsize)
+    values = np.asanyarray(image.dataobj).T.reshape(image.shape[2::-1])  # stored as [x, y, z]
+    scaled = (image.dataobj.slope, image.dataobj.inter) != (1, 0)
+    return values.astype(np.float32 if scaled else dtype.newbyteorder("=")), (z, y, x)
 
 
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:

@@ -214,9 +214,6 @@ def study(request: StudyRequest) -> None:
     equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring
     views, side by side and overlapping.
 
-    dose: FILE is a configuration. Its simulated instrument takes scans of equal time and of equal dose, with many and
-    with few views, flying and in steps, and each is compared with the truth.
-
     Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
     the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).

@@ -26,7 +26,7 @@ from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
 from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.prepared import hold_out
 from beamline.projections.scan_statistics import LightAsked, light_in
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
@@ -118,16 +118,10 @@ def opened_scan(
         truth = fit_truth(truth_given, Grid.matching(prepared.geometry), asked.selection.binning).data
     if light is not None:
         facts["light"] = "; ".join(light.in_words())
-    table = replace(table_of(asked, name, title, prepared, facts), light=light)
-    return TrialData(prepared, truth), table if truth is None else replace(table, by="psnr")
-
-
-def table_of(
-    scan: ComparedScan, name: str, title: str, prepared: PreparedProjections, facts: dict[str, str]
-) -> TrialTable:
-    """A table without trials of these views; `facts` are of the scan, by name."""
-    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
-    return TrialTable(name, title, (), HELD_OUT, prepared.length_unit, machine(), known, scan.command)
+    by = HELD_OUT if truth is None else "psnr"
+    facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
+    table = TrialTable(name, title, (), by, prepared.length_unit, machine(), facts, asked.command, light=light)
+    return TrialData(prepared, truth), table
 
 
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:

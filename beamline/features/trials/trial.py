@@ -56,11 +56,6 @@ class Trial:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
 
-    @property
-    def facts(self) -> Mapping[str, float]:
-        """How its views were taken, by heading."""
-        return {} if self.choice is None else self.choice.facts
-
     def build(self) -> Method:
         """The method with the settings of the trial.
 
@@ -235,7 +230,6 @@ class TrialTable:
             "window": 1 if trial.choice is None else trial.choice.window,
             **{name: trial.settings.get(name) for each in every for name in each.settings},
             **({} if self.light is None else self.light.of(trial.frames)),
-            **{name: trial.facts.get(name) for each in every for name in each.facts},
             "status": outcome.status,
             "seconds_asked": trial.seconds_asked,
             **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},

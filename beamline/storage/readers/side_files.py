@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import SETTINGS, decoded, require_regular
-from beamline.core.text import with_points
+from beamline.core.text import NUMBER, with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
 from drivers.base.frame import FrameKind
@@ -224,7 +224,7 @@ def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str
     names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:
-        numbers = (re.match(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text) for text in with_points(texts))
+        numbers = (re.match(rf"\s*[-+]?{NUMBER}", text) for text in with_points(texts))
     except ValueError as error:
         raise DataError(f"{path}: {error}.") from error
     return {name: number and float(number[0]) for name, number in zip(names, numbers, strict=True)}

@@ -6,7 +6,6 @@ and that nobody uses; `info` shows them, and `validate` warns where such a value
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,10 +25,6 @@ Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
 EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
 EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
-_UNKNOWN = "nothing reads this name"
-_MOST = 40  # fields of unknown names
-_CHANGES = re.compile(r"expos|count_?time|current|energ|wavelength|shift|transl|displac|jitter")
-_TOLD = re.compile(_CHANGES.pattern + r"|position|temperature")
 _HALF_PIXEL = 0.5  # what moves by less is not seen
 
 
@@ -55,13 +50,9 @@ class Entry:
 def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
     """The fields stated in a file but ignored; a value that may change the volume is a doubt.
 
-    Numbers that would be used, were their unit known, are among them, and fields whose names are not known.
+    Numbers that would be used, were their unit known, are among them.
     """
-    return (*_not_used(fields, root, source, detector), *_unknown_fields(fields, root, source, detector))
-
-
-def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
-    unused = []
+    unused = list[NotUsed]()
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
         if item is None or item.size == 0 or datasets.is_foreign(item):
@@ -85,7 +76,7 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
             unused.append(NotUsed(field.where, _text(value, unit), why, True))
-    return unused
+    return tuple(unused)
 
 
 def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
@@ -100,36 +91,6 @@ def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detect
             text = _text(np.asarray(datasets.values_of(item)), datasets.attribute(item, "units"))
             used.append(Used(field.where, text, field.use))
     return tuple(used)
-
-
-def _unknown_fields(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
-    """What a file states of each frame, and of exposure, current, energy, position and temperature, under other names.
-
-    A doubt where what may change line integrals differs from view to view.
-    """
-    listed = [item for field in fields if (item := _dataset(root, field.where, detector)) is not None]
-    places, views = {_place(item) for item in listed}, source.image_key == FrameKind.PROJECTION
-    unknown = list[NotUsed]()
-
-    def visit(name: str, item: Any) -> None:
-        told = [key for key in item.attrs if _TOLD.search(key.lower()) and not key.endswith("_indices")]
-        unknown.extend(NotUsed(f"{name}@{key}", datasets.attribute(item, key), _UNKNOWN, False) for key in told)
-        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or _place(item) in places:
-            return
-        of_frames = item.ndim == 1 and item.size in (views.size, views.sum()) and item.size > 1
-        if of_frames or (item.size == 1 and _TOLD.search(name.rpartition("/")[2].lower())):
-            value = np.asarray(datasets.values_of(item))
-            of_views = value[views] if value.size == views.size else value
-            doubt = of_frames and bool(_CHANGES.search(name.lower())) and np.unique(of_views).size > 1
-            unknown.append(NotUsed(name, _text(value, datasets.attribute(item, "units")), _UNKNOWN, doubt))
-
-    root.visititems(visit)
-    return unknown[:_MOST]
-
-
-def _place(item: h5py.Dataset) -> tuple[int, int]:
-    known = h5py.h5o.get_info(item.id)
-    return known.fileno, known.addr
 
 
 def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:

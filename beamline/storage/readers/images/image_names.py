@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_angles import NamedAngles, angles_in, in_even_steps
+from beamline.storage.readers.images.image_angles import NamedAngles, angles_in
 from drivers.base.frame import FrameKind
 
 _REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
@@ -193,15 +193,6 @@ def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     """The numbers of images that count frames, not dates."""
     numbers = _numbers(names)
     return None if numbers is None or np.ptp(numbers) > COUNTED * numbers.size else numbers
-
-
-def two_orders(names: Sequence[str]) -> bool:
-    """Whether names have two numbers that count the images in even steps, each in a different order."""
-    digits = [re.findall(r"\d+", name) for name in names]
-    if len({len(each) for each in digits}) != 1:
-        return False
-    columns = [np.array([int(each[-18:]) for each in column], np.int64) for column in zip(*digits, strict=True)]
-    return len({tuple(np.argsort(column)) for column in columns if in_even_steps(np.sort(column))}) > 1
 
 
 def _several_series(path: object, names: Sequence[str]) -> str:

@@ -456,26 +456,6 @@ def test_the_page_lists_every_field() -> None:
         assert f"| `{field.where}` | {use} |\n" in page, field.where
 
 
-# Values under names that nobody reads, and whether they may change a number.
-UNKNOWN: dict[str, tuple[Any, bool | None]] = {
-    "instrument/pco/exposure_of_frame": (np.r_[0, 0, np.arange(VIEWS)] * 0.1, True),
-    "instrument/pco/exposure_of_view": (np.arange(VIEWS) * 0.1, True),
-    "instrument/machine/current": (np.r_[1, 2, [200.0] * VIEWS], False),  # the same in all views
-    "instrument/thermometer/value": (np.arange(2.0 + VIEWS), False),
-    "sample/temperature": (293.0, False),
-    "instrument/pco/gain": (3.0, None),  # one number that tells nothing of these
-    "instrument/pco/table": (np.zeros(3), None),
-}
-
-
-@pytest.mark.parametrize("where", UNKNOWN)
-def test_what_is_stated_of_each_frame_under_another_name_is_named(tmp_path: Path, where: str) -> None:
-    value, doubt = UNKNOWN[where]
-    for store in (nxtomo, exchange):
-        hits = [hit for hit in validate(store(tmp_path / "s.h5", (where, value, None))) if where in hit.message]
-        assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
-
-
 def test_info_shows_what_is_used(tmp_path: Path) -> None:
     path = nxtomo(tmp_path / "s.nx", ("control/data", np.arange(7.0) + 200, "mA"))
     used = describe(path)["used"]
