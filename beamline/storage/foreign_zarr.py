@@ -31,13 +31,15 @@ def is_zarr(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """A scale of a volume: an array [..., z, y, x] of a Zarr store whose leading axes have length one
-    (`VolumeScale`)."""
+    """A scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length one.
+
+    Attributes:
+        coarser: the same volume with fewer voxels.
+    """
 
     path: Path
     array: Any
     coarser: tuple[ZarrScale, ...] = ()
-    whole_chunks = True
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,28 +93,6 @@ class VolumeFormat(Protocol):
         Raises:
             DataError: cut off or damaged.
         """
-
-
-@runtime_checkable
-class VolumeScale(Protocol):
-    """A volume stored in chunks, read box by box.
-
-    Attributes:
-        coarser: the same with fewer voxels.
-        whole_chunks: a part of a chunk costs as much as all of it.
-    """
-
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-    @property
-    def chunk(self) -> tuple[int, int, int]: ...
-    @property
-    def dtype(self) -> np.dtype[Any]: ...
-    @property
-    def coarser(self) -> tuple[VolumeScale, ...]: ...
-    @property
-    def whole_chunks(self) -> bool: ...
-    def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]: ...
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
