@@ -225,9 +225,8 @@ def _suggestion(record: ReconRecord) -> str:
     if not values.size:
         return "No value of the slices looked at is finite. Nothing was written."
     low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
-    if low < high:
-        return f"99.8 % of the values of {count(chosen.size, 'slice')} lie in {low:g}:{high:g}. Nothing was written."
-    lowest, highest = float(values.min()), float(values.max())
-    if lowest < highest:  # matter in a few voxels, or values that differ in their last digits
-        return f"The values of {count(chosen.size, 'slice')} lie in {lowest:.8g}:{highest:.8g}. Nothing was written."
-    return f"Every value of the slices looked at is {lowest:g}: there is no window to take. Nothing was written."
+    if low == high:  # matter in a few voxels, or values that differ in their last digits
+        low, high = float(values.min()), float(values.max())
+    if low == high:
+        return f"Every value of the slices looked at is {low:g}: there is no window to take. Nothing was written."
+    return f"The values of {count(chosen.size, 'slice')} lie in {low:.8g}:{high:.8g}. Nothing was written."

@@ -109,7 +109,7 @@ def _returned(scan: SourceOptions) -> list[ReturnedView]:
     from beamline.projections.flagged_frames import returned_views
     from beamline.storage.readers.base import TakesTooLongError
     from beamline.storage.readers.open import open_scan
-    from beamline.storage.readers.wrapped import brief_source
+    from beamline.storage.readers.transforms import brief_source
 
     until = SystemClock().now() + LOOK
     with suppress(TakesTooLongError), open_scan(scan) as source:

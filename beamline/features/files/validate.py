@@ -20,7 +20,7 @@ from beamline.features.files.nexus import nexus_findings
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import brief_source
+from beamline.storage.readers.transforms import brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views

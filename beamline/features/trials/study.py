@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from beamline.core.errors import DataError
 from beamline.core.events import StudyStarted
 from beamline.core.sinks import Warn
 from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
-from beamline.projections.prepared import PreparedProjections
 from recon.base.choices import Filter
 from recon.base.method import Plain
 from recon.methods import BASELINE
@@ -41,7 +38,7 @@ def planned_study(
         ConfigError, DataError: nothing was written.
     """
     data, table = opened_scan(scan, "study", study.title, warn, held_out=False)
-    choices = study.rows(_view_set(scan.seed, draws, data.prepared))
+    choices = study.rows(ViewSet(data.geometry.angles, data.geometry.period, scan.seed, draws))
     n_views, given = data.geometry.n_views, settings or {}
 
     def trial(method: str, choice: ViewChoice) -> Trial:
@@ -72,14 +69,6 @@ def planned_study(
     others = (trial(method, whole) for method in scan.methods if method != BASELINE)
     data = replace(data, prepared=replace(data.prepared, held_out=None))
     return Planned(data, table, started, (fbp, *others))
-
-
-def _view_set(seed: int, draws: int, prepared: PreparedProjections) -> ViewSet:
-    """The views of a scan that was taken, which rows choose from."""
-    geometry = prepared.geometry
-    turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
-    places = np.concatenate((geometry.shifts, turns), axis=1)
-    return ViewSet(geometry.angles, geometry.period, seed, draws, places)
 
 
 def _note(n_views: int, ramp: Filter) -> str:

@@ -249,11 +249,8 @@ def quality_plot(table: TrialTable) -> bytes:
 
 def _costs(table: TrialTable) -> dict[str, Callable[[Outcome], float]]:
     """The costs that a picture shows, by the label of their axis. Frames that several views share are counted once."""
-    light, unit, each = table.light, "frames", 1.0
-    if light is not None:
-        unit, each = ("photons a pixel", light.photons) if light.gray is None else ("Gy", light.gray)
     return {
         "time (s)": lambda outcome: outcome.seconds,
         "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
-        f"dose ({unit})": lambda outcome: outcome.trial.frames * each,
+        "dose (frames)": lambda outcome: outcome.trial.frames,
     }

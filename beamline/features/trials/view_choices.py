@@ -17,7 +17,6 @@ EQUAL_COUNTS = 120, 60
 DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
 OVERLAPPING = 180  # Number of overlapping windows of each width
-_APART = 0.25  # px between views of a window: a mean of views that lie further apart is blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +60,12 @@ class ViewSet:
         period: radians after which views see the same rays, see `Geometry.period`.
         seed: of the first random draw.
         draws: how often a random choice is repeated.
-        places: [view, place], px, how far poses move the image or its edge; None: views lie alike.
     """
 
     angles: NDArray[np.float64]
     period: float
     seed: int = 0
     draws: int = 3
-    places: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -171,9 +168,4 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     if together.sum() < 2:
         return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
     groups = groups[together]
-    apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
-    if apart > _APART:
-        return ViewChoice(
-            label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
-        )
     return ViewChoice(label, groups.tolist())

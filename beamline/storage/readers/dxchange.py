@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
-from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
-from beamline.storage.readers.stated import (
+from beamline.storage.readers.fields import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
     EXCHANGE_LENGTH_UNITS,
@@ -24,6 +22,8 @@ from beamline.storage.readers.stated import (
     not_copied,
     stated_in,
 )
+from beamline.storage.readers.nexus import differing
+from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"

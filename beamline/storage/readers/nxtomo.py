@@ -32,6 +32,7 @@ from beamline.storage.readers.base import (
     count_in_blocks,
     frame_indices,
 )
+from beamline.storage.readers.fields import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
 from beamline.storage.readers.nexus import (
     Places,
     choose,
@@ -42,7 +43,6 @@ from beamline.storage.readers.nexus import (
     read_geometry,
     require_order,
 )
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
 from beamline.storage.structure import drawn_on
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier

@@ -16,24 +16,25 @@ from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.changed import AveragedSource, angles_of_frames, overlaid, stated_frames_per_view
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
-from beamline.storage.readers.supplied import (
+from beamline.storage.readers.replacements import (
     Angles,
     Images,
     assign,
     load_angles,
     load_images,
+    overlaid,
     parse_angles,
     select_rows,
 )
-from beamline.storage.readers.wrapped import (
+from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
+from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
     cropped,
@@ -98,7 +99,7 @@ class SourceOptions:
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds. "0::2": every second view, as `wrapped.selected` says.
+            files in a folder then say no kinds. "0::2": every second view, as `transforms.selected` says.
         then: further files of the same scan, whose frames follow.
         side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.

@@ -63,7 +63,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "v.png"], 2, "'.png' is not known"),
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),
-        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
+        (["-o", "g.tif", "--bits", "8"], 2, "lie in"),
         (["-o", "g.tif", "--window", "0:1"], 2, "needs --bits 8"),
         (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
         (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "not a window"),

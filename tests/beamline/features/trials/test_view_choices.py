@@ -89,16 +89,6 @@ def test_no_window_spans_a_gap_or_half_a_turn() -> None:
     assert max(widest) < 12
 
 
-def test_views_that_lie_apart_are_not_averaged() -> None:
-    angles = np.radians(np.arange(0, 180, 0.5))
-    drift, jitter = np.linspace(0, 10, 360), 0.5 * (-1.0) ** np.arange(360)
-    for places, kept in ((drift, 6), (jitter, 0)):
-        row = chosen("window-average", ViewSet(angles, np.pi, places=places[:, None]))
-        means = [each for each in row if each.label.startswith("mean of")]
-        assert sum(each.groups is not None for each in means) == kept
-        assert all("displaced by up to" in each.reason for each in means if each.groups is None)
-
-
 @pytest.mark.parametrize("name", STUDIES)
 def test_rows_that_ask_for_too_much_are_left_out_with_the_reason(name: str) -> None:
     few = np.radians(np.arange(0, 180, 2.0))

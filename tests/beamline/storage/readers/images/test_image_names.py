@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.images.image_angles import angles_in
 from beamline.storage.readers.images.image_names import kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.supplied import load_images
+from beamline.storage.readers.replacements import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12

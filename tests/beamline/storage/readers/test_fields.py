@@ -14,8 +14,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Entry
 
 ROWS, COLS, VIEWS = 4, 6, 5
 KEY = np.r_[2, 1, [0] * VIEWS]
