@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 import recon
@@ -26,7 +25,6 @@ from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene
 from tests.bench.quality_cases import OBJECTS, padded, seen_by_simulator
 from tests.bench.test_materials import counted, cross_sections, grains
-from tests.bench.test_series import FOAM, of_sub_scans, scanned
 from tests.conftest import SHARED_DATA
 
 pytestmark = pytest.mark.bench
@@ -115,44 +113,8 @@ def test_energies(kind: str) -> None:
     measured(f"energies of the {kind}, apart", truth[1], apart)
 
 
-MOMENTS = (np.arange(12) + 0.5) / 12
-
-
-def settled(fine: F32, time: float) -> F32:
-    """The volume, lower by 15 % at time 1: slices come from farther up, and hold as much as before."""
-    shrunk = 1 - 0.15 * time
-    places = np.meshgrid(np.arange(len(fine)) / shrunk, *(np.arange(n) for n in fine.shape[1:]), indexing="ij")
-    return np.asarray(map_coordinates(fine, places, order=1, output=np.float32), np.float32)
-
-
-def in_time(kind: str) -> tuple[recon.TimedViews, F32]:
-    """72 golden-angle views over a second, 50 000 photons; the truth at `MOMENTS`."""
-    if kind == "foam":
-        return scanned(FOAM)
-    fine, times = MEASURED[kind](48), (np.arange(72) + 0.5) / 72
-    angles = np.pi * (np.sqrt(5) - 1) / 2 * np.arange(72)
-    geometry = Geometry.parallel(angles, (24, 64), pixel_pitch=1.0)
-    lines = np.concatenate([
-        seen_by_simulator(settled(fine, float(t)), geometry.select([n]), 0.5) for n, t in enumerate(times)
-    ])  # fmt: skip
-    scale = np.float32(2 / lines.max())
-    counts = np.random.default_rng(0).poisson(5e4 * np.exp(-scale * lines)).clip(1)
-    truth = scale * np.stack([coarse(settled(fine, float(t))) for t in MOMENTS])
-    return recon.TimedViews((-np.log(counts / 5e4)).astype(np.float32), geometry, times), truth
-
-
-@pytest.mark.parametrize("kind", ["shell", "teapot", "foam"])
-def test_time(kind: str) -> None:
-    """A sample that settles: one volume, two to six parts of the views, and one fit of three volumes."""
-    views, truth = in_time(kind)
-    for parts in (1, 2, 3, 4, 6):
-        measured(f"{kind} in time, fista-tv, {parts} parts", truth, lambda parts=parts: of_sub_scans(views, parts))  # type: ignore[misc]
-
-    def one_fit() -> F32:
-        made = recon.fit_series(views, 3)
-        return np.stack([made.at(float(t)) for t in MOMENTS])
-
-    measured(f"{kind} in time, one fit", truth, one_fit)
+FOAM = {"kind": "foam", "diameter": 0.408, "height": 0.408, "n_holes": 120, "largest_um": 107.0, "smallest_um": 35.0,
+        "gap_um": 4.0, "candidates": 40_000}  # fmt: skip
 
 
 def foam() -> F32:
