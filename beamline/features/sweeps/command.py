@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 _OF_A_VOLUME = frozenset(
     ("output", "report", "write-config", "log", "verbose", "json", "dry-run", "max-residual", "truth", "uncertainty",
-     "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
-     "time", "moves", "beside-scan")
+     "roi", "follow", "earlier", "memory", "cluster", "checkpoint", "resume", "budget",
+     "time", "beside-scan")
 )  # fmt: skip
 """Options of `beamline recon` that a slice has no use for."""
 
