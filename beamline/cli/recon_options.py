@@ -11,6 +11,7 @@ import click
 from beamline.cli.method_options import method_options, preset_option
 from beamline.cli.options import (
     NOT_NEGATIVE,
+    POSITIVE,
     MethodChoice,
     NameChoice,
     json_option,
@@ -154,6 +155,18 @@ recon_options = together(
         multiple=True,
         metavar="FILE",
         help="With --follow: an earlier part of a resumed run, whose views come first. May be repeated.",
+    ),
+    run_option(
+        "--enough-loss",
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: report when all remaining views together would add at most so many dB of PSNR.",
+    ),
+    run_option(
+        "--enough-gain",
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: report when ten more views would add at most so many dB.",
     ),
     unfinished_option,
     heading(RESOURCES),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from beamline.config.beam import Kev, NoMonochromator
 from beamline.config.devices import DeviceSection
@@ -15,7 +15,7 @@ from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
 from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT, names_of_one_volume
+from recon.methods import DEFAULT, names_of_one_volume, streams
 
 if TYPE_CHECKING:
     MethodName = str
@@ -152,6 +152,21 @@ class StorageSection(Section):
     """Frames that are flushed together, at most, while others wait to be written; else each is flushed at once."""
 
 
+class StopWhen(Section):
+    """Limits at which the views suffice, as predicted from the live volume; if both are given, both must be met."""
+
+    psnr_gain_per_10_views: PositiveFloat | None = None
+    """dB that ten more views may still add; null: any."""
+    psnr_loss: PositiveFloat | None = None
+    """dB that the volume may stay below that of the whole scan; null: any."""
+
+    @model_validator(mode="after")
+    def _some_limit(self) -> Self:
+        if self.psnr_gain_per_10_views is self.psnr_loss is None:
+            raise ValueError("stop_when needs psnr_gain_per_10_views or psnr_loss, in dB; null never stops early")
+        return self
+
+
 class ReconSection(Section):
     live: bool = True
     """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
@@ -161,6 +176,20 @@ class ReconSection(Section):
     """Most time after the last view: the volume is made as of a finished scan, and takes longer on a busy machine."""
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
+    stop_when: StopWhen | None = None
+    """End the scan when its views are enough; needs live: true. null: take all views."""
+
+    @model_validator(mode="after")
+    def _somebody_looks(self) -> Self:
+        if self.stop_when is not None and not self.live:
+            raise ValueError(
+                "stop_when needs live: true, because the live reconstruction decides when the views suffice"
+            )
+        if self.stop_when is not None and not streams(self.method):
+            raise ValueError(
+                f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
+            )
+        return self
 
 
 class Speed(Section):
@@ -248,6 +277,8 @@ class Config(Section):
         texts = [f"{energy:.7g}" for energy in energies]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+        if several and self.recon.stop_when is not None:
+            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(

@@ -90,6 +90,8 @@ RULES: Mapping[str, OptionRule] = {
         },
     ),
     "earlier": OptionRule(needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts.")),
+    "enough-loss": OptionRule(value="enough.psnr_loss", needs=_RUNNING),
+    "enough-gain": OptionRule(value="enough.psnr_gain_per_10_views", needs=_RUNNING),
     "unfinished": OptionRule(value="unfinished"),
     "memory": OptionRule(value="memory", excludes=_IN_MEMORY),
     "cluster": OptionRule(value="cluster", excludes=_IN_MEMORY),

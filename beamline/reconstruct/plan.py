@@ -300,7 +300,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 def _refuse_unfollowed(options: ReconOptions) -> None:
     """Raises ConfigError for a method or views that a growing scan cannot have."""
-    if not options.streams:
+    if not options.streams and options.enough is None:
         return
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
