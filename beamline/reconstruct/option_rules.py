@@ -80,6 +80,7 @@ RULES: Mapping[str, OptionRule] = {
         "volumes",
         excludes={**_FINISHED, **OF_ONE_VOLUME},
     ),
+    "moves": OptionRule("moves", needs=("time", "is of volumes in time: give --time N with it.")),
     "plain-splatting": OptionRule("fit.rays.rectified", inverted=True, excludes=_BY_BUDGET),
     "uncertainty": OptionRule(value="uncertainty", excludes=_FOR_TIME),
     "truth": OptionRule(value="truth"),

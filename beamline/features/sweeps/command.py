@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _OF_A_VOLUME = frozenset(
     ("output", "report", "write-config", "log", "verbose", "json", "dry-run", "max-residual", "truth", "uncertainty",
      "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
-     "time", "beside-scan")
+     "time", "moves", "beside-scan")
 )  # fmt: skip
 """Options of `beamline recon` that a slice has no use for."""
 

@@ -215,11 +215,12 @@ def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
 
 
 def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
-    """Each method ignoring time, then of parts of the views; one fit of so many volumes."""
+    """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
     alone = _baselines(methods, n_views, gaussians)
     numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
-    jointly = Trial("one fit", "series", n_views, settings={"volumes": volumes})
-    return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), jointly
+    settings: list[dict[str, Plain | None]] = [{"volumes": volumes, "moves": moves} for moves in (False, True, None)]
+    jointly = [Trial("one fit", "series", n_views, settings=each) for each in settings]
+    return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *jointly
 
 
 def plan_of_energies(

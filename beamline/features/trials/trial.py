@@ -129,6 +129,7 @@ _WORDS: Mapping[str, Callable[[Any], str]] = {
     "steps": lambda n: f"{n} steps",
     "gaussians": lambda n: f"{n / 1000:.3g}k Gaussians" if isinstance(n, int) and n >= 1000 else f"{n} Gaussians",
     "volumes": lambda n: f"{n} volumes",
+    "moves": lambda moves: f"motion {'chosen' if moves is None else 'learnt' if moves else 'none'}",
     "states": lambda names: "smooth share",
     "materials": lambda names: "",
     "iterations": lambda n: count(n, "iteration"),

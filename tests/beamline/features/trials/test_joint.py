@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 VIEWS, HELD_OUT, SIDE, ROWS = 40, 5, 20, 2
 SECTIONS = np.array([[0.2, 1.0], [1.0, 0.3]])  # [energy, material]
 SHORT = {"weight": 0.01, "sweeps": 8}  # the weight is given, for fewer sweeps
-SERIES = Trial("one fit", "series", VIEWS, settings={"volumes": 2, **SHORT})
+SERIES = Trial("one fit", "series", VIEWS, settings={"volumes": 2, "moves": False, **SHORT})
 MATERIALS = Trial("one fit", "materials", VIEWS, settings={"materials": "a,b"})
 
 
@@ -108,7 +108,7 @@ def kept(trial: Trial, data: TrialData, folder: Path) -> F32:
 def test_one_fit_in_time_is_that_of_recon(in_time: TrialData, tmp_path: Path) -> None:
     times = in_time.shown
     views = TimedViews(in_time.prepared.projections.data, in_time.geometry, times)
-    expected = fit_series(views, 2, tv_weight=0.01, sweeps=8)
+    expected = fit_series(views, 2, motion=False, tv_weight=0.01, sweeps=8)
     np.testing.assert_array_equal(kept(SERIES, in_time, tmp_path), expected.at(float(np.sort(times)[VIEWS // 2])))
 
 
@@ -175,16 +175,18 @@ def test_times_and_energies_come_through_the_file(
 def test_too_few_views_are_a_failed_trial(
     in_time: TrialData, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    trial = replace(SERIES, settings={"volumes": 9})
+    trial = replace(SERIES, settings={"volumes": 9, "moves": False})
     assert done(in_time, tmp_path, trial) == 1
     assert "9 volumes of 40 views" in json.loads(capsys.readouterr().out.splitlines()[-1])["message"]
 
 
 def test_a_plan_in_time_ignores_it_then_parts_it_then_fits_all() -> None:
     trials = plan_in_time(("fbp", "sirt"), 72, 1000, 4)
-    assert [t.group for t in trials] == ["method"] * 2 + ["parts"] * 6 + ["one fit"]
+    assert [t.group for t in trials] == ["method"] * 2 + ["parts"] * 6 + ["one fit"] * 3
     assert [t.parts for t in trials if t.group == "parts"] == [2, 2, 4, 4, 8, 8]
-    assert trials[-1].title == "series, 4 volumes"
+    assert [t.title for t in trials[-3:]] == [
+        f"series, 4 volumes, motion {how}" for how in ("none", "learnt", "chosen")
+    ]
     assert max(t.parts for t in plan_in_time(("fbp",), 30, 1000, 4)) == 4  # a part has six views or more
 
 

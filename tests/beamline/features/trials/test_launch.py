@@ -76,13 +76,13 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
 
 def test_a_job_comes_through_its_file(tmp_path: Path) -> None:
     groups = [[0, 1], [2, 3], [4, 5]]
-    settings = {"steps": 3, "weight": 3.0, "start": "tv", "fast": True}
+    settings = {"steps": 3, "weight": 3.0, "start": "tv", "moves": None, "fast": True}
     trial = Trial("method", "r2", 3, 2, settings, choice=ViewChoice("means", groups), seconds_asked=1.5)
     back = JOB.validate_json(JOB.dump_json(TrialJob(tmp_path / "data", trial, 7, tmp_path / "v.npy", [trial]))).trial
     assert back is not None and back.choice is not None
     assert (back.choice.label, back.choice.groups) == ("means", groups)
     assert replace(back, choice=None) == replace(trial, choice=None)
-    assert [type(value) for value in back.settings.values()] == [int, float, str, bool]
+    assert [type(value) for value in back.settings.values()] == [int, float, str, type(None), bool]
 
 
 @pytest.mark.slow
