@@ -54,11 +54,11 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> Axis
     cols = a.shape[1]
     rows = np.unique(np.linspace(0, len(a) - 1, min(len(a), 4 * MOST_ROWS)).astype(int))
     candidates = np.arange(cols // 8 * 2, 2 * cols - 1 - cols // 8 * 2) / 2
-    curve = _mirror_mismatch(a[rows], b[rows], candidates)
+    curve = mirror_mismatch(a[rows], b[rows], candidates)
     value, depth = optimum(candidates, curve)
     confident = depth > 0.5
     if confident and rows.size >= 8:
-        halves = [_mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
+        halves = [mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
         confident = max(abs(lowest(candidates, half)[0] - value) for half in halves) < AGREE
     return AxisEstimate(value, candidates, curve, confident, "pair")
 
@@ -142,7 +142,7 @@ def _rows_of(views: Floats) -> Floats:
     return views.reshape(-1, views.shape[2])
 
 
-def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
+def mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
 
     It is 1 if these columns hold too little of the views' variance: air alone always matches.
@@ -209,7 +209,7 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     a, b = _opposites(data, theta)
     candidates = _opposite_candidates(data.shape[2])
     rows = range(data.shape[1])
-    return candidates, np.stack([_mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
+    return candidates, np.stack([mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
 
 
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
