@@ -204,7 +204,7 @@ def test_as_a_process(folder: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.startswith("recon: loading libraries\nbeamline: --views fixed:1")
+    assert done.stderr.startswith("beamline: --views fixed:1")
     assert "Traceback" not in done.stderr
     assert left(folder) == {"scan.h5"}
 
