@@ -82,18 +82,6 @@ def test_torch_too(tmp_path: Path) -> None:
     assert said["torch_allocates"][0] == DataError.exit_code, said
 
 
-def test_a_limit_below_what_the_libraries_take_is_refused_before_they_are_loaded(tmp_path: Path) -> None:
-    """OpenBLAS and LLVM would end the process, or wait for ever."""
-    code = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (400_000_000,) * 2); "
-        "from beamline.cli.main import run; run()"
-    )
-    command = [sys.executable, "-c", code, "ingest", "no.h5", str(tmp_path / "out.h5")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == DataError.exit_code and not list(tmp_path.iterdir())
-    assert done.stderr.startswith("beamline: Out of memory: this process may use 400 MB of address space (ulimit -v)")
-
-
 def _raised_after(cause: BaseException, error: BaseException) -> BaseException:
     try:
         try:
