@@ -28,6 +28,10 @@ FOR_BLUESKY = {
 
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
+    "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "user_message"),
+    "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues"),
+    "beamline.scan.control": ("State", "Verb", "ask"),
+    "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem", "Traits"),
     "recon.testing": ("MethodConformance",),
     "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
