@@ -20,6 +20,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 _PREFIX = "splatline."
 ADD_ONS = {
+    "archive": "splatline-archive",
     "tango": "splatline-tango",
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
