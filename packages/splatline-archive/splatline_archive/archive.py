@@ -154,14 +154,13 @@ class _CompressedCopy:
         raw.visit(names.append)  # each object once, by one of its names
         for name in ("/", *names):
             item, copied = raw[name], file.get(name)
-            if (
-                type(item) is not type(copied)
-                or not _same(dict(item.attrs), dict(copied.attrs))
-                or (isinstance(item, h5py.Dataset) and name not in images and not _same(item[()], copied[()]))
-            ):
+            same = type(item) is type(copied) and _same(dict(item.attrs), dict(copied.attrs))
+            if same and isinstance(item, h5py.Dataset) and name not in images:
+                same = _same(item[()], copied[()])
+            if not same:
                 yield name
 
-    def _checksum_of(self, image: np.ndarray) -> int:
+    def _checksum_of(self, image: Any) -> int:
         self._done += image.nbytes
         self._progress(math.ceil(self._done / 1e6), math.ceil(self._total / 1e6))
         return zlib.crc32(np.ascontiguousarray(image))
