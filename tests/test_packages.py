@@ -10,6 +10,8 @@ from click.testing import CliRunner
 import recon
 from beamline import api
 from beamline.cli.main import main
+from beamline.core.errors import ConfigError
+from beamline.reconstruct.memory import cluster
 from recon.base.registry import ADD_ONS, Registry, UnknownNameError
 from tests.public_names import FOR_BLUESKY, FOR_PACKAGES
 
@@ -46,5 +48,7 @@ def test_a_missing_add_on_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("recon.base.registry.entry_points_announced", lambda: ())
     monkeypatch.setattr("beamline.cli.main.commands", dict)
     assert "`beamline tango`: install splatline-tango." in CliRunner().invoke(main, ["tango"]).stderr
+    with pytest.raises(ConfigError, match="--cluster: install splatline-cluster"):
+        cluster("local:2")
     with pytest.raises(UnknownNameError, match="pip install splatline-tango"):
         Registry("method", {})["tango"]

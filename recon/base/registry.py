@@ -21,6 +21,7 @@ from typing import Any, Generic, Literal, TypeVar
 _PREFIX = "splatline."
 ADD_ONS = {
     "archive": "splatline-archive",
+    "cluster": "splatline-cluster",
     "tango": "splatline-tango",
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""

@@ -163,7 +163,7 @@ class _CompressedCopy:
     def _checksum_of(self, image: Any) -> int:
         self._done += image.nbytes
         self._progress(math.ceil(self._done / 1e6), math.ceil(self._total / 1e6))
-        return zlib.crc32(np.ascontiguousarray(image))
+        return zlib.crc32(np.ascontiguousarray(image).data)
 
 
 def _same(one: Any, other: Any) -> bool:
