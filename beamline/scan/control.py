@@ -21,7 +21,7 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered, Warned
-from beamline.core.files import CONTROL, parts_of, same_file
+from beamline.core.files import CONTROL, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.storage.run_record import DIED, alive, read_record
 
@@ -111,7 +111,7 @@ class _Requests:
             return ""
         try:
             ours = os.fstat(self._held)
-            same = same_file(os.lstat(self._folder), ours)
+            same = os.path.samestat(os.lstat(self._folder), ours)
         except OSError:
             same = False
         return _not_private(ours) if same else "it is gone, or another was put in its place"
