@@ -285,7 +285,7 @@ class Recorder:
 
     def _digested(self, frame: Frame) -> _Item:
         """A frame with its digests and flags, or why it has none: it then fails at its turn to be written."""
-        begun, cpu = time.monotonic(), time.thread_time()
+        begun = time.monotonic()
         try:
             seen, stored = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
             return frame, seen, stored, self._look(_as_stored(frame), seen)
@@ -293,13 +293,12 @@ class Recorder:
             return error
         finally:
             self._work.checking += time.monotonic() - begun
-            self._work.checking_cpu += time.thread_time() - cpu
 
     def _write_frames(self) -> None:
         """The second thread: writes, and reports."""
         item, flushed = self._checked.get(), True
         while True:
-            begun, cpu = time.monotonic(), time.thread_time()
+            begun = time.monotonic()
             try:
                 if isinstance(item, BaseException):
                     raise item
@@ -317,7 +316,6 @@ class Recorder:
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
             self._work.writing += time.monotonic() - begun
-            self._work.writing_cpu += time.thread_time() - cpu
             self._writing_since = math.inf
             if item is None:
                 return

@@ -311,9 +311,13 @@ def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
     """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
     datasets.copy_attributes(source, target)
-    for name, item in source.items():
+    for name in source:
         path = f"{source.name.rstrip('/')}/{name}"
-        if path in _MADE_ANEW or path in _VIRTUAL or datasets.attribute(item, "target") not in ("", path):
+        if (
+            path in _MADE_ANEW
+            or path in _VIRTUAL
+            or datasets.attribute(item := source[name], "target") not in ("", path)
+        ):
             continue
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)

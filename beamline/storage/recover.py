@@ -104,7 +104,8 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         if head is None:
             raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
         if not (head.open_for_writing or head.missing):
-            return _with_view(path, head)
+            with suppress(*hdf5.ALTERED):  # its writer may have been killed when it added the view
+                return _with_view(path, head)
         if head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
             raise DataError(
                 f"{path} changed {age:.0f} s ago and is marked as being written. If its writer is dead, try again in "
@@ -132,7 +133,7 @@ def require_ours(path: Path, file: h5py.File) -> None:
 
 def _with_view(path: Path, head: Superblock) -> Recovered:
     """A closed file; the /exchange view is added where it lacks."""
-    with hdf5.readable(path), closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
+    with closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
         require_ours(path, file)
         require_joined(file)
         frames, complete = int(file[layout.COMMITTED][()]), has_exchange_view(file)
