@@ -30,26 +30,11 @@ _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5p
 def require_harmless(file: h5py.File) -> None:
     """Raise DataError for a file with more objects or deeper groups than any scan has, and for one that refers to a
     path that is no regular file."""
-    _files_drawn_on(file)
-
-
-def require_inside(file: h5py.File) -> None:
-    """Raise DataError if a file links to one outside of its folder."""
     path = Path(file.filename)
-    for other in _files_drawn_on(file):
-        if path.resolve().parent not in other.resolve().parents:
-            raise DataError(
-                f"{path} links to {other}, outside of its folder. Name the file itself to have that read, too."
-            )
-
-
-def _files_drawn_on(file: h5py.File) -> list[Path]:
-    """The regular files that a file draws on; DataError where one is something else."""
-    path, files = Path(file.filename), list[Path]()
     for name in dict.fromkeys(_names(file, path)):
         # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
         for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-            if not os.path.lexists(place) or place.is_dir():
+            if place.is_dir():
                 continue
             try:
                 require_regular(place)
@@ -57,8 +42,6 @@ def _files_drawn_on(file: h5py.File) -> list[Path]:
                 raise DataError(
                     f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
                 ) from error
-            files.append(place)
-    return files
 
 
 def _names(file: h5py.File, path: Path) -> Iterator[str]:
