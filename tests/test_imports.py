@@ -27,7 +27,7 @@ def test_imports_in_functions_and_for_types_count(imported: dict[str, set[str]])
 
 
 def test_nothing_is_pickled() -> None:
-    """But for numba's files of kernels, and what a trial's process reads from its parent's temporary folder."""
+    """But for numba's files of compiled kernels, and what a trial reads from its parent's temporary folder."""
     allowed = {*(ROOT / "recon/compiled").glob("*.py"), ROOT / "beamline/features/trials/worker.py"}
     for package in PACKAGES:
         for path in (ROOT / package).rglob("*.py"):

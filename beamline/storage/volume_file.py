@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import h5py
 import numpy as np
@@ -20,8 +21,8 @@ from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.tiff import require_possible
 from beamline.storage.structure import require_npy
 
-LENGTHS = MappingProxyType({"unknown": 1.0, "meter": 1e3, "mm": 1.0, "micron": 1e-3})
-"""mm of the units of NIfTI; an unstated unit counts as mm."""
+LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
+"""mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")
 
 
@@ -143,7 +144,7 @@ def _check_size(path: Path, n: int) -> None:
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
-    """NIfTI: values scaled as the header says, and mm between voxels along z, y, x.
+    """NIfTI (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
 
     Scaled values are float32, others of the file's type. The orientation of the patient is not applied.
     """
@@ -153,17 +154,17 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
         raise DataError(
             f"{path} is a NIfTI volume; install nibabel to read it: pip install splatline[nifti]."
         ) from error
-    image = nibabel.load(path)
-    dtype, header = image.get_data_dtype(), image.header
-    if len(image.shape) < 3 or min(image.shape) < 1 or any(n != 1 for n in image.shape[3:]) or dtype.kind not in "iuf":
-        raise DataError(f"{path} holds {dtype} of the axes {image.shape}; a volume has three, of real numbers.")
-    unit = LENGTHS[header.get_xyzt_units()[0]]
-    x, y, z = (abs(float(size)) * unit for size in header.get_zooms()[:3])
-    if not all(0 < size < math.inf for size in (x, y, z)):
-        raise DataError(f"{path} states voxels of {z} x {y} x {x} mm; expected lengths above 0.")
-    _check_size(path, math.prod(image.shape) * dtype.itemsize)
-    values = np.asanyarray(image.dataobj).T.reshape(image.shape[2::-1])  # stored as [x, y, z]
-    scaled = (image.dataobj.slope, image.dataobj.inter) != (1, 0)
+    image: Any = nibabel.load(path)
+    shape, unit = image.shape, LENGTHS.get(int(image.header["xyzt_units"]) & 7)
+    dtype, steps = image.get_data_dtype(), np.abs(image.header.get_zooms()[:3])
+    if len(shape) < 3 or any(n != 1 for n in shape[3:]) or dtype.kind not in "iuf":
+        raise DataError(f"{path} holds {dtype} of shape {shape}; expected real numbers of three axes.")
+    if unit is None or not (np.isfinite(steps).all() and steps.all()):
+        raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
+    _check_size(path, math.prod(shape) * dtype.itemsize)
+    values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any axes of length 1
+    x, y, z = (float(step) * unit for step in steps)
+    scaled = values.dtype.newbyteorder("=") != dtype.newbyteorder("=")
     return values.astype(np.float32 if scaled else dtype.newbyteorder("=")), (z, y, x)
 
 

@@ -39,7 +39,6 @@ _FAULTS = {
 _MODULES = {
     "export": "features.export.command",
     "ingest": "features.files.command features.files.ingest",
-    "archive": "features.archive.command",
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
     "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",

