@@ -231,10 +231,7 @@ def _read(folder: Path) -> list[BatchRow]:
             if not {"name", "scan"} <= {*(reader.fieldnames or ())}:
                 raise ValueError(f"expected a first line with name and scan, not {reader.fieldnames}")
         table = TypeAdapter(list[BatchRow]).validate_python(rows)
-        folded = [TABLE, RECIPE, *(row.name.casefold() for row in table)]
-        for n, row in enumerate(table, start=2):
-            if row.name != safe_name(row.name) or folded[n] in folded[:n]:
-                raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
+        _refuse_names(table)
         return [
             BatchRow(row.name, row.scan) if row.has_volume and not (folder / row.name / RECON).is_file() else row
             for row in table
@@ -245,6 +242,14 @@ def _read(folder: Path) -> list[BatchRow]:
         raise DataError(f"{path} is no table of a batch ({place}: {first['msg']}). Nothing was touched.") from error
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
+
+
+def _refuse_names(rows: Sequence[BatchRow]) -> None:
+    """ValueError for a name that is not safe for a folder, or that another row or file of the batch has."""
+    folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
+    for n, row in enumerate(rows, start=2):
+        if row.name != safe_name(row.name) or folded[n] in folded[:n]:
+            raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:

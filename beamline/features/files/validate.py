@@ -232,6 +232,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     attributes = dict(source.attributes)
     if not source.finished and not held(source.path):
         attributes["status"] = "died"
+    optional = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
     facts = {
         "path": str(source.path),
         "format": source.format,
@@ -243,8 +244,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "quantity": source.quantity,
         **_angles(source),
         "pixel_size_mm": source.pixel_size_mm,
-        **({} if source.row_pitch_mm is None else {"pixel_height_mm": source.row_pitch_mm}),
-        **({} if source.cone is None else {"cone_mm": source.cone}),
+        **{name: value for name, value in optional.items() if value is not None},
         "energy_kev": source.energy_kev,
         "axis_col": source.axis_col,
         "exposure_s": attributes.pop("exposure_s", None),
@@ -259,10 +259,10 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
-            finding.message for finding in findings if finding.severity != "info" or finding.rule == CONSTANT_DARKS
-        ]
-        + ([altered_sentence(source)] if source.altered else [])
-        + (_fringes(brief) if facts["reconstructable"] else []),
+            *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),
+            *([altered_sentence(source)] if source.altered else []),
+            *(_fringes(brief) if facts["reconstructable"] else []),
+        ],
     }
 
 

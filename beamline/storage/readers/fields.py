@@ -52,6 +52,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
     Numbers that would be used, were their unit known, are among them.
     """
+    views = int((source.image_key == FrameKind.PROJECTION).sum())
     unused = list[NotUsed]()
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
@@ -60,23 +61,27 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
-        value, unit = np.asarray(datasets.values_of(item)), datasets.attribute(item, "units")
+        value, why, doubt = np.asarray(datasets.values_of(item)), field.use, True
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
-            unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
-        elif (
-            field.units is not None
-            and datasets.in_units(item, field.units) is None
-            and (datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source))
-        ):
-            why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
-            if value.dtype.kind not in "uifb":
-                why = "it is text; expected a number, and a known unit behind it or as its attribute `units`"
-            unused.append(NotUsed(field.where, _text(value, unit), why, True))
-        elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
+        elif value.size not in (1, source.image_key.size, views):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
-            unused.append(NotUsed(field.where, _text(value, unit), why, True))
+        else:
+            why = _unit_problem(field, value, item, source)
+        if why:
+            unused.append(NotUsed(field.where, _text(value, datasets.attribute(item, "units")), why, doubt))
     return tuple(unused)
+
+
+def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> str:
+    """Why a number that would be used is not; "" where its unit is known, or nothing is stated."""
+    stated = datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source)
+    if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
+        return ""
+    if value.dtype.kind not in "uifb":
+        return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
+    unit = datasets.attribute(item, "units")
+    return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 
 
 def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:

@@ -184,7 +184,6 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
 def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     """The scan with what the caller says instead of its files."""
-    quantity = options.quantity
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
         base = with_side_file(base, side)
@@ -198,22 +197,33 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = selected(base, views)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
         base = as_unsigned(base, dtype)
-    darks, flats = _references(base, options, None if side is None else side.white)
-    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
-        base, counts_photons = marked_source(base, no_data)
-        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
-    if any(given is not None for given in (angles, darks, flats, quantity)):
-        base = overlaid(
-            base,
-            darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
-            flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
-            quantity="counts" if quantity == "transmission" else quantity,
-        )
+    base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
     if options.horizontal_axis:
         base = turned(base)
     return base if options.cols is None else cropped(base, options.cols)
+
+
+def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | None, *, replaced: bool) -> ScanSource:
+    """The scan with the darks, flats and quantity that the caller states, and without pixels that have no data.
+
+    Args:
+        replaced: the caller states something else of its frames.
+    """
+    quantity = options.quantity
+    darks, flats = _references(base, options, None if side is None else side.white)
+    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
+        base, counts_photons = marked_source(base, no_data)
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
+    if not replaced and darks is None and flats is None and quantity is None:
+        return base
+    return overlaid(
+        base,
+        darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
+        flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
+        quantity="counts" if quantity == "transmission" else quantity,
+    )
 
 
 def _angle_table(

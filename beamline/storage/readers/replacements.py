@@ -92,14 +92,13 @@ def assign(
         spread[projections] = angles
         return spread
     numbers = source.numbers
-    if numbers is not None and _count_all(numbers, angles.size) and not of_views:
+    if numbers is not None and not of_views and _count_all(numbers, angles.size):
         return np.asarray(angles[numbers - numbers.min()])
     series = None if numbers is None else numbers[projections]
-    one_a_number = series is not None and _count_all(series, angles.size)
     all_frames = angles.size == key.size and not of_views
     if all_frames and source.in_order:
         return angles
-    if series is not None and one_a_number and (not all_frames or _in_equal_steps(angles)):
+    if series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
         spread[projections] = angles[series - series.min()]
         return spread
     if all_frames and int(np.isfinite(angles).sum()) == n:

@@ -238,15 +238,20 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
     if lacking := [getattr(keys, name) for name in ("sod", "sdd", "pixel", "count") if not (number[name] or 0) > 0]:
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
-    n, scale, span = int(count), number["scale"] or 1.0, number["span"] or _ROUND.get(keys.maker)
-    step = number["step"]
-    if step is None and span is not None:
-        step = span / n
-    angles = _listed_angles(path, n) if keys.maker == "Nikon" else None
-    if angles is None and step is not None:
-        angles = (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)
+    n, scale = int(count), number["scale"] or 1.0
+    angles = _degrees(path, keys, number, n)
     radians = None if angles is None else np.radians(angles)
     return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number["white"])
+
+
+def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
+    """Of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
+    if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
+        return listed
+    step, span = number["step"], number["span"] or _ROUND.get(keys.maker)
+    if step is None and span is not None:
+        step = span / n
+    return None if step is None else (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:

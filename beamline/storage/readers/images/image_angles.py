@@ -52,10 +52,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     """
     stems = [name.rpartition("/")[2].rpartition(".")[0] for name in names]
     numbers = [[*_NUMBER.finditer(stem)] for stem in stems]
-    worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
-    chosen = [row[0] for row in worded if len(row) == 1]
-    if not (words := any(worded)):
-        chosen = [match for stem in stems if (match := _THOUSANDTHS.search(stem))] or _with_signs(numbers)
+    chosen, words = _chosen(stems, numbers)
     if not chosen or len(chosen) != len(stems):
         return NamedAngles([*names])
     degrees, doubt = _read(chosen)
@@ -68,6 +65,14 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
         doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
     return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
+
+
+def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
+    """The number of each name that may be its angle, fewer than names where some have none; and whether by a word."""
+    worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
+    if any(worded):
+        return [row[0] for row in worded if len(row) == 1], True
+    return [match for stem in stems if (match := _THOUSANDTHS.search(stem))] or _with_signs(numbers), False
 
 
 def _doubt_of_series(

@@ -175,18 +175,25 @@ def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     for i, name in enumerate(names):
         of_template.setdefault(_template(name), []).append(i)
     for rows in of_template.values():
-        digits = [re.findall(r"\d+", names[i]) for i in rows]
-        columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
-        if not columns or len({len(each) for each in digits}) > 1:
+        column = _counting([names[i] for i in rows])
+        if column is None:
             return None
-        varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
-        counting = [n for n in varying if len(set(columns[n])) == len(rows)]
-        dates = {n for n in varying if min(columns[n]) >= _DATE}
-        if not counting or set(varying) - {*counting} - dates:
-            return None
-        closest = min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))
-        numbers[rows] = columns[closest]
+        numbers[rows] = column
     return numbers if np.unique(numbers).size == len(names) or len(of_template) > 1 else None
+
+
+def _counting(names: list[str]) -> list[int] | None:
+    """The number that counts names of one template most closely."""
+    digits = [re.findall(r"\d+", name) for name in names]
+    columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
+    if not columns or len({len(each) for each in digits}) > 1:
+        return None
+    varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
+    counting = [n for n in varying if len(set(columns[n])) == len(names)]
+    dates = {n for n in varying if min(columns[n]) >= _DATE}
+    if not counting or set(varying) - {*counting} - dates:
+        return None
+    return columns[min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))]
 
 
 def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
