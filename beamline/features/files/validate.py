@@ -221,8 +221,8 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and the findings of the rules; None for what is unknown.
 
-    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `used` are
-    the numbers that the file states and somebody uses, by path, `not_used` those that nobody does. `findings` are the
+    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
+    are the numbers that the file states and nobody uses, by path. `findings` are the
     messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
@@ -256,7 +256,6 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     return {
         **facts,
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
-        "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
             *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),

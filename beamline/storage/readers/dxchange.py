@@ -18,7 +18,6 @@ from beamline.storage.readers.fields import (
     EXCHANGE_ENERGY_UNITS,
     EXCHANGE_LENGTH_UNITS,
     EXCHANGE_TIME_UNITS,
-    in_use,
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
@@ -62,7 +61,6 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
         source.not_used = stated_in(EXCHANGE, file, source)
-        source.used = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
             source.not_used += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)

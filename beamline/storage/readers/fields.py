@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import printable
 from beamline.storage import datasets
-from beamline.storage.readers.base import NotUsed, ScanSource, Used
+from beamline.storage.readers.base import NotUsed, ScanSource
 from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
@@ -82,20 +82,6 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
         return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
-
-
-def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
-    """The numbers stated in a file and used."""
-    unused, used = {field.where for field in source.not_used}, []
-    for field in fields:
-        item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
-        if item is None or not 0 < item.size * 8 <= datasets.BRIEF:
-            continue
-        in_text = field.units is not None and datasets.in_units(item, field.units) is not None
-        if (item.dtype.kind in "uif" or in_text) and (item.ndim <= 1 or item.size == 1):
-            text = _text(np.asarray(datasets.values_of(item)), datasets.attribute(item, "units"))
-            used.append(Used(field.where, text, field.use))
-    return tuple(used)
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:

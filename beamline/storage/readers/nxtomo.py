@@ -32,7 +32,7 @@ from beamline.storage.readers.base import (
     count_in_blocks,
     frame_indices,
 )
-from beamline.storage.readers.fields import NXTOMO, UPRIGHT, in_use, stated_in
+from beamline.storage.readers.fields import NXTOMO, UPRIGHT, stated_in
 from beamline.storage.readers.nexus import (
     Places,
     choose,
@@ -257,7 +257,6 @@ class NXtomoSource(ScanSource):
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
             why = f"it is another scan of this file: --data-path {where}"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
-        self.used = in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
 

@@ -70,7 +70,7 @@ class TiffSeriesSource(ScanSource):
             references, series = self._files[: images.references], self._files[images.references :]
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
-                self.used, self.not_used = stated(path, tif)
+                self.not_used = stated(path, tif)
             some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
