@@ -213,11 +213,6 @@ def test_nonsense_is_refused(text: str, why: str) -> None:
         swept_option(text, LEGAL)
 
 
-def test_two_options_make_a_grid_whose_last_one_changes_fastest() -> None:
-    grid = combinations([SweptOption("a", ("1", "2")), SweptOption("b", ("x", "y"))])
-    assert [tuple(values.values()) for values in grid] == [("1", "x"), ("1", "y"), ("2", "x"), ("2", "y")]
-
-
 @pytest.mark.parametrize("names", ["", "aa", "abc"])
 def test_other_numbers_of_options_are_refused(names: str) -> None:
     with pytest.raises(ValueError, match="or two others"):

@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from beamline.core.machine import machine
 from beamline.features.trials import table as table_module
 from beamline.features.trials.table import quality_plot, sentences, text, to_html, write_page, write_table
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
-from beamline.features.trials.trial import LEAST_GAIN, Outcome, Trial, TrialTable, _rounded
+from beamline.features.trials.trial import LEAST_GAIN, Outcome, Trial, TrialTable
 from beamline.report.sheets import SliceSheet
 from recon.base.method import BoundedMethod
 from recon.methods import by_name, names_of_one_volume
@@ -106,24 +105,6 @@ def test_exactly_the_points_that_nothing_beats_are_kept(points: list[tuple[float
         assert points.index(points[i]) == i
 
 
-@given(POINTS)
-def test_the_best_of_each_axis_is_on_it_and_both_rise_along_it(points: list[tuple[float, float]]) -> None:
-    kept = [points[i] for i in _front(points)]
-    finite = [p for p in points if _finite(p)]
-    assert bool(kept) == bool(finite)
-    if finite:
-        assert kept[0][0] == min(p[0] for p in finite)
-        assert kept[-1][1] == max(p[1] for p in finite)
-    assert all(a[0] < b[0] and a[1] < b[1] for a, b in pairwise(kept))
-
-
-@given(st.floats(1e-9, 1e12), st.floats(1e-9, 1e12))
-def test_rounding_moves_a_cost_by_half_a_percent_and_keeps_the_order(one: float, other: float) -> None:
-    assert _rounded(one) == pytest.approx(one, rel=0.0051)
-    assert _rounded(min(one, other)) <= _rounded(max(one, other))
-    assert _rounded(_rounded(one)) == pytest.approx(_rounded(one), rel=1e-9)
-
-
 METHODS = names_of_one_volume()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
@@ -168,12 +149,6 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
                 continue
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
-
-
-def test_full_tries_more_than_quick() -> None:
-    quick, full = (plan(METHODS, 90, 50_000, depth) for depth in ("quick", "full"))
-    assert len(quick) < 0.7 * len(full)
-    assert len({t.label for t in full}) == len(full)
 
 
 def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
