@@ -1,1 +1,1 @@
-"""Quality of a volume: against a truth, by half data sets (FSC), and against the time spent."""
+"""Quality of a volume: against a truth, and against the time spent."""

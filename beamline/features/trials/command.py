@@ -79,8 +79,7 @@ class TradeoffRequest:
         heading(RESOURCES),
         "--max-seconds",
         type=POSITIVE,
-        help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
-        "would not fit is not begun.",
+        help="Wall time of the whole command. Each method comes first once; a trial that would not fit is not begun.",
     )
     seed: int = set_by(heading(METHOD), seed_option)
     output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem + _tradeoff"))
@@ -107,8 +106,8 @@ def tradeoff(request: TradeoffRequest) -> None:
 
     With --seconds: each method once, all in the same time.
 
-    Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
-    resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, pictures and an HTML page.
+    Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses.
+    Writes a folder with tradeoff.csv, pictures and an HTML page.
     Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds

@@ -111,7 +111,7 @@ def opened_scan(
         truth = fit_truth(truth_given, Grid.matching(prepared.geometry), asked.selection.binning).data
     by = HELD_OUT if truth is None else "psnr"
     facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
-    table = TrialTable(name, title, (), by, prepared.length_unit, machine(), facts, asked.command)
+    table = TrialTable(name, title, (), by, machine(), facts, asked.command)
     return TrialData(prepared, truth), table
 
 

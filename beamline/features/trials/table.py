@@ -38,20 +38,14 @@ FIGURES = {
     "spillover": ("cold", "level of cold regions over the body's"),
     "variation": ("noise", "standard deviation of the body over its level"),
     HELD_OUT: ("held out", METRICS[HELD_OUT].label),
-    "resolution": ("FSC", "period in {} to which two halves of the views agree"),
 }
-"""Heading of each metric of a trial, and what it is; `{}` is the unit of length."""
+"""Heading of each metric of a trial, and what it is."""
 _DIGITS_OF = {"psnr_all": "psnr", "ssim_all": "ssim3d"}
 _QUALITY = {
     "psnr": "PSNR (dB)",
     "psnr_all": "PSNR all views (dB)",
     HELD_OUT: "−20 log₁₀ of the held-out residual (dB)",
 }
-_FSC = (
-    "FSC: a smaller period is better among settings of one method only. Two halves with the same regularisation agree "
-    "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
-    "at the slices."
-)
 _NEAR = 1.0  # dB below the best figure: a tenth more error
 _SHOWN_DB = 12.0  # below the best; worse trials are not drawn
 _WIDTH = 120  # characters
@@ -78,8 +72,6 @@ def cells(table: TrialTable, outcome: Outcome) -> list[str]:
 def _figure(name: str, value: float) -> str:
     """With its digits; "equal" for the PSNR of two equal volumes."""
     name = _DIGITS_OF.get(name, name)
-    if name == "resolution":
-        return f"{value:.3g}" if math.isfinite(value) else "none"
     if math.isfinite(value):
         return f"{value:.{METRICS[name].digits}f}"
     return "equal" if name == "psnr" and value > 0 else "undefined"
@@ -113,7 +105,7 @@ def text(table: TrialTable) -> str:
         else:
             lines.append(f"  {outcome.trial.label}  {_status(outcome)}")
     legends = [f"{words}: {legend}" for name, (words, legend) in FIGURES.items() if name in table.metrics]
-    notes = ["; ".join(legends).format(table.length_unit) + "."] if legends else []
+    notes = ["; ".join(legends) + "."] if legends else []
     notes += ["*: on the front of time and quality."] if front else []
     notes += [*sentences(table), *(f"{o.trial.label}: {o.message}." for o in table.compared if o.message)]
     return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
@@ -190,7 +182,7 @@ def _conclusions(table: TrialTable) -> list[str]:
     if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
         chance = f"+{gain:.2f} dB by {highest.trial.label}, is within chance (± {table.chance(highest, best):.2f} dB)."
         out.append(f"There it ends: the best figure, {chance}")
-    return [*out, _FSC] if "resolution" in table.metrics else out
+    return out
 
 
 def _draws(table: TrialTable) -> Iterator[str]:

@@ -107,7 +107,7 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
     tried = [trials_of(method, n_views, gaussians, depth) for method in methods]
     fewer = [[replace(base, group="views", views=n) for n in counts] + others for base, *others in tried]
-    return tuple(dict.fromkeys([*(replace(base, halves=True) for base, *_ in tried), *chain(*fewer)]))
+    return tuple(dict.fromkeys([*(base for base, *_ in tried), *chain(*fewer)]))
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
@@ -116,10 +116,6 @@ def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, sec
 
 
 def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """The trials in an order for little time: each method once, direct ones first, without half-set resolutions.
-
-    These take two more reconstructions each, and say less than one of another method.
-    """
-    once = [replace(trial, halves=False) for trial in trials]
-    alone = sorted((t for t in once if t.group == "method"), key=lambda t: not by_name(t.method).traits.direct)
-    return tuple(dict.fromkeys([*alone, *once]))
+    """The trials in an order for little time: each method once, direct ones first."""
+    alone = sorted((t for t in trials if t.group == "method"), key=lambda t: not by_name(t.method).traits.direct)
+    return tuple(dict.fromkeys([*alone, *trials]))

@@ -31,7 +31,6 @@ class Trial:
         views: how many, spread evenly over those of the scan, or as many as `choice` has.
         binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
-        halves: measure the half-set resolution too, which takes two more reconstructions.
         seconds_asked: after which the reconstruction ends; None: when its work is done.
         choice: which views; None: `views` of them, evenly spread.
     """
@@ -41,7 +40,6 @@ class Trial:
     views: int
     binning: int = 1
     settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
-    halves: bool = False
     seconds_asked: float | None = None
     choice: ViewChoice | None = None
 
@@ -117,8 +115,8 @@ class Outcome:
         status: only "done" comes with figures.
         seconds: wall time of the reconstruction, without compilation and measuring.
         peak_bytes: of its process; None where the system does not say.
-        metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), and with a reference psnr_all,
-            ssim_all, snr, cnr; by name.
+        metrics: psnr, ssim3d (with a truth), residual_held_out, and with a reference psnr_all, ssim_all, snr, cnr;
+            by name.
         gaussians: in the model at the end; None for voxel methods.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         squared_residuals: of each view held out.
@@ -151,7 +149,6 @@ class TrialTable:
         title: of the page.
         outcomes: in the order of the plan, also of trials that are left out.
         by: the metric of quality: psnr, psnr_all or residual_held_out.
-        length_unit: of the resolution, "mm" or "px".
         scan: facts for people, by name.
         question: that the table answers; empty: none.
         stopped: it was interrupted before all trials were done.
@@ -162,7 +159,6 @@ class TrialTable:
     title: str
     outcomes: tuple[Outcome, ...]
     by: str
-    length_unit: str
     machine: Mapping[str, str | int]
     scan: Mapping[str, str]
     command: str

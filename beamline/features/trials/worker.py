@@ -38,7 +38,6 @@ from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.features.trials import fourier_shell_correlation, soft_cylinder
 from recon.prep.counts import weighted_lines
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
@@ -138,8 +137,6 @@ def run(
     volume = on_grid(result.volume, grid).data
     cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
     figures, squared = measured(trial.method, volume, data, grid)
-    if trial.halves and trial.views >= 4:
-        figures["resolution"] = _half_set_resolution(trial, prepared, grid, seed)
     return {
         "seconds": result.seconds,
         "cpu_seconds": cpu_seconds,
@@ -184,16 +181,6 @@ def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dic
         figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
         squared = left.tolist()
     return figures, squared
-
-
-def _half_set_resolution(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> float:
-    """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
-    geometry, volumes = prepared.geometry, list[F32]()
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    for first in (0, 1):
-        half = replace(prepared.of_views(np.sort(order[first::2])), held_out=None)
-        volumes.append(on_grid(_reconstruct(trial, half, grid, seed).volume, grid).data)
-    return fourier_shell_correlation(volumes[0], volumes[1], grid.spacing, soft_cylinder(grid.shape)).resolution_mm
 
 
 def _reconstruct(

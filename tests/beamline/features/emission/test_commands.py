@@ -142,14 +142,13 @@ def test_a_trial_gives_what_the_function_gives_of_the_same_counts(pet: Path, tmp
         unseen = prepared if given is not None else hold_out(prepared, 8, most=16, advice="")
         data = TrialData(unseen, given)
         dump(tmp_path / DATA, data)
-        trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3}, halves=True)
+        trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3})
         found, volume = run(trial, load(tmp_path / DATA), 0)
         ids = (prepared if given is not None else hold_out(prepared, 8, advice="")).projections.view_ids
         some = ids[np.arange(views) * len(ids) // views]
         emission = prepared.emission.summed(some[:, None], prepared.geometry.select(some))
         expected = recon.mlem(emission, recon.Grid.matching(prepared.geometry), 2, 3).data
         np.testing.assert_array_equal(volume, expected)
-        assert np.isfinite(found["metrics"]["resolution"])
         assert ("spillover" in found["metrics"]) == (given is not None)
 
 

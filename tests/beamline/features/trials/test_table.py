@@ -31,7 +31,7 @@ def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
         Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
         for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
     ]
-    table = TrialTable("tradeoff", "", tuple(outcomes), "psnr", "mm", machine(), {}, "")
+    table = TrialTable("tradeoff", "", tuple(outcomes), "psnr", machine(), {}, "")
     assert table.front == outcomes
 
 
@@ -42,7 +42,7 @@ def _judged(*trials: tuple[float, list[float]]) -> TrialTable:
                 squared_residuals=left)
         for n, (seconds, left) in enumerate(trials)
     ]  # fmt: skip
-    return TrialTable("tradeoff", "", tuple(outcomes), "residual_held_out", "mm", machine(), {}, "")
+    return TrialTable("tradeoff", "", tuple(outcomes), "residual_held_out", machine(), {}, "")
 
 
 def test_a_gain_within_the_scatter_of_the_views_is_none() -> None:
@@ -82,7 +82,7 @@ def _front(points: list[tuple[float, float]]) -> list[int]:
     outcomes = [
         Outcome(Trial("method", "fbp", n), "done", cost, metrics={"psnr": db}) for n, (cost, db) in enumerate(points)
     ]
-    table = TrialTable("tradeoff", "", tuple(outcomes), "psnr", "mm", {}, {}, "")
+    table = TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, "")
     return [outcome.trial.views for outcome in table.front]
 
 
@@ -123,7 +123,7 @@ def test_one_change_at_a_time_about_each_methods_baseline(
     assert len(set(trials)) == len(trials)
     bases = {t.method: t for t in trials if t.group == "method"}
     assert list(bases) == methods == [t.method for t in trials[: len(methods)]]
-    assert all(base.halves and base.views == n_views for base in bases.values())
+    assert all(base.views == n_views for base in bases.values())
     for trial in trials[len(methods) :]:
         base = bases[trial.method]
         changed = {name for name, _ in trial.settings.items() ^ base.settings.items()}
@@ -132,13 +132,12 @@ def test_one_change_at_a_time_about_each_methods_baseline(
         assert (trial.binning != 1) is (trial.group == "binning")
         assert isinstance(trial.build(), by_name(trial.method))
         assert 2 <= trial.views <= n_views
-        assert not trial.halves
 
 
 @given(st.floats(0.5, 1e5))
 def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(seconds: float) -> None:
     trials = plan_in_equal_time(METHODS, 60, 1000, seconds)
-    assert [trial.method for trial in trials] == list(METHODS) and not any(trial.halves for trial in trials)
+    assert [trial.method for trial in trials] == list(METHODS)
     for trial in trials:
         method = trial.build()
         assert trial.seconds_asked == (None if method.traits.direct else seconds)
@@ -187,7 +186,7 @@ FIT = Trial("method", "r2", 10, settings={"steps": 100, "gaussians": 2000})
 
 def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
     command = "beamline tradeoff 'a <b>.h5'"
-    return TrialTable("tradeoff", "What accuracy costs", outcomes, by, "mm", machine(), {"file": "a <b>.h5"}, command)
+    return TrialTable("tradeoff", "What accuracy costs", outcomes, by, machine(), {"file": "a <b>.h5"}, command)
 
 
 def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
@@ -197,7 +196,7 @@ def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8)
 @pytest.mark.parametrize("depth", ["quick", "full"])
 def test_the_table_fits_into_120_columns(depth: Any) -> None:
     """Also with four-digit numbers of views, and with everything that can be measured."""
-    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
+    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784}
     trials = plan(names_of_one_volume(), 1801, 200_000, depth)
     outcomes = [Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4) for trial in trials]
     said = text(_table(*outcomes))

@@ -68,7 +68,7 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str, 
         views = replace(data.prepared.projections, data=used)
         held = np.where(measured, held, np.float32(filled))
         given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
-        trial = Trial("method", method, data.geometry.n_views, binning, halves=True)
+        trial = Trial("method", method, data.geometry.n_views, binning)
         found = run(trial, replace(data, prepared=given), 0)
         figures.append([*found["metrics"].values(), *found["squared_residuals"]])
     np.testing.assert_array_equal(*figures)
@@ -77,7 +77,7 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str, 
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
-    found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0)
+    found = run(Trial("method", "fbp", data.geometry.n_views), data, 0)
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
     assert data.truth is not None and data.prepared.held_out is not None
     assert found["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
@@ -87,7 +87,6 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
     seen = at_voxel_resolution(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
     left = np.linalg.norm(project(volume, geometry) - seen) / np.linalg.norm(unseen)
     assert found["metrics"]["residual_held_out"] == pytest.approx(left, rel=1e-6)
-    assert 2 * 0.5 <= found["metrics"]["resolution"] < 12  # between two voxels and the inner cylinder's size
     assert found["gaussians"] is None
     if STATUS.is_file():  # Linux: this process has its libraries and these arrays, and never had more than now
         assert 1e8 < found["peak_bytes"] <= peak_memory()
@@ -181,8 +180,8 @@ def _cone(data: TrialData) -> TrialData:
     return replace(data, prepared=replace(data.prepared, geometry=around, held_out=None))
 
 
-def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views half a turn apart are not the same ones of a cone: neither may one half of them be half the circle."""
+def test_views_of_a_cone_come_from_the_whole_turn(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views half a turn apart are not the same ones of a cone."""
     cone = _cone(data)
     turn = cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False))
     around = replace(cone, prepared=replace(cone.prepared, geometry=turn))
@@ -190,11 +189,10 @@ def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, mo
     plain = module._reconstruct
     monkeypatch.setattr(module, "warm_up", lambda *_: None)
     monkeypatch.setattr(module, "_reconstruct", lambda *said: seen.append(said[1].geometry.angles) or plain(*said))
-    run(Trial("method", "fbp", 8, halves=True), around, 0)
-    for angles in seen:
-        gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
-        assert gaps.max() < 1.6 * 2 * np.pi / angles.size
-    assert [angles.size for angles in seen] == [8, 4, 4]
+    run(Trial("method", "fbp", 8), around, 0)
+    (angles,) = seen
+    assert angles.size == 8
+    assert np.diff(np.sort(angles), append=angles.min() + 2 * np.pi).max() < 1.6 * 2 * np.pi / 8
 
 
 def test_as_a_process_it_speaks_lines_of_json(
