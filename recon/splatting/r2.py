@@ -17,11 +17,9 @@ from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.in_time import fit_costs
 from recon.splatting.initialise import Start, default_count, first_volume, place
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
@@ -155,9 +153,6 @@ class R2(Checked):
             rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return fit_costs(self, geometry, grid)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians

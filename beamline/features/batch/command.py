@@ -40,8 +40,6 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
 def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
     """What the reconstruction of a scan takes, with its output on the disk of the folder `beside`."""
     from beamline.cli.recon import options_of, recon  # the batch itself needs none of it
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import busy
     from beamline.reconstruct.estimate import estimate
 
     recipe = [] if config is None else ["--config", str(config)]
@@ -49,7 +47,7 @@ def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
         with TemporaryDirectory(prefix=".beamline-", dir=beside) as work:
             words = [scan, *recipe, "--output", str(Path(work) / RECON)]
             with recon.make_context("beamline recon", words) as context:
-                needs = estimate(options_of(context), MachineSpeed(), busy())
+                needs = estimate(options_of(context))
     except (BeamlineError, click.ClickException) as error:
         return ScanNeed(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
     return ScanNeed(**{each.name: getattr(needs, each.name) for each in fields(Need)})

@@ -227,16 +227,14 @@ def _rows(slices: Sequence[SweptSlice], scores: Scores | None) -> list[list[str]
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     """Print the time and memory of the sweep."""
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import Need, busy
+    from beamline.core.machine import Need
     from beamline.core.text import count, size
     from beamline.features.sweeps.sweep import sliced
     from beamline.reconstruct.estimate import estimate
     from recon.assess.time_model import duration_text
 
     with answering(as_json) as answer:
-        speed = MachineSpeed()
-        needs = [estimate(each, speed, busy()) for each in sliced([each for _, each in trials])]
+        needs = [estimate(each) for each in sliced([each for _, each in trials])]
         together = Need.in_turn(needs)
         total = None if any(each.seconds is None for each in needs) else together.seconds
         time, first = "not known" if total is None else f"about {duration_text(total)} at most", needs[0]

@@ -184,13 +184,12 @@ def _compare(
     scan: ComparedScan, layout: TableLayout, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None
 ) -> None:
     """Run a comparison and print its table, or print what it will take."""
-    from beamline.core.durations import MachineSpeed
     from beamline.features.trials.layout import text
     from beamline.features.trials.runner import dry_run, run_comparison
 
     with answering(as_json) as answer:
         if dry:
-            expected = dry_run(plan, scan.folder, answer.warn, MachineSpeed())
+            expected = dry_run(plan, scan.folder, answer.warn)
             answer.done(expected, *expected.lines())
             return
         table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)

@@ -9,14 +9,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import psutil
 
-from beamline.core.durations import MachineSpeed
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
 from beamline.core.machine import Need, free_memory
@@ -32,72 +30,39 @@ from recon.assess.time_model import duration_text
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.base.work import Rates, costs_of, seconds_of
-from recon.methods import by_name
+from recon.forecast import forecast
+from recon.warm_up import warm_up
 
 _PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 _COMPILING = 0.5  # of the time left, at most: what is missing then is compiled by the trials, cheap ones first
 _SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the page shows
 
 
-Expected = Callable[[Trial], float | None]
-"""s of a trial; None: not known."""
+def size_of(trial: Trial) -> float:
+    """Work of a trial, in a unit that all trials of its method share: steps x views x voxels."""
+    method = trial.build()
+    steps = getattr(method, "iterations", None) or getattr(method, "planned_steps", None) or 1
+    return float((1 + trial.halves) * steps * trial.views / trial.binning**3)
 
 
-def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
-    """s that a trial on some of these views reconstructs, at most.
-
-    None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
-    """
-
-    @cache
-    def of_trial(trial: Trial) -> float | None:
-        limit, views = trial.seconds_asked, np.arange(trial.views)
-        if limit is not None and not by_name(trial.method).traits.own_length:
-            return limit
-        with suppress(ValueError):
-            method, coarse = (
-                trial.build(),
-                geometry.select(views * geometry.n_views // views.size).binned(trial.binning),
-            )
-            parts = [coarse.select(part) for part in np.array_split(views, trial.parts)]
-            if trial.halves:
-                parts += [coarse.select(slice(first, None, 2)) for first in (0, 1)]
-            costs = [costs_of(method, [(part, Grid.matching(part))]) for part in parts]
-            seconds = [seconds_of(each, rates).most for each in costs if each is not None]
-            return min(sum(seconds), limit or math.inf) if seconds else None
-        return None
-
-    return of_trial
-
-
-def trials_left(done: Sequence[Outcome], trials: Sequence[Trial], expected: Expected) -> float | None:
+def trials_left(done: Sequence[Outcome], trials: Sequence[Trial]) -> float | None:
     """s that the trials to come will take, from those done; None before the first.
 
-    Starting and measuring take the same time in each trial. The rest takes the expected time, scaled by how much longer
-    than expected the finished trials of its method took (or all finished trials). A trial without an expected time
-    takes as long as these did.
+    Starting and measuring take the same time in each trial. The rest is as that of the finished trials of the same
+    method, by their sizes; of a method of which none is finished, as that of all.
     """
     if not done:
         return None
     total = len(trials) * sum(each.wall - each.working for each in done) / len(done)
-    # a direct method is over too soon to tell how fast this machine is
-    pace = _pace([each for each in done if not by_name(each.trial.method).traits.direct], expected) or 1.0
     for trial in trials:
         same = [each for each in done if each.trial.method == trial.method and each.working > 0]
         if trial.seconds_asked is not None:
             total += trial.seconds_asked
-        elif (seconds := expected(trial)) is not None:
-            total += seconds * (_pace(same, expected) or pace)
+        elif same:
+            total += size_of(trial) * sum(o.working for o in same) / sum(size_of(o.trial) for o in same)
         else:
-            total += sum(each.working for each in same or done) / len(same or done)
+            total += sum(each.working for each in done) / len(done)
     return total
-
-
-def _pace(done: Sequence[Outcome], expected: Expected) -> float | None:
-    """What trials took over what was expected of them; None where nothing was."""
-    told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
-    return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None
 
 
 @dataclass(frozen=True)
@@ -115,7 +80,6 @@ class _Rig:
     end: float
     now: Callable[[], float]
     emit: Callable[[Event], None]
-    expected: Expected
     slices: SliceSheet
 
     @property
@@ -167,11 +131,10 @@ def run_comparison(
     planned, slices = plan(Warnings(sink, clock)), SliceSheet()
     emit(planned.started)
     table, layout, references, truth = planned.table, planned.layout, planned.references, planned.data.truth
-    expected = expected_seconds(planned.data.geometry, MachineSpeed())
     with _result_folder(scan.folder) as work:
         planned.data.save(work / DATA)
         del planned
-        rig = _Rig(work, scan.seed, end, now, emit, expected, slices)
+        rig = _Rig(work, scan.seed, end, now, emit, slices)
         contrast = truth
         for reference in references:
             outcome, volume = rig.run(reference, rig.seconds, reference.title)
@@ -210,10 +173,10 @@ def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) ->
     try:
         for n, index in enumerate(todo):
             trial, seconds = table.outcomes[index].trial, rig.seconds
-            if refusal := _no_time(trials_left(timed, [trial], rig.expected) or 0.0, seconds):
+            if refusal := _no_time(trials_left(timed, [trial]) or 0.0, seconds):
                 table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
                 continue
-            eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.expected)
+            eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]])
             rate = 60 * n / max(rig.now() - begin, 1e-9)
             rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta and min(eta, seconds), rate))
             started, whole = rig.now(), table
@@ -297,11 +260,26 @@ class ExpectedRun:
         ]
 
 
-def dry_run(plan: Plan, folder: Path, warn: Warn, rates: Rates) -> ExpectedRun:
-    """Plan a comparison; nothing is written, and nothing is run.
+def _paces(trials: Sequence[Trial], geometry: Geometry) -> dict[str, float | None]:
+    """s of the first trial of each method over its size, by the method's name, from a few iterations of it.
 
-    Args:
-        rates: of this machine.
+    None: not known before it is tried, also where its method refuses the views, which the trial will report.
+    """
+    paces: dict[str, float | None] = {}
+    for trial in trials:
+        if trial.method not in paces:
+            paces[trial.method] = None
+            with suppress(ValueError):
+                method = trial.build()
+                warm_up(method, geometry)
+                expected = forecast(method, geometry, Grid.matching(geometry), time.perf_counter)
+                whole = replace(trial, views=geometry.n_views, binning=1, halves=False)
+                paces[trial.method] = expected and expected.most / size_of(whole)
+    return paces
+
+
+def dry_run(plan: Plan, folder: Path, warn: Warn) -> ExpectedRun:
+    """Plan a comparison; nothing is written, and a few iterations of each method are run.
 
     Raises:
         ConfigError, DataError: the comparison would be refused.
@@ -309,19 +287,21 @@ def dry_run(plan: Plan, folder: Path, warn: Warn, rates: Rates) -> ExpectedRun:
     start, own_bytes = time.process_time(), int(psutil.Process().memory_info().rss)  # of a process that has begun
     planned = plan(warn)
     data, prepared = planned.data, planned.data.prepared
-    at_most = expected_seconds(data.geometry, rates)
     arrays = (
         prepared.projections.data, prepared.projections.weights, prepared.shares, data.truth,
         prepared.held_out and prepared.held_out[0],
     )  # fmt: skip
     disk, weighted = sum(array.nbytes for array in arrays if array is not None), prepared.ray_factors() is not None
 
+    trials = [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]
+    paces = _paces(trials, data.geometry)
+
     def expected(trial: Trial) -> ExpectedTrial:
-        coarse, works = data.geometry.binned(trial.binning), at_most(trial)
+        coarse, pace = data.geometry.binned(trial.binning), paces[trial.method]
+        works = trial.seconds_asked or (pace and pace * size_of(trial))
         # of a process that has loaded the libraries, the views twice (in their file and those used), the rest
         memory = own_bytes + 2 * disk + trial.build().memory(coarse, Grid.matching(coarse), weighted)
         return ExpectedTrial(label=trial.label, seconds=None if works is None else start + works, memory=memory)
 
-    trials = [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]
     free = shutil.disk_usage(folder.absolute().parent).free
     return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), disk, free, free_memory())

@@ -5,7 +5,6 @@ The registry of methods says which lengths of a method are tried; one without is
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -13,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from beamline.core.durations import MachineSpeed
 from beamline.core.errors import ConfigError
 from beamline.core.events import TradeoffStarted
 from beamline.core.files import refuse_existing
@@ -22,7 +20,7 @@ from beamline.energies import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.launch import ComparedScan, TrialData, opened_scan, table_of
 from beamline.features.trials.layout import Planned
-from beamline.features.trials.runner import Expected, expected_seconds
+from beamline.features.trials.runner import size_of
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.prepared import with_views_held_out
 from beamline.reconstruct.outcome import facts_of
@@ -87,7 +85,7 @@ def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
     n, start = data.geometry.n_views, default_count(data.geometry, data.geometry.sample_pitch)
     methods = scan.methods or names_compared(data.prepared.emission is not None)
     trials = (
-        quick_first(plan(methods, n, start, depth), expected_seconds(data.geometry, MachineSpeed()))
+        quick_first(plan(methods, n, start, depth))
         if scan.seconds is None
         else plan_in_equal_time(methods, n, start, scan.seconds)
     )
@@ -192,11 +190,12 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     return tuple(dict.fromkeys([*(replace(base, halves=True) for base, *_ in tried), *chain(*fewer)]))
 
 
-def quick_first(trials: Sequence[Trial], expected: Expected) -> tuple[Trial, ...]:
-    """The trials with baselines first, then those that take least time, and those whose time is not known."""
+def quick_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """The trials with baselines first, then those that are smallest beside the baseline of their method."""
     baselines = [trial for trial in trials if trial.group == "method"]
+    whole = {trial.method: size_of(trial) for trial in baselines}
     varied = [trial for trial in trials if trial.group != "method"]
-    return *baselines, *sorted(varied, key=lambda trial: expected(trial) or math.inf)
+    return *baselines, *sorted(varied, key=lambda trial: size_of(trial) / whole[trial.method])
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:

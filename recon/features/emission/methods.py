@@ -18,11 +18,9 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
-from recon.base.work import Costs
 from recon.prep.counts import Emission
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import interleaved, iterative_memory
-from recon.voxels.work import on_volume, sweep
 
 _RANGE = 1e30  # products of a sensitivity and an activity beyond it, or below 1 / it, leave float32
 _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
@@ -266,12 +264,6 @@ class Mlem(Checked):
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """The most work: held-out counts may choose fewer iterations, after as many trials on halves of them."""
-        iterations = self.most_iterations if self.iterations is None else self.iterations
-        step = sweep(geometry, grid) + on_volume("pass", grid, 6 * self.parts(geometry.n_views))
-        return Costs({self.name: (iterations + 0.5) * step})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         subsets = self.parts(geometry.n_views)

@@ -10,5 +10,3 @@ METHODS = {
     "intratomo": MethodEntry("recon.features.neural.methods", "IntraTomo", compared=False, lengths=_LENGTHS),
     "sax-nerf": MethodEntry("recon.features.neural.methods", "SaxNerf", compared=False, lengths=_LENGTHS),
 }
-
-OPERATIONS = {"field": "recon.features.neural.methods"}

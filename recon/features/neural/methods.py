@@ -11,15 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from recon.base.declared_types import Bound, Count, Natural
-from recon.base.work import SizedRun
 from recon.features.neural.networks import Field, HashGrid, Waves
 from recon.features.neural.train import FieldMethod
-from recon.methods import by_name, with_settings
-from recon.reconstruction import reconstruct
 
 _COARSEST = 16  # cubes an edge of the first level
 
@@ -98,17 +94,3 @@ class IntraTomo(FieldMethod):
     def network(self, across: int) -> Field:
         highest = None if self.allow_negative else self.highest
         return Field(Waves(self.bands), self.width, waves=True, attention=False, highest=highest)
-
-
-def timed(which: str) -> tuple[SizedRun, ...]:
-    """Timed runs of some steps of the method of this name."""
-    from recon.machine_speed import views_of_disc
-
-    geometry, grid, data = views_of_disc("parallel", 8, 64, 24)
-    method: Any = by_name(which)()
-    samples, voxels = method.rays * method.samples_of(64), math.prod(grid.shape)
-
-    def run(steps: int) -> object:
-        return reconstruct(data, geometry, with_settings(method, {"steps": steps}))
-
-    return tuple(SizedRun(steps * samples, voxels, partial(run, steps)) for steps in (1, 4))

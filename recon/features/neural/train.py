@@ -21,10 +21,8 @@ from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
-from recon.base.work import CLOCK, Costs, Work
 from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import first_volume
-from recon.voxels.direct import direct_work
 from recon.voxels.voxel_problem import density_unit, iterative_memory
 
 CHUNK = 2**15  # Samples that one pass through the network takes
@@ -92,15 +90,6 @@ class FieldMethod(Checked, ABC):
     def for_part(self, share: float, of_time: float) -> Self:
         """The method for a share of a volume: with its share of the seconds."""
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """The most work: `seconds` may end the fit earlier."""
-        if self.seconds is not None:
-            return Costs({self.name: Work.of(CLOCK, self.seconds)})
-        samples = self.steps * self.rays * self.samples_of(max(grid.shape))
-        return Costs(
-            {self.name: direct_work(geometry, grid) + Work.of(f"field, {self.name}", samples, math.prod(grid.shape))}
-        )
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         across = max(grid.shape)

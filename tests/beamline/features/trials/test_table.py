@@ -167,7 +167,7 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
     started = [Outcome(trials[0], "done", seconds, wall=2.0 + seconds)] * done
-    left = trials_left(started, [trials[0]] * 3, lambda trial: None)
+    left = trials_left(started, [trials[0]] * 3)
     assert (left is None) == (not done)
     assert left is None or left == pytest.approx(3 * (2.0 + seconds))
 
@@ -205,21 +205,17 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
     base = Trial("method", "r2", 60, settings={"steps": 100, "gaussians": 1000})
     left = [replace(base, settings={**base.settings, "steps": 100 * k}) for k in range(1, n + 1)]
 
-    def steps(trial: Trial) -> float | None:
-        return float(trial.settings["steps"] or 0) if "steps" in trial.settings else None
-
     one = Outcome(base, "done", speed * 100, wall=start + speed * 100)
-    assert trials_left([one], left, steps) == pytest.approx(n * start + speed * 100 * n * (n + 1) / 2)
-    assert trials_left([one], [], steps) == 0
-    assert trials_left([], left, steps) is None
-    assert quick_first(left[::-1], steps)[0] == left[-1]  # baselines keep their order
+    assert trials_left([one], left) == pytest.approx(n * start + speed * 100 * n * (n + 1) / 2)
+    assert trials_left([one], []) == 0
+    assert trials_left([], left) is None
+    assert quick_first(left[::-1])[0] == left[-1]  # baselines keep their order
     varied = [replace(each, group="steps") for each in left]
-    assert quick_first([*varied[::-1], base], steps) == (base, *varied)
+    assert quick_first([*varied[::-1], base]) == (base, *varied)
     # Of a method never tried nothing better is known than the mean of what was.
     done = [Outcome(base, "done", 4.0, wall=7.0), Outcome(base, "done", 8.0, wall=11.0)]
     other = Trial("method", "fbp", 60)
-    assert trials_left(done, [other], steps) == pytest.approx(3 + 6)
-    assert trials_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
+    assert trials_left(done, [other]) == pytest.approx(3 + 6)
 
 
 def test_where_the_time_of_a_trial_went() -> None:
