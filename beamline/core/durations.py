@@ -1,9 +1,4 @@
-"""Durations: what operations take on this machine, measured once and kept on disk; the time that is left; and the
-phases of a long work.
-
-Operations are measured in processor time, which is the same on a busy machine; a time that follows is that of an idle
-one.
-"""
+"""Durations: the time that is left, and the phases of a long work."""
 
 from __future__ import annotations
 
@@ -11,9 +6,6 @@ import math
 
 from beamline.core.events import PhaseReached, Sink
 from drivers.base.clock import Clock, SystemClock
-
-DAYS = 30.0  # after which figures are measured anew: updates and other programs change what a machine does
-_LAWS = 1  # to be raised where an operation in `recon.machine_speed` takes another size, or does something else
 
 
 def seconds_left(done: float, total: float, spent: float) -> float | None:
