@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,15 +11,10 @@ import numpy as np
 
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS, finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import (
-    default_count,
-    sample_gaussians,
-    sweeps_of_start,
-)
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
@@ -34,9 +28,7 @@ FINISH_SHARE = 0.8
 
 _GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling then takes so many times longer
 _SLAB = 16  # slices that are filled to measure it
-_DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
-_COLS = 96  # binned pixels of the views that time a start
 # Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
 # projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
@@ -55,26 +47,6 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
     parts = subsets_of(geometry, SUBSETS)
     return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
-
-
-def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of a sweep of FISTA-TV, estimated quickly at the beginning from binned pixels."""
-    factor = max(1, min(geometry.detector_shape[1] // _COLS, geometry.detector_shape[0]))
-    coarse = geometry.binned(factor)
-    box = Grid.of_field(coarse, coarse.sample_pitch)
-    share = math.prod(grid.shape) / math.prod(box.shape)
-    return sweep_seconds(coarse, box, now) * share
-
-
-def first_draw_seconds(grid: Grid, count: int, now: Clock) -> float:
-    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, as if all were matter."""
-    nz, ny, nx = grid.shape
-    slices = min(_DRAWN, nz)
-    slab, rng = grid.part(slice(0, slices), slice(0, ny), slice(0, nx)), np.random.default_rng(0)
-    noise = Volume(rng.random(slab.shape, dtype=np.float32), slab)
-    begin = now()
-    sample_gaussians(noise, max(1, count * slices // nz), rng, field_radius=math.inf)
-    return (now() - begin) * nz / slices
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
@@ -218,34 +190,3 @@ class LastRound:
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory in bytes without the projections: that of the method that began the fit."""
         return self.method.memory(geometry, grid, weighted)
-
-
-_RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
-
-
-_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
-
-
-def factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
-    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
-
-    Warns:
-        UserWarning: they do not suffice for a start from all pixels.
-    """
-    if isinstance(method.gaussians, Gaussians):
-        return 1
-    count = method.gaussians or default_count(geometry, grid.voxel_size)
-    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
-    needed += first_draw_seconds(grid, count, now)
-    remaining = max(end - now(), 0.0)
-    if needed <= remaining:
-        return 1
-    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
-    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
-    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
-    warnings.warn(
-        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
-        f"{then if factor > 1 else 'it ends late'}",
-        stacklevel=2,
-    )
-    return factor

@@ -39,8 +39,8 @@ class R2(Checked):
             predict as well: then they make the volume, see `finish.judged`. With `seconds` it takes as many as
             fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
-            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
-            are too few for the start, a warning says so before it, and the start uses binned views.
+            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. The
+            start and one step are made in any case.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
