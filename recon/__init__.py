@@ -39,9 +39,6 @@ if TYPE_CHECKING:
     from recon.features.joint.proportions import fit_share
     from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
     from recon.features.joint.spectral import Materials, fit_materials
-    from recon.features.neural.methods import NAF as NAF
-    from recon.features.neural.methods import IntraTomo as IntraTomo
-    from recon.features.neural.methods import SaxNerf as SaxNerf
     from recon.features.published.r2_published import R2Published as R2Published
     from recon.features.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis

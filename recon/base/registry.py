@@ -22,6 +22,7 @@ _PREFIX = "splatline."
 ADD_ONS = {
     "archive": "splatline-archive",
     "cluster": "splatline-cluster",
+    **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     "tango": "splatline-tango",
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""

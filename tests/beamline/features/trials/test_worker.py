@@ -172,10 +172,7 @@ def test_iterations(data: TrialData, method: str) -> None:
 
 @pytest.mark.parametrize(
     "method",
-    [
-        *(name for name in names_of_one_volume() if not by_name(name).traits.direct and name not in taking("rays")),
-        pytest.param("intratomo", marks=pytest.mark.slow),  # fields share their steps
-    ],
+    [name for name in names_of_one_volume() if not by_name(name).traits.direct],
 )
 def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
     """On a clock that goes on by a tenth of a second whenever it is asked."""

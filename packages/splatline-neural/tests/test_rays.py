@@ -7,8 +7,8 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.neural.networks import drawn, rays_of
 from recon.voxels.projector import Projector
+from splatline_neural.networks import drawn, rays_of
 
 GRID = Grid((20, 32, 32), 0.25, (0.4, 0.2, -0.3))
 ANGLES = np.array([0.0, 0.3, np.pi / 2, 2.0, 4.0])

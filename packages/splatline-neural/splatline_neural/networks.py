@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,12 +17,11 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, leaky_relu, silu
 from torch.nn.utils import skip_init
 
-from recon.base.arrays import F32, F64, Mask
-from recon.base.geometry import Geometry
-from recon.base.volume import Grid
-from recon.kernels.cpu import hash_grid
+from recon import Geometry, Grid
 
+F32 = NDArray[np.float32]
 Activation = Callable[[Tensor], Tensor]
+_PRIMES = 19349663, 83492791
 _SMALL = 1e-4  # first features of a hash grid
 _LEAST = 1e-3  # of the highest density, at the start
 _HEADS, _HEAD, _SEGMENT, _WIDER = 8, 4, 2, 4  # heads, numbers of each, samples of a segment, width of its perceptron
@@ -32,7 +30,8 @@ _HEADS, _HEAD, _SEGMENT, _WIDER = 8, 4, 2, 4  # heads, numbers of each, samples 
 class HashGrid(nn.Module):
     """Multiresolution hash grid (Müller et al. 2022): `levels` of 16, 32, ... cubes an edge, two features each.
 
-    A level has at most 2^log2_table entries. On the CPU numba gathers and scatters, elsewhere torch does.
+    Level l has cubes of 1 / (sides[l] - 2) of the unit box, and features at their corners, which are interpolated
+    trilinearly. A level has at most 2^log2_table entries; corners beyond share them by a hash (eq. 4).
     """
 
     def __init__(self, levels: int, log2_table: int, features: int = 2, coarsest: int = 16) -> None:
@@ -44,54 +43,19 @@ class HashGrid(nn.Module):
         self.width = levels * features
 
     def forward(self, points: Tensor) -> Tensor:
-        if points.is_cuda:
-            return gather_in_torch(points, self.table, self.sides, self.firsts)
-        encoded: Tensor = _Gather.apply(points, self.table, self.sides, self.firsts)
-        return encoded
-
-    def start(self, rng: torch.Generator) -> None:
-        nn.init.uniform_(self.table, -_SMALL, _SMALL, rng)
-
-
-class _Gather(torch.autograd.Function):
-    """`hash_grid.gather`; its slopes are added to `table.grad` in place, without a table for each part of a batch."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, sides: NDArray[Any], firsts: NDArray[Any]) -> Tensor:
-        flat = np.ascontiguousarray(points.detach().reshape(-1, 3).numpy())
-        out = np.empty((len(flat), sides.size * table.shape[1]), np.float32)
-        hash_grid.gather(flat, table.detach().numpy(), sides, firsts, out)
-        ctx.given = flat, table, sides, firsts
-        return torch.from_numpy(out).reshape(*points.shape[:-1], -1)
-
-    @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> Any:
-        flat, table, sides, firsts = ctx.given
-        if table.grad is None:
-            table.grad = torch.zeros_like(table)
-        given = np.ascontiguousarray(slopes[0].reshape(len(flat), -1).numpy())
-        hash_grid.scatter(flat, given, sides, firsts, table.grad.numpy())
-        return None, None, None, None
-
-
-def gather_in_torch(points: Tensor, table: Tensor, sides: NDArray[Any], firsts: NDArray[Any]) -> Tensor:
-    """Features [..., levels * features] of points [..., 3], by torch with its own slopes."""
-    levels = []
-    corners = torch.tensor([[(n >> k) & 1 for k in range(3)] for n in range(8)], device=points.device)
-    primes = torch.tensor(hash_grid.PRIMES, device=points.device)
-    for level, side in enumerate(sides.tolist()):
-        first, size = int(firsts[level]), int(firsts[level + 1] - firsts[level])
-        at = points[..., None, :] * (side - 2) + 0.5
-        low = at.floor()
-        corner = low.long() + corners
-        weight = torch.where(corners > 0, at - low, 1 - (at - low)).prod(-1)
-        if side**3 <= size:
-            entry = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
-        else:
-            mixed = corner * primes
-            entry = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) & (size - 1)
-        levels.append((weight[..., None] * table[first + entry]).sum(-2))
-    return torch.cat(levels, -1)
+        levels = []
+        corners = torch.tensor([[(n >> k) & 1 for k in range(3)] for n in range(8)], device=points.device)
+        for level, side in enumerate(self.sides.tolist()):
+            first, size = int(self.firsts[level]), int(self.firsts[level + 1] - self.firsts[level])
+            at = points[..., None, :] * (side - 2) + 0.5
+            low = at.floor()
+            corner = low.long() + corners
+            weight = torch.where(corners > 0, at - low, 1 - (at - low)).prod(-1)
+            x, y, z = corner.unbind(-1)
+            hashed = (x ^ (y * _PRIMES[0]) ^ (z * _PRIMES[1])) & (size - 1)
+            entry = x + side * (y + side * z) if side**3 <= size else hashed
+            levels.append((weight[..., None] * self.table[first + entry]).sum(-2))
+        return torch.cat(levels, -1)
 
 
 class Waves(nn.Module):
@@ -170,7 +134,7 @@ class Field(nn.Module):
                 for values in part.parameters(recurse=False):
                     nn.init.uniform_(values, -(part.in_features**-0.5), part.in_features**-0.5, rng)
             elif isinstance(part, HashGrid):
-                part.start(rng)
+                nn.init.uniform_(part.table, -_SMALL, _SMALL, rng)
         share = 0.0 if self.highest is None else min(max(mean / self.highest, _LEAST), 0.5)
         with torch.no_grad():
             *_, bias = self.layers[-1].parameters()
@@ -228,13 +192,13 @@ def rays_of(geometry: Geometry, view: int, pixels: Places, grid: Grid) -> Rays:
     return Rays(*((part / edge).astype(np.float32) for part in (start + enter * run - low, (leave - enter) * run)))
 
 
-def _turned(vectors: F64, angles: F64) -> F64:
+def _turned(vectors: NDArray[np.float64], angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vectors (x, y, z), each turned about z by its angle."""
     c, s, (x, y, z) = np.cos(angles), np.sin(angles), vectors.T
     return np.stack((c * x - s * y, s * x + c * y, z), 1)
 
 
-def drawn(rng: np.random.Generator, candidates: Mask, count: int, windows: int, side: int) -> Places:
+def drawn(rng: np.random.Generator, candidates: NDArray[np.bool_], count: int, windows: int, side: int) -> Places:
     """Pixels of a view for one step: `windows` squares of `side` pixels, and `count` candidates outside of them.
 
     Args:
