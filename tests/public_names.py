@@ -30,10 +30,13 @@ FOR_BLUESKY = {
 FOR_PACKAGES = {
     "beamline.cli.options": ("as_scan", "json_option"),
     "beamline.cli.terminal": ("answering",),
-    "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "user_message"),
-    "beamline.core.files": ("refuse_existing", "whole_file"),
-    "beamline.core.text": ("size",),
+    "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
+    "beamline.core.files": ("refuse_existing", "text_in", "whole_file", "write_together", "write_whole"),
+    "beamline.core.text": ("csv_text", "safe_name", "size"),
     "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues"),
+    "beamline.report.figures": ("WIDTH", "finish", "new_figure", "png"),
+    "beamline.scan.energies": ("scans_of",),
+    "beamline.scenes.scene_file": ("open_scene",),
     "beamline.scan.control": ("State", "Verb", "ask"),
     "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem", "Traits"),
@@ -62,7 +65,13 @@ FOR_PACKAGES = {
     "drivers.stages.settings": ("StageDriver", "StageSettings", "key"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),
+    "recon.prep.matter": ("HEAVIEST", "edges_of"),
     "simulators.effects.catalogue": ("Domain",),
+    "simulators.frame.sensor": ("largest_count",),
+    "simulators.light.beam": ("Beam",),
+    "simulators.samples.materials.parts": ("Mixture",),
+    "simulators.samples.materials.spectrum": ("light",),
+    "simulators.scenes.expose": ("Scan", "expose"),
 }  # fmt: skip
 
 _OURS = ("beamline", "recon", "drivers", "simulators")

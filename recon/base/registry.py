@@ -24,6 +24,7 @@ ADD_ONS = {
     "cluster": "splatline-cluster",
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     "tango": "splatline-tango",
+    "xafs": "splatline-spectral",
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant

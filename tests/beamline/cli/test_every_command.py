@@ -17,7 +17,7 @@ TAKES_FILE = {
     "batch": "FILE -o out", "export": "FILE -o out.nrrd", "ingest": "FILE out.h5",
     "materials": "FILE FILE --spectra FILE -o out.h5", "render": "FILE -o out.h5", "study": "fixed-views FILE",
     "simulate": "FILE -o out.h5", "surface": "FILE -o out.stl", "sweep": "FILE axis=1:3:1",
-    "voxelise": "FILE -o out.h5", "xafs": "FILE --from 8.30 --to 8.42",
+    "voxelise": "FILE -o out.h5",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
 NO_FILE = {"completion", "config", "demo", "ioc", "pause", "resume", "stop", "abort", "runs"}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from scipy.special import stdtr
-
-from recon.base.arrays import Mask
 
 Reals = NDArray[np.float64]
 
@@ -21,6 +19,7 @@ ENOUGH = 50  # pixels inside the rim for an estimate of the noise; with fewer th
 FEWEST = 16  # pixels for any estimate of the noise
 DARK = 0.01  # largest share of dark pixels in a region
 KNOWN = 0.5  # least share of pixels with a value in a region
+_LIT, _LIT_SHARE = 0.5, 1e-3  # light: counts above the dark level, or share of the flat where that is less
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +32,34 @@ class ContrastRegions:
         thickness: mm of the material, mean over `inside`; None: not known.
     """
 
-    inside: Mask
-    around: Mask | None = None
+    inside: NDArray[np.bool_]
+    around: NDArray[np.bool_] | None = None
     thickness: float | None = None
 
     def __post_init__(self) -> None:
         for name, mask in (("inside", self.inside), ("around", self.around)):
             if mask is not None and mask.sum() < 1:
                 raise ValueError(f"the region {name} the material has no pixels")
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Radiographs of a material at several energies.
+
+    Attributes:
+        title: what is scanned.
+        n: number of energies.
+        frames: (keV, line integrals [row, col]) of each energy, in any order; +inf where a pixel is dark, NaN
+            without a value.
+        regions: pixels that are compared.
+        elements: atomic numbers of the material; empty: not known.
+    """
+
+    title: str
+    n: int
+    frames: Iterable[tuple[float, Reals]]
+    regions: ContrastRegions
+    elements: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +115,17 @@ class XafsCurve:
         return float(self.energies[first]), float(self.energies[last])
 
 
+def line_integrals(signal: Reals, flat: Reals) -> Reals:
+    """-log(signal / flat), [row, col], of counts above the dark level. +inf where no light was transmitted, NaN where
+    the flat is dark too, or where one of them is not finite."""
+    lit = np.minimum(_LIT, _LIT_SHARE * flat)
+    out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
+    known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)
+    np.log(np.divide(flat, signal, where=known & (signal > lit), out=out), where=known & (signal > lit), out=out)
+    out[known & (signal <= lit)] = np.inf
+    return out
+
+
 def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
     """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
     pixels).
@@ -121,7 +151,7 @@ def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Co
     return XafsCurve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
 
 
-def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
+def _level(frame: Reals, mask: NDArray[np.bool_]) -> tuple[float, float]:
     """Mean over the mask, and the noise of a pixel of it.
 
     The noise is the response of a filter that removes planes and products of lines (Immerkaer, Comput. Vis. Image

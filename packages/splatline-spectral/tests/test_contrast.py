@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from beamline.features.xafs.contrast import (
+from splatline_spectral.contrast import (
     LEAST,
     ContrastRegions,
     XafsCurve,
