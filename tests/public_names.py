@@ -28,11 +28,12 @@ FOR_BLUESKY = {
 
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
-    "beamline.cli.options": ("as_scan", "json_option"),
-    "beamline.cli.terminal": ("answering",),
+    "beamline.cli.options": ("as_scan", "json_option", "parsed", "volume_argument", "volume_path"),
+    "beamline.cli.terminal": ("Answer", "answering"),
     "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
     "beamline.core.files": ("refuse_existing", "text_in", "whole_file", "write_together", "write_whole"),
     "beamline.core.text": ("csv_text", "safe_name", "size"),
+    "beamline.gaussians": ("Model", "read_model"),
     "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues"),
     "beamline.report.figures": ("WIDTH", "finish", "new_figure", "png"),
     "beamline.scan.energies": ("scans_of",),
@@ -51,6 +52,7 @@ FOR_PACKAGES = {
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
     "beamline.storage.readers.open": ("open_scan",),
     "beamline.storage.writers.layout": ("LIBVER",),
+    "beamline.storage.volumes.files": ("opened_volume", "write_volume"),
     "beamline.storage.volumes.base": ("Slices", "VolumeFormat", "bare_record"),
     "beamline.monitor.check": ("Check", "Flag", "Level", "Look", "Policy", "ScanContext"),
     "beamline.testing": ("ReaderConformance",),
@@ -65,6 +67,7 @@ FOR_PACKAGES = {
     "drivers.stages.settings": ("StageDriver", "StageSettings", "key"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),
+    "recon.post": ("clusters",),
     "recon.prep.matter": ("HEAVIEST", "edges_of"),
     "simulators.effects.catalogue": ("Domain",),
     "simulators.frame.sensor": ("largest_count",),

@@ -23,6 +23,7 @@ ADD_ONS = {
     "archive": "splatline-archive",
     "cluster": "splatline-cluster",
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
+    **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
     "tango": "splatline-tango",
     "xafs": "splatline-spectral",
 }

@@ -9,19 +9,16 @@ from __future__ import annotations
 import time
 import tracemalloc
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
 
 import recon
 from recon.assess.metrics import psnr
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.surfaces import Mesh, half_way, on_level, surface
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene
 from tests.bench.quality_cases import OBJECTS, padded, seen_by_simulator
@@ -160,60 +157,3 @@ def foam() -> F32:
     sample = load_scene({"phantom": FOAM, "beam": {"photons_per_s": 1.0}}).sample
     grid = Grid((32, 128, 128), 0.0034)
     return np.asarray(sample_at(sample, 0.0).attenuation(grid), np.float32)[8:24]
-
-
-def distances(mesh: Mesh, truth: Mesh, half: float) -> F64:
-    """Of vertices from the plane of the nearest triangle of the truth, in its unit; less those near the ends."""
-    corners = truth.vertices[truth.faces].astype(np.float64)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    middles = corners.mean(axis=1)
-    points = mesh.vertices[np.abs(mesh.vertices[:, 2]) < half].astype(np.float64)
-    _, near = cKDTree(middles).query(points)
-    return np.asarray(np.einsum("ni,ni->n", points - middles[near], normals[near]))
-
-
-@pytest.mark.parametrize("kind", ["teapot", "shell", "foam"])
-def test_surfaces(kind: str) -> None:
-    """Half-way between air and matter, of 90 views of 20 000 photons; RMS distance from the truth's, in voxels."""
-    fine = foam() if kind == "foam" else np.ascontiguousarray(padded(OBJECTS[kind](SHARED_DATA), 256)[120:136])
-    height, width = fine.shape[0] // 2, fine.shape[1] // 2
-    geometry = Geometry.parallel(np.arange(90) * np.pi / 90, (height, width), pixel_pitch=1.0)
-    grid, half = Grid.matching(geometry), height / 2 - 1
-    exact = surface(fine, Grid(fine.shape, 0.5), half_way(fine, len(fine)))
-    lines = seen_by_simulator(fine, geometry, 0.5)
-    depth = 2 * lines / lines.max()
-    counts = np.random.default_rng(0).poisson(2e4 * np.exp(-depth)).clip(1)
-    views = (-np.log(counts / 2e4)).astype(np.float32)
-
-    def row(name: str, run: Callable[[], Mesh]) -> float:
-        run()
-        began = time.process_time()
-        away = distances(run(), exact, half)
-        took = time.process_time() - began
-        tracemalloc.start()
-        run()
-        peak = tracemalloc.get_traced_memory()[1] / 1e6
-        tracemalloc.stop()
-        rms = float(np.sqrt(np.mean(away**2)))
-        print(f"| surface of the {kind}, {name} | {rms:.3f} | {took:.2f} | {peak:.0f} |")
-        return rms
-
-    def of(method: object, of_gaussians: bool = False) -> Callable[[], Mesh]:
-        def run() -> Mesh:
-            found = recon.reconstruct(views, geometry, method)  # type: ignore[arg-type]
-            if not of_gaussians:
-                return surface(found.volume.data, grid, half_way(found.volume.data, height))
-            assert found.gaussians is not None
-            voxels = recon.voxelize(found.gaussians, grid).numpy()
-            level = half_way(voxels, height)
-            mesh = surface(voxels, grid, level)
-            moved = on_level(found.gaussians, mesh.vertices.astype(np.float64), level, grid.voxel_size)
-            return replace(mesh, vertices=moved.astype(np.float32))
-
-        return run
-
-    rms = {name: row(name, of(method)) for name, method in
-           (("fbp", recon.Fbp()), ("fista-tv", recon.FistaTv()), ("r2", recon.R2()))}  # fmt: skip
-    row("r2, its Gaussians", of(recon.R2(), of_gaussians=True))
-    assert rms["r2"] < rms["fbp"]

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import meshio
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.features.models.made import write_views
 from beamline.gaussians import read_model
-from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
-from recon.features.surfaces import density_at
+from recon import Grid
+from splatline_models.made import Mesh, half_way, surface, write_views
 from tests.beamline.cli.small_scan import beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -85,17 +83,6 @@ def test_views_of_a_model_of_displaced_views_are_in_their_place(folder: Path) ->
         np.testing.assert_array_equal(a["exchange/data"], b["exchange/data"])
 
 
-def test_a_ply_holds_every_gaussian(folder: Path) -> None:
-    _made("recon", "scan.h5", *FIT, "-o", "v.h5")
-    said = _made("export", "v.h5", "--gaussians", "-o", "v.ply")
-    model = read_model(folder / "v.h5").gaussians
-    head, _, body = (folder / "v.ply").read_bytes().partition(b"end_header\n")
-    assert f"element vertex {model.n}".encode() in head and str(model.n) in said
-    rows = np.frombuffer(body, "<f4").reshape(model.n, 11)
-    np.testing.assert_array_equal(rows[:, :3], model.means.numpy())
-    np.testing.assert_allclose(rows[:, 10], model.densities.numpy(), rtol=1e-5)
-
-
 REFUSED = [
     (("voxelise", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
     (("render", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
@@ -103,9 +90,6 @@ REFUSED = [
     (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "names no angles"),
     (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "names no angles"),
     (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "is not a box"),
-    (("export", "f.h5", "-o", "x.ply"), 2, "--gaussians goes with the suffix .ply"),
-    (("export", "f.h5", "-o", "x.tif", "--gaussians"), 2, "--gaussians goes with the suffix .ply"),
-    (("export", "f.h5", "-o", "x.ply", "--gaussians", "--bits", "8"), 2, "does not go with"),
 ]
 
 
@@ -117,22 +101,14 @@ def test_a_volume_without_gaussians_and_bad_names_are_refused(folder: Path) -> N
         assert not list(folder.glob("x.*"))
 
 
-def test_views_of_a_cone_state_their_cone_and_one_that_no_file_states_is_refused(folder: Path) -> None:
+def test_views_of_a_cone_are_refused(folder: Path) -> None:
     _made("recon", "scan.h5", *FIT, "-o", "v.h5")
     model = read_model(folder / "v.h5")
-    cone = replace(model, geometry=replace(model.geometry, sod=100.0, sdd=250.0))
-    write_views(folder / "views.h5", cone, np.radians([0.0, 90.0]), lambda n, of: None)
-    with open_scan(folder / "views.h5") as source:
-        assert source.cone == pytest.approx((100.0, 250.0)) and source.quantity == "line_integrals"
-        assert source.pixel_size_mm == cone.geometry.pixel_pitch and source.axis_col == cone.geometry.axis_col
-        np.testing.assert_allclose(source.angles, np.radians([0.0, 90.0]))
-    off_middle = replace(cone, geometry=replace(cone.geometry, axis_row=7.0))
-    with pytest.raises(DataError, match="the middle row"):
-        write_views(folder / "x.h5", off_middle, np.zeros(1), lambda n, of: None)
+    with pytest.raises(DataError, match="of a cone"):
+        write_views(
+            folder / "x.h5", replace(model, geometry=replace(model.geometry, sod=100.0, sdd=250.0)), np.zeros(1), print
+        )
     assert not list(folder.glob("x.*"))
-
-
-pytest.importorskip("skimage")
 
 
 @pytest.fixture
@@ -145,75 +121,63 @@ def ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def _stl(path: Path) -> NDArray[np.float32]:
-    """Triangles [n, corner, xyz] of a binary STL."""
-    raw = path.read_bytes()
-    assert b"lengths in mm" in raw[:80] and not raw.startswith(b"solid")
-    rows = np.frombuffer(raw[84:], np.dtype([("n", "<f4", 3), ("v", "<f4", (3, 3)), ("a", "<u2")]))
-    assert len(rows) == np.frombuffer(raw[80:84], "<u4")[0]
-    corners: NDArray[np.float32] = rows["v"]
-    outward = np.einsum("ni,ni->n", rows["n"], corners.mean(axis=1))
-    assert (outward > 0).all()
-    return corners
-
-
-def _ply(path: Path) -> NDArray[np.float32]:
-    head, _, body = path.read_bytes().partition(b"end_header\n")
-    assert b"comment splatline, lengths in mm" in head
-    n, m = (int(found) for found in re.findall(rb"element \w+ (\d+)", head))
-    places = np.frombuffer(body[: 12 * n], "<f4").reshape(n, 3)
-    faces = np.frombuffer(body[12 * n :], np.dtype([("n", "u1"), ("at", "<i4", 3)]))
-    assert len(faces) == m and (faces["n"] == 3).all()
-    return places[faces["at"]]
-
-
-def _obj(path: Path) -> NDArray[np.float32]:
-    lines = path.read_text(encoding="ascii").splitlines()
-    assert lines[0] == "# splatline, lengths in mm"
-    places = np.array([line.split()[1:] for line in lines if line.startswith("v ")], np.float32)
-    return places[np.array([line.split()[1:] for line in lines if line.startswith("f ")], int) - 1]
-
-
-def test_the_three_formats_hold_the_same_closed_ball(ball: Path) -> None:
-    meshes = []
-    for suffix, read in ((".stl", _stl), (".ply", _ply), (".obj", _obj)):
-        result = beamline("surface", "ball.npz", "-o", f"ball{suffix}")
-        assert result.exit_code == 0, result.output
-        assert "Euler number 2" in result.output
-        meshes.append(read(ball / f"ball{suffix}"))
-    for other in meshes[1:]:
-        np.testing.assert_array_equal(other, meshes[0])
-    radius = np.linalg.norm(meshes[0], axis=2)
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
+def test_a_mesh_is_the_closed_ball(ball: Path, suffix: str) -> None:
+    result = beamline("surface", "ball.npz", "-o", f"ball{suffix}")
+    assert result.exit_code == 0, result.output
+    assert "Euler number 2" in result.output
+    mesh = meshio.read(ball / f"ball{suffix}")
+    corners = mesh.points[mesh.cells_dict["triangle"]].astype(np.float64)
+    radius = np.linalg.norm(corners, axis=2)
     assert np.sqrt(np.mean((radius - 0.5) ** 2)) < 0.005
-    a, b, c = np.moveaxis(meshes[0].astype(np.float64), 1, 0)
+    a, b, c = np.moveaxis(corners, 1, 0)
     share = np.einsum("ij,ij->", a, np.cross(b, c)) / 6 / (4 / 3 * np.pi * 0.5**3)
     assert 0.97 < share < 1  # chords of a ball of five voxels lie inside it
 
 
-def test_vertices_of_gaussians_are_on_the_level_of_their_density(folder: Path) -> None:
-    fit = ("-m", "r2", "--steps", "40", "--gaussians", "200", "--finish", "0", "--no-report", "-o", "v.h5")
-    assert beamline("recon", "scan.h5", *fit).exit_code == 0
-    result = beamline("surface", "v.h5", "--from", "gaussians", "--level", "0.02", "-o", "v.obj")
-    assert result.exit_code == 0, result.output
-    corners = _obj(folder / "v.obj").reshape(-1, 3).astype(np.float64)
-    low, high = read_reconstruction(folder / "v.h5").volume.grid.edges
-    inside = ((corners > low + 1e-3) & (corners < high - 1e-3)).all(axis=1)
-    assert inside.mean() > 0.1
-    density = density_at(read_model(folder / "v.h5").gaussians, corners[inside])[0]
-    assert np.quantile(np.abs(density - 0.02), 0.95) < 1e-4
-
-
-SURFACE_COMMAND_REFUSED = [
-    (("--level", "7"), 5, "no value lies above the level 7"),
-    (("--from", "gaussians"), 5, "ball.npz"),
-    (("-o", "x.tif"), 2, "format of a mesh '.tif' is unknown"),
-]
-
-
-@pytest.mark.parametrize(("options", "code", "said"), SURFACE_COMMAND_REFUSED)
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [(("--level", "7"), 5, "no value lies above the level 7"), (("-o", "x.tif"), 2, "expected a suffix of .stl")],
+)
 def test_what_has_no_surface_is_refused_and_nothing_is_left(
     ball: Path, options: tuple[str, ...], code: int, said: str
 ) -> None:
     result = beamline("surface", "ball.npz", "-o", "x.stl", *options)
     assert result.exit_code == code and said in result.output + str(result.exception)
     assert left(ball) == {"ball.npz"}
+
+
+def assert_closed(mesh: Mesh) -> None:
+    """Each edge twice, once in each direction, and no two vertices in one place: as STL, too, it is closed."""
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    found, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 1).all()
+    np.testing.assert_array_equal(found, np.unique(found[:, ::-1], axis=0))
+    assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
+
+
+def test_noise_through_all_faces_is_closed() -> None:
+    data = np.random.default_rng(0).normal(size=(17, 20, 23)).astype(np.float32)
+    data[3:6, 4, 5] = 0.1  # on the level itself
+    grid = Grid(data.shape, 1.0, slice_pitch=2.0)
+    mesh = surface(data, grid, 0.1)
+    assert_closed(mesh)
+    low, high = grid.edges
+    assert (mesh.vertices >= low).all() and (mesh.vertices <= high).all()
+
+
+def test_a_full_box_is_closed_at_its_faces() -> None:
+    mesh = surface(np.ones((3, 4, 5), np.float32), Grid((3, 4, 5)), 0.5)
+    assert_closed(mesh)
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (5, 4, 3), rtol=2e-3)
+    assert mesh.euler == 2
+
+
+def test_neither_a_speck_of_metal_nor_a_small_body_in_empty_air_misleads_the_level() -> None:
+    data = np.zeros((20, 40, 40), np.float32)
+    data[:, 10:30, 10:30] = 1.0
+    data[9:11, 19:21, 19:21] = 50.0
+    assert half_way(data) == 0.5
+    alone = np.zeros((20, 40, 40), np.float32)
+    alone[8:12, 18:22, 18:22] = 1.0
+    assert half_way(alone) == 0.5
