@@ -131,7 +131,8 @@ def page() -> str:
         "splatline is BSD-3-Clause. Its wheel holds one file of another project: uPlot 1.6.32, MIT, with its licence\n"
         "beside it. `python -m tests.licences` writes this page from the metadata of what is installed, with what\n"
         "packages bring in turn. A test fails where an installed package has no row, and where one that users install\n"
-        "is under the GPL. Packages of tests and docs, which no user needs, are not listed. What each direct dependency is for: [dependencies](decisions/dependencies.md).",
+        "is under the GPL. Packages of tests and docs, which no user needs, are not listed. What each direct\n"
+        "dependency is for: [dependencies](decisions/dependencies.md).",
         "Wheels of numpy and scipy hold libgfortran, and those of torch libgomp: GPL with the exception that lets any\n"
         "program use them. pyusb loads the system's libusb (LGPL), a driver for DCAM cameras the vendor's library;\n"
         "neither is shipped.",
