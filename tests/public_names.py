@@ -33,6 +33,7 @@ FOR_PACKAGES = {
     "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
     "beamline.core.files": ("refuse_existing", "text_in", "whole_file", "write_together", "write_whole"),
     "beamline.core.text": ("csv_text", "safe_name", "size"),
+    "beamline.core.quantities": ("VoxelKind",),
     "beamline.gaussians": ("Model", "read_model"),
     "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues"),
     "beamline.report.figures": ("WIDTH", "finish", "new_figure", "png"),

@@ -20,7 +20,7 @@ NEED = {
 }
 """Modules that may load torch, beside those of `recon.kernels.gpu`."""
 
-ON_VOXELS = ("fista-tv", "os-sirt-tv", "pnp-dct", "sirt", "sart", "cgls", "asd-pocs", "osem")
+ON_VOXELS = ("fista-tv", "os-sirt-tv", "pnp-dct", "sirt", "sart", "cgls", "asd-pocs")
 
 WITHOUT = """
 import sys

@@ -147,7 +147,7 @@ def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> Non
 def test_each_argument_but_the_data_and_hooks_is_checked_against_the_method() -> None:
     # A new argument that no method is asked about would be one that may silently do nothing.
     free = {"projections", "geometry", "grid", "method", "seed", "weights", "on_progress", "should_stop", "stop_trials",
-            "checkpoint_every", "now", "decide", "emission", "sample_radius"}  # fmt: skip
+            "checkpoint_every", "now", "decide", "sample_radius"}  # fmt: skip
     names = {"device", *inspect.signature(recon.reconstruct).parameters} - {"use", "control"}
     names |= {field.name for kind in (DataUse, RunControl) for field in fields(kind)}
     assert names == free | {name.split()[0] for name in OF_A_FIT}

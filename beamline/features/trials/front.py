@@ -37,12 +37,6 @@ _FIGURES = {
     for each in (
         Figure("psnr", "PSNR", "PSNR (dB)", "dB against the truth"),
         Figure("ssim3d", "SSIM", "SSIM 3D", "mean over the slices of three directions"),
-        Figure("rmse", "RMSE", "RMSE", "of the activity"),
-        Figure("signal_to_background", "S/B", "signal/background", "hot regions over the body"),
-        Figure("sbr_error", "S/B err", "its largest error", "of a hot region, relative"),
-        Figure("recovery", "hot", "contrast recovery", "contrast of hot regions over the truth's"),
-        Figure("spillover", "cold", "spillover", "level of cold regions over the body's"),
-        Figure("variation", "noise", "noise", "standard deviation of the body over its level"),
         Figure("residual_held_out", "held out", "held-out res.", METRICS["residual_held_out"].label),
         Figure("resolution", "FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
     )
@@ -286,7 +280,6 @@ COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
     "pnp-dct": "maroon",
-    "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
     "series": "darkgreen", "materials": "slateblue",
 }  # fmt: skip
 _SPARE = ("tab:pink", "black", "sienna", "steelblue", "olivedrab", "orchid")

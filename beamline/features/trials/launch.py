@@ -36,7 +36,6 @@ from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 from recon.base.method import Energies
 from recon.base.volume import Grid
 from recon.prep.correct import Projections
-from recon.prep.counts import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
@@ -85,8 +84,7 @@ class TrialData:
         """
         views = self.prepared
         parts: dict[str, Any] = {
-            "data": self, "prepared": views, "projections": views.projections, "emission": views.emission,
-            "energies": views.energies,
+            "data": self, "prepared": views, "projections": views.projections, "energies": views.energies,
         }  # fmt: skip
         values = {
             f"{part}.{each.name}": getattr(of, each.name) for part, of in parts.items() if of for each in fields(of)
@@ -121,7 +119,6 @@ class TrialData:
             geometry,
             axis=None,
             held_out=(held["lines"], geometry_of_arrays(arrays("unseen"))) if (held := of("held_out")) else None,
-            emission=Emission(geometry=geometry, **counted) if (counted := of("emission")) else None,
             energies=Energies(**energies) if (energies := of("energies")) else None,
             **of("prepared"),
         )
@@ -192,25 +189,21 @@ def table_of(
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
     """The views of a row of a study, each the mean of a window of views.
 
-    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
-    of an emission are added. A ray weighs as the least of its window.
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. A ray
+    weighs as the least of its window.
     """
     groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
-    if choice.window == 1 and prepared.emission is None:
+    if choice.window == 1:
         return middle
     angles = prepared.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
     geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
-    emission = None if prepared.emission is None else prepared.emission.summed(groups, geometry)
+    lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
     weights: F32 | None = whole.weights
-    if emission is not None:
-        lines, weights = weighted_lines(emission)
-    else:
-        lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
-        weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
+    weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
     means = replace(middle.projections, data=lines, weights=weights)
-    return replace(middle, projections=means, geometry=geometry, emission=emission)
+    return replace(middle, projections=means, geometry=geometry)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:

@@ -85,7 +85,7 @@ Comparison = tuple[TrialData, TrialTable, Sequence[Trial]]
 def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
     data, table = opened_scan(scan, warn, "give --truth")
     n, start = data.geometry.n_views, default_count(data.geometry, data.geometry.sample_pitch)
-    methods = scan.methods or names_compared(data.prepared.emission is not None)
+    methods = scan.methods or names_compared()
     trials = (
         quick_first(plan(methods, n, start, depth), expected_seconds(data.geometry, MachineSpeed()))
         if scan.seconds is None
@@ -97,8 +97,6 @@ def _of_one_volume(scan: ComparedScan, depth: Depth, warn: Warn) -> Comparison:
 def _in_time(scan: ComparedScan, volumes: int, warn: Warn) -> Comparison:
     data, table = opened_scan(scan, warn, "leave out --time")
     held, n = data.prepared, data.geometry.n_views
-    if held.emission is not None:
-        raise ConfigError(f"--time: {scan.source.path} is of an emission. Leave it out. Nothing was written.")
     try:
         refuse_few(volumes, n)
     except ValueError as error:

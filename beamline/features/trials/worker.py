@@ -113,8 +113,6 @@ def measured(
         write_array(keep, middle)
     if data.truth is not None:
         figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
-        if data.prepared.emission is not None:
-            figures |= metrics.contrast(data.truth, middle)
     if (reference := data.references.get(method)) is not None:
         figures["psnr_all"] = metrics.psnr(reference, middle)
         figures["ssim_all"] = metrics.ssim3d(reference, middle)

@@ -27,7 +27,6 @@ from beamline.features.trials.view_choices import ViewChoice
 from recon.base.geometry import Geometry
 from recon.base.method import Energies
 from recon.base.volume import Grid
-from recon.prep.counts import Emission
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
@@ -108,7 +107,7 @@ def test_values_survive_the_file(tmp_path: Path) -> None:
     images = rng.random((9, 40, 60)).astype(np.float32)
     whole = prepared_views(images, views, weights=images / 2)
     energies = Energies(np.arange(9), rng.random((9, 2)))
-    whole = replace(whole, emission=Emission(images, views, survival=images), energies=energies, stretch=1.5)
+    whole = replace(whole, energies=energies, stretch=1.5)
     prepared = replace(whole.of_views(np.arange(3)), held_out=(images[3:], views.select(range(3, 9))))
     TrialData(prepared, images, np.arange(6.0)).save(tmp_path / "data")
     write_array(tmp_path / "data" / "reference.os-sirt-tv.npy", images[:1])
@@ -125,8 +124,6 @@ def test_values_survive_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.shown_held_out, np.arange(6.0))
     np.testing.assert_array_equal(back.references["os-sirt-tv"], images[:1])
     assert back.regions is not None and back.regions.shape == (1, 2, 3) and list(back.references) == ["os-sirt-tv"]
-    assert back.prepared.emission is not None and back.prepared.emission.background is None
-    np.testing.assert_array_equal(back.prepared.emission.survival, images[:3])
     assert back.prepared.energies is not None and back.prepared.energies.of_view.tolist() == [0, 1, 2]
     for name in ("stretch", "length_unit", "n_projections", "axis_col"):
         assert getattr(back.prepared, name) == getattr(prepared, name)
@@ -138,4 +135,4 @@ def test_without_truth_and_views_held_out(tmp_path: Path) -> None:
     TrialData(prepared_views(np.zeros((3, 2, 4), np.float32), views), None).save(tmp_path / "data")
     back = TrialData.load(tmp_path / "data")
     assert (back.truth, back.regions, back.references, back.prepared.held_out) == (None, None, {}, None)
-    assert back.prepared.emission is None and back.prepared.energies is None
+    assert back.prepared.energies is None
