@@ -10,7 +10,7 @@ import pytest
 from beamline.config.load import config_folder, load, resolved_yaml
 from beamline.core.files import CONFIG
 from beamline.core.process import ChildProcess, ProcessEnd, with_our_path
-from beamline.features.trials.launch import COMMAND
+from beamline.features.trials.runner import COMMAND
 from beamline.scan.watchdog import watched
 
 OURS = ("beamline", "drivers", "recon", "simulators")
