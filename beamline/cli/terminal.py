@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import sys
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import ReconRecord
 
 
-LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
 SAY_EVERY = 0.2  # s between events on the progress of many frames
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
 _COUNTED = {
@@ -84,15 +82,12 @@ class Terminal:
         self._last_text, self._narrated = "", Narration()
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
-        self._long: threading.Timer | None = None  # names the phase after LONG
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._end_of_phase()
-        with closed_terminal_ignored():
-            self._bar.stop()
+        self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
         """Print a request to the operator without the progress bar, and wait until `put` returns."""
@@ -105,25 +100,24 @@ class Terminal:
             self._asking = False
 
     def __call__(self, event: Event) -> None:
-        with self._lock, closed_terminal_ignored():
+        with self._lock:
             for each in self._narrated(event):
                 self._take(each)
 
     def say(self, text: str) -> None:
         """Print a line that is not an event."""
-        with self._lock, closed_terminal_ignored():
+        with self._lock:
             self._console.print(printable(text))
 
     def _take(self, event: Event) -> None:
-        self._end_of_phase()
         match event:
             case FrameStored(n, of):
                 self._show("scan", n, of, rates(event))
             case Counted(stage, n, of):
                 what, counted = _COUNTED.get(stage, (stage, stage))
                 self._show(what, n, of, rate_text(event, counted))
-            case PhaseReached():
-                self._show_phase(event)
+            case PhaseReached(_, counted, phase, n, of) if n or not self._bar.disable:
+                self._show(phase, n, of, rate_text(event, counted))
             case TrialReached(stage, n, of):
                 what = in_folders("beamline.features", "COUNTED").get(stage, "trials")
                 self._show(what, n, of, trials(event, what))
@@ -138,19 +132,6 @@ class Terminal:
                 if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                     self._last_text = text
                     self._console.print(one_line(text, SENTENCE))
-
-    def _show_phase(self, reached: PhaseReached) -> None:
-        if reached.n or not self._bar.disable:
-            self._show(reached.phase, reached.n, reached.of, rate_text(reached, reached.counted))
-            return
-        self._long = threading.Timer(LONG, self.say, [f"{reached.phase}: begun {LONG:.0f} s ago"])
-        self._long.daemon = True
-        self._long.start()
-
-    def _end_of_phase(self) -> None:
-        if self._long is not None:
-            self._long.cancel()
-            self._long = None
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:
@@ -215,16 +196,6 @@ def answering(as_json: bool) -> Iterator[Answer]:
         yield answer
     if answer.lines and not as_json:
         click.echo("\n".join(answer.lines))
-
-
-@contextmanager
-def closed_terminal_ignored() -> Iterator[None]:
-    """A context that ignores errors from a closed terminal, so that the work continues."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
 
 
 def rates(frame: FrameStored) -> str:

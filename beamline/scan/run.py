@@ -39,7 +39,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_sho
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
-from beamline.scan.resume import ResumableRun, other_devices
+from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
@@ -109,7 +109,7 @@ def run_scan(
         still = series.remaining if series else all_of
         ready = preflight(config, instrument, place, still, check_stop=lambda: _refuse_stop(stop))
         _refuse_stop(stop)
-        remarks = [*_settings_before(ready), *([] if series else other_devices(place, ready))]
+        remarks = [*_settings_before(ready)]
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
             record, *logs = _logs(config, ready, folder, stack)
