@@ -121,7 +121,7 @@ def look(
             continue
         begin(check.name)
         try:
-            looks.append(_look_of(check.look(state, frame, digest, monitor.context)))
+            looks.append(_look_of(check.look(state, frame, digest, monitor.context), frame.index))
         except BaseException as error:  # a plug-in may call sys.exit
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
@@ -157,10 +157,12 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
     return replace(digest, preview=preview, peaks=peaks)
 
 
-def _look_of(answer: Any) -> Look[Any]:
-    """What a check returned; TypeError where it is no `Look`, as of one of another package."""
+def _look_of(answer: Any, at: int) -> Look[Any]:
+    """What a check returned at a frame; TypeError where it is no `Look` at frames so far, as of another package's."""
     if not isinstance(answer, Look) or not isinstance(answer.flag, Flag | None):
         raise TypeError(f"it returned {answer!r:.80}; expected a Look with a Flag or None")
+    if answer.flag is not None and not 0 <= answer.flag.frame <= at:
+        raise TypeError(f"its flag is of frame {answer.flag.frame}; expected 0 to {at}")
     return answer
 
 
