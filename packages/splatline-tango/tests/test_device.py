@@ -10,17 +10,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tango
 
-from beamline.core.errors import ConfigError
-from beamline.features.tango.device import SHOWN, ServedRun, ServerPlace, device_class, push_changes
+from beamline.page.followed_run import FollowedRun, RunValues, StampedValues
 from beamline.scan.control import Verb
-from beamline.storage.volumes.base import bare_record
-from beamline.storage.volumes.files import write_volume
+from splatline_tango.device import ATTRIBUTES, ServerPlace, device_class, device_state, push, reading
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.features.run_folder import FAILED, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
@@ -28,10 +28,25 @@ from tests.beamline.scans import TwoCylinders, frames_of
 WITHIN = 60.0  # s
 
 
-def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "tango", None)
-    with pytest.raises(ConfigError, match=r"splatline\[tango\]"), closing(ServedRun(tmp_path, print)) as run:
-        device_class(run, control=False)
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        ("idle", "ON"), ("preparing", "INIT"), ("flats", "RUNNING"), ("acquiring", "RUNNING"), ("paused", "STANDBY"),
+        ("finishing", "RUNNING"), ("done", "ON"), ("stopped", "ON"), ("aborted", "FAULT"), ("died", "FAULT"),
+    ],
+)  # fmt: skip
+def test_states_of_the_device(state: str, expected: str) -> None:
+    """An alarm of the monitor is one of the device while the scan runs."""
+    values = RunValues(state=state)
+    assert device_state(values).name == expected
+    assert device_state(replace(values, alarms=1)).name == ("ALARM" if expected == "RUNNING" else expected)
+
+
+def test_qualities() -> None:
+    stamped = StampedValues(RunValues(warnings=2, alarms=1, stored=3), 100.0)
+    names = {"warnings": "WARNING", "alarms": "ALARM", "planned": "INVALID", "rate": "INVALID", "stored": "VALID"}
+    assert {name: reading(stamped, name)[2].name for name in names} == {n: f"ATTR_{q}" for n, q in names.items()}
+    assert reading(replace(stamped, unread="the disk is gone"), "stored")[2].name == "ATTR_INVALID"
 
 
 def test_a_name_that_is_none_is_refused() -> None:
@@ -45,9 +60,6 @@ def test_a_place_as_arguments_of_a_server() -> None:
     assert "-nodb" not in ServerPlace("127.0.0.1", 1, "a/b/c", "id19").arguments
 
 
-tango = pytest.importorskip("tango")
-
-
 @contextmanager
 def _signals_as_before() -> Iterator[None]:
     """Tango takes the signals of its process for itself."""
@@ -59,28 +71,27 @@ def _signals_as_before() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[ServedRun, Path, Any]]:
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FollowedRun, Path, Any]]:
     """The one device of this process, which Tango allows no second server; its folder of runs is empty at first."""
     from tango.test_context import DeviceTestContext
 
     runs = tmp_path_factory.mktemp("runs")
     with (
-        closing(ServedRun(runs, lambda line: None)) as run,
+        closing(FollowedRun(runs)) as run,
         _signals_as_before(),
         DeviceTestContext(device_class(run, control=True), process=False, debug=0) as device,
     ):
         yield run, runs, device
 
 
-def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
+def test_a_run_as_a_client_sees_it(served: tuple[FollowedRun, Path, Any]) -> None:
     run, runs, device = served
     run.look()
     assert (device.state(), device.ScanStatus, device.SampleName) == (tango.DevState.ON, "idle", "")
-    assert device.read_attribute("LastView").quality == tango.AttrQuality.ATTR_INVALID
     with pytest.raises(tango.DevFailed, match="There is no run"):
         device.Stop()
 
-    folder = write_run(runs / "2026-01-01T000000_a", *FAILED)
+    write_run(runs / "2026-01-01T000000_a", *FAILED)
     run.look()
     frames = frames_of(TwoCylinders())
     expected = {
@@ -96,40 +107,30 @@ def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
         assert read.time.totime() == pytest.approx(at, abs=1e-5)
     assert device.read_attribute("Beam").quality == tango.AttrQuality.ATTR_INVALID
     assert device.state() == tango.DevState.FAULT and device.status() == "failed; the stage does not answer"
-    assert device.LastView.shape == frames[-1].counts.shape and np.isfinite(device.LastView).any()
-    assert device.read_attribute("Slice").quality == tango.AttrQuality.ATTR_INVALID
-    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
-    write_volume(folder / "recon.h5", bare_record(folder / "scan.h5", values))
-    assert np.array_equal(device.Slice, values[1])
     with pytest.raises(tango.DevFailed, match="no scan is running"):
         device.Abort()
 
 
-def test_only_what_was_set_again_is_pushed(tmp_path: Path) -> None:
+def test_all_values_are_pushed(tmp_path: Path) -> None:
     pushed: dict[str, Any] = {}
 
     class Recorder:
         def push_change_event(self, name: str, value: Any, at: float, quality: Any) -> None:
-            pushed[name] = value, quality
+            pushed[name] = value, quality.name
 
-    with closing(ServedRun(tmp_path, print, lambda: 100.0)) as run:
-        before = run.look()
-        push_changes(Recorder(), before, run.look())
-        assert pushed == {}
+    with closing(FollowedRun(tmp_path, lambda: 100.0)) as run:
         write_run(tmp_path / "2026-01-01T000000_a", *FAILED)
-        push_changes(Recorder(), before, run.look())
-    quality = tango.AttrQuality
-    assert pushed["SampleName"] == ("s", quality.ATTR_VALID) and pushed["FlagCounts"] == ([1], quality.ATTR_VALID)
-    assert pushed["State"] == (tango.DevState.FAULT, quality.ATTR_VALID) and pushed["Alarms"] == (1, quality.ATTR_ALARM)
-    assert "Beam" not in pushed and "Warnings" in pushed  # it was set to 0 by the start
+        push(Recorder(), run.look())
+    assert pushed["SampleName"] == ("s", "ATTR_VALID") and pushed["FlagCounts"] == ([1], "ATTR_VALID")
+    assert pushed["State"] == (tango.DevState.FAULT, "ATTR_VALID") and pushed["Alarms"] == (1, "ATTR_ALARM")
 
 
 def test_verbs_are_commands_only_with_control(tmp_path: Path) -> None:
-    with closing(ServedRun(tmp_path, print)) as run:
+    with closing(FollowedRun(tmp_path)) as run:
         watching, controlling = (vars(device_class(run, control)) for control in (False, True))
     verbs = {verb.value.capitalize() for verb in Verb}
     assert not verbs & set(watching) and verbs <= set(controlling)
-    assert {each.metadata["name"] for each in SHOWN} <= set(watching)
+    assert {each.metadata["name"] for each in ATTRIBUTES} <= set(watching)
 
 
 _EVENTS = """
@@ -182,7 +183,6 @@ def test_a_simulated_scan_is_paused_resumed_and_stopped_beside_a_real_server(tmp
             stored = json.loads(told.stdout)
             assert len(stored) == 3 and stored == sorted(stored)
             assert device.state() == tango.DevState.RUNNING and device.ImagesPlanned > 2000
-            assert device.LastView.shape == (144, 160)
             device.Pause()
             until(lambda: device.state() == tango.DevState.STANDBY)
             device.Resume()

@@ -23,14 +23,63 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
 from itertools import product
+from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
+from recon.base.kernel import Kernel, RayModel
+from recon.base.volume import Grid
 from recon.kernels.cpu.losses import ABSOLUTE, L1, L2, DataTerm, gaussian_window
+from recon.splatting import splat
+from recon.splatting.gaussians import Gaussians, turned_by_rows
+
+
+def project(
+    gaussians: Gaussians, geometry: Geometry, views: Any = None, *, model: RayModel | None = None,
+    gpu: bool = False, **how: Any,
+) -> Tensor:  # fmt: skip
+    """`recon.splatting.splat.project`, which float64 Gaussians take by this module, not truncated.
+
+    Args:
+        gpu: take the GPU's kernels, which may be interpreted on tensors of the CPU.
+    """
+    if gaussians.means.dtype == torch.float32:
+        with _kernels(gaussians, gpu):
+            return splat.project(gaussians, geometry, views, model=model, **how)
+    rays = model or RayModel()
+    chosen = geometry if views is None else geometry.select(views)
+    g = turned_by_rows(gaussians, chosen, -1)
+    chosen = chosen.at_row(0)
+    parameters, length, images = (g.means, g.scales, g.quaternions, g.densities), rays.length(chosen), []
+    for view in range(chosen.n_views):
+        exact = None
+        if chosen.is_cone and rays.exact_above < math.inf:
+            exact = affine_error(*parameters[:3], chosen, view, g.kernel) > rays.exact_above
+        images.append(project_view(parameters, chosen, view, exact=exact, length=length, kernel=g.kernel))
+    return torch.stack(images)
+
+
+def on_grid(gaussians: Gaussians, grid: Grid, *, gpu: bool = False, **how: Any) -> Tensor:
+    """`recon.splatting.splat.voxelize`, which float64 Gaussians take by this module, not truncated; `gpu` as above."""
+    if gaussians.means.dtype == torch.float32:
+        with _kernels(gaussians, gpu):
+            return splat.voxelize(gaussians, grid, **how)
+    z, y, x = (torch.from_numpy(axis).to(gaussians.means.dtype) for axis in grid.coordinates())
+    parameters = gaussians.means, gaussians.scales, gaussians.quaternions, gaussians.densities
+    return voxelize(*parameters, (z, y, x), gaussians.kernel)
+
+
+def _kernels(gaussians: Gaussians, gpu: bool) -> AbstractContextManager[object]:
+    if not gpu:
+        return nullcontext()
+    engine = import_module("recon.kernels.gpu.engine")  # loads triton
+    return patch.object(splat, "backend_for", lambda _: engine.Gpu(gaussians.means.device))
 
 
 def density_profile(q: Tensor, kernel: Kernel) -> Tensor:

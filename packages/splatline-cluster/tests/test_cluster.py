@@ -10,23 +10,24 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import distributed
 import numpy as np
 import pytest
 
 import recon
+import splatline_cluster as module
+from beamline.cli.recon_options import cluster_of
 from beamline.core.errors import ConfigError, DataError
-from beamline.features.cluster import cluster as module
-from beamline.features.cluster.cluster import Cluster, WorkersLostError, check_cluster, connected
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.features.iterative.methods import Sirt
+from splatline_cluster import Cluster, WorkersLostError, connected
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
-pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 pytestmark = pytest.mark.filterwarnings("ignore")  # of dask's own threads and sockets
 
 
@@ -73,7 +74,7 @@ def test_the_volume_is_that_without_a_cluster_to_the_bit(
     write_exchange(Path("scan.h5"), scan, {"data": counts.astype(np.uint16)})
     fista = ("recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight", "0.002", "--no-report")
     fista += ("--memory", "4.1M")
-    scheduler = two._client.scheduler.address
+    scheduler = two.client.scheduler.address
     for more in (("-o", "here.h5"), ("--cluster", scheduler, "-o", "there.h5")):
         result = beamline(*fista, *more)
         assert result.exit_code == 0, result.output
@@ -102,7 +103,7 @@ class Losing:
 
 def test_a_slab_that_nobody_returns_is_an_error_and_not_left_to_another_method() -> None:
     """A DataError would be: that of a slab without matter."""
-    killed = pytest.importorskip("distributed").KilledWorker("slab", SimpleNamespace(address="worker"), 3)
+    killed = distributed.KilledWorker("slab", SimpleNamespace(address="worker"), 3)
     views = Geometry.parallel([0.0, 1.0], (1, 4))
     rest = {"grid": Grid.matching(views), "seed": 0, "device": "cpu", "use": DataUse(), "control": RunControl()}
     for error in (killed, CancelledError("gone")):
@@ -113,7 +114,6 @@ def test_a_slab_that_nobody_returns_is_an_error_and_not_left_to_another_method()
 
 def test_there_are_as_many_workers_as_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not as many as processors; in this process, which is quick."""
-    distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(distributed, "LocalCluster", partial(distributed.LocalCluster, processes=False))
     n = (os.cpu_count() or 1) + 1
     with connected(f"local:{n}") as cluster:
@@ -122,7 +122,6 @@ def test_there_are_as_many_workers_as_wanted(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_without_any_worker_it_ends_after_the_time_stated() -> None:
     """A scheduler that answers and has none, at the start and during work."""
-    distributed = pytest.importorskip("distributed")
     views = Geometry.parallel([0.0, 1.0], (1, 4))
     rest = {"grid": Grid.matching(views), "seed": 0, "device": "cpu", "use": DataUse(), "control": RunControl()}
     alone = distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="tcp")
@@ -136,7 +135,16 @@ def test_without_any_worker_it_ends_after_the_time_stated() -> None:
             Cluster(1, client, patience=0.2).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("spec", ["local", "local:0", "slurm:", "pbs", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])
+@pytest.mark.parametrize("spec", ["local", "local:0", "slurm", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])
 def test_what_names_no_workers_is_refused(spec: str) -> None:
     with pytest.raises(ValueError, match="neither local:N"):
-        check_cluster(spec)
+        cluster_of(spec)
+
+
+@pytest.mark.slow
+def test_workers_do_not_import_modules_of_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    (tmp_path / "string.py").write_text("raise SystemExit('a module of the current folder')")
+    with connected("local:1") as cluster:
+        assert cluster.workers == 1
