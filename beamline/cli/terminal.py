@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TextIO
 
@@ -201,21 +202,21 @@ def answering(as_json: bool) -> Iterator[Answer]:
 def rates(frame: FrameStored) -> str:
     """n/N, frames/s, MB/s and the time left."""
     speed = f"{frame.frames_per_s:.1f} frames/s  {frame.mb_per_s:.1f} MB/s"
-    return f"{frame.n}/{frame.of}  {speed}  {_clock_time(frame.eta_s)} left"
+    return f"{frame.n}/{frame.of}  {speed}  {timedelta(seconds=round(frame.eta_s))} left"
 
 
 def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
     """n/N, rate and remaining time, if known; else that the work has begun."""
     if not (done.of and done.per_s) or done.eta_s is None:
         return "begun"
-    return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
+    return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {timedelta(seconds=round(done.eta_s))} left"
 
 
 def trials(done: TrialReached, what: str = "trials") -> str:
     """n/N, trials/min, remaining time if known, and the running trial."""
     parts = [f"{done.n}/{done.of}"]
     if done.eta_s is not None:
-        parts += [f"{done.per_min:.1f} {what}/min", f"{_clock_time(done.eta_s)} left"]
+        parts += [f"{done.per_min:.1f} {what}/min", f"{timedelta(seconds=round(done.eta_s))} left"]
     return "  ".join([*parts, one_line(done.label, SENTENCE)])
 
 
@@ -231,7 +232,7 @@ def fit(at: FitReached) -> str:
     if at.held_out is not None and math.isfinite(at.held_out):
         parts.append(f"held out {at.held_out:.4f}")
     if at.eta_s is not None:
-        parts.append(f"{_clock_time(at.eta_s)} left")
+        parts.append(f"{timedelta(seconds=round(at.eta_s))} left")
     return ", ".join(parts)
 
 
@@ -268,10 +269,15 @@ def results(record: ReconRecord) -> str:
     lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
     lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
     lines += [f"{'longer':<10}{record.next_decibel_text}"] if record.next_decibel_text else []
+    return "\n".join([*lines, "", *_metrics_of(record)])
+
+
+def _metrics_of(record: ReconRecord) -> list[str]:
+    """Lines of a table of metrics by method."""
     columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
     if record.compared is not None:
         columns[BASELINE] = {**record.compared}
-    lines += ["", f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
+    lines = [f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
@@ -279,12 +285,7 @@ def results(record: ReconRecord) -> str:
             if name == "seconds" and record.ending.resumed_from:
                 label += ", since resumed"
             lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
-    return "\n".join(lines)
-
-
-def _clock_time(seconds: float) -> str:
-    whole_seconds = round(seconds)
-    return f"{whole_seconds // 3600}:{whole_seconds // 60 % 60:02}:{whole_seconds % 60:02}"
+    return lines
 
 
 LOOK, ACT = "watch", "control"  # Purpose of an address: the first word of its line

@@ -183,14 +183,19 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
-            whole = f"{run} has all {planned} views and its references"
-            if not closed or (len(parts) > 1 and not is_joined(run / JOINED)):
-                what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
-                raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
-            raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
+            _refuse_whole(run, planned, parts, closed)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
     )
+
+
+def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:
+    """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
+    whole = f"{run} has all {planned} views and its references"
+    if closed and (len(parts) == 1 or is_joined(run / JOINED)):
+        raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
+    what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
+    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
