@@ -37,8 +37,6 @@ class NotUsed(NamedTuple):
     doubt: bool
 
 
-
-
 class ScanSource(ABC):
     """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
 
