@@ -43,7 +43,7 @@ _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
 _PIECE = 2**31  # bytes of a chunk of frames
 NAME = 1000  # letters of a name or a title
-BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
+BRIEF = 2**28  # bytes of a text, a number or a list of a scan
 
 
 def text(value: Any) -> str:
@@ -96,17 +96,16 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def first_of(item: h5py.Dataset) -> Any:
     """The first value of a dataset, which may have many; of an empty dataset nothing."""
-    _require_brief(item, item.dtype.itemsize)
     return item[()] if item.size <= 1 else item[(0,) * item.ndim]
 
 
-def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
-    """All values of a dataset of at most so many bytes, by default those of a number, a text or a list of a scan.
-
-    Raises:
-        DataError: it holds more.
-    """
-    _require_brief(item, (item.size or 0) * item.dtype.itemsize, most)
+def values_of(item: h5py.Dataset) -> Any:
+    """All values of a number, a text or a list of a scan. DataError: it holds more than BRIEF bytes."""
+    if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
+        raise DataError(
+            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
+            f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
+        )
     return item[()]
 
 
@@ -122,15 +121,6 @@ def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
     return math.prod(pieces) * math.prod(across) * int(item.dtype.itemsize)
-
-
-def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> None:
-    """DataError where so many bytes, or the piece of the file that HDF5 unpacks for them, are too many."""
-    if (n := max(n_bytes, piece_of(item))) > most:
-        raise DataError(
-            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
-            f"{most / 1e9:.3g} GB at most. Nothing was read."
-        )
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:

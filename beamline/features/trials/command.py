@@ -68,8 +68,7 @@ class TradeoffRequest:
         callback=parsed(listed),
         metavar="A,B,...",
         help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
-        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
-        "of an emission also mlem and osem.",
+        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}.",
     )
     quick: bool = set_by(
         "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."

@@ -31,12 +31,6 @@ FIGURES = {
     "ssim_all": ("SSIM all", "against the same volume"),
     "snr": ("SNR rims", "dB, of the whole dense and empty region, with their rims"),
     "cnr": ("CNR rims", "dB, of the same regions"),
-    "rmse": ("RMSE", "of the activity"),
-    "signal_to_background": ("S/B", "hot regions over the body"),
-    "sbr_error": ("S/B err", "its largest error, of a hot region, relative"),
-    "recovery": ("hot", "contrast of hot regions over the truth's"),
-    "spillover": ("cold", "level of cold regions over the body's"),
-    "variation": ("noise", "standard deviation of the body over its level"),
     HELD_OUT: ("held out", METRICS[HELD_OUT].label),
 }
 """Heading of each metric of a trial, and what it is."""

@@ -32,9 +32,7 @@ class AveragedSource(Frames):
     """
 
     def __init__(self, base: ScanSource, n: int) -> None:
-        """Raises ConfigError where no view would have more than one frame, or the scan is one of counts that emit."""
-        if base.emission is not None:
-            raise ConfigError(f"--frames-per-view: {base.path} is of an emission, whose counts are not averaged.")
+        """Raises ConfigError where no view would have more than one frame."""
         self._base, self._n, self._groups = base, n, list[list[int]]()
         super().__init__(
             base,

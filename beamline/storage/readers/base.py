@@ -37,18 +37,6 @@ class NotUsed(NamedTuple):
     doubt: bool
 
 
-class EmissionCounts(NamedTuple):
-    """Float32 [view, row, col] each: counts, survival and background as in `recon.Emission`."""
-
-    counts: NDArray[np.float32]
-    survival: NDArray[np.float32]
-    background: NDArray[np.float32]
-
-
-EmissionOf = Callable[[NDArray[np.int64], slice], EmissionCounts]
-"""What was counted in some frames and rows."""
-
-
 class ScanSource(ABC):
     """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
 
@@ -80,7 +68,6 @@ class ScanSource(ABC):
         energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
         currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
             NaN where unknown, None where there is no monitor.
-        emission: the counts of a sample that emits, whose line integrals the pixels are; None: it does not emit.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
@@ -110,7 +97,6 @@ class ScanSource(ABC):
     not_used: tuple[NotUsed, ...] = ()
     energies: NDArray[np.float64] | None = None
     currents: NDArray[np.float64] | None = None
-    emission: EmissionOf | None = None
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None

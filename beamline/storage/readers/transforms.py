@@ -70,9 +70,9 @@ def turned(base: ScanSource) -> ScanSource:
     What was the last column is the first row. Any rows take reading whole frames.
 
     Raises:
-        DataError: an emission, or a scan with flags: both have a vertical axis.
+        DataError: a scan with flags, which has a vertical axis.
     """
-    if base.emission is not None or base.flags is not None:
+    if base.flags is not None:
         raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
     sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
     return Frames(
