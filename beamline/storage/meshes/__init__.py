@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,12 @@ def _ply(data: bytes) -> Reals:
         return _corners(rows[:, [at.index(axis) for axis in "xyz"]], np.array(faces, np.int64)[:, 1:])
     if ["format", "binary_little_endian", "1.0"] not in words:
         raise ValueError("a PLY is text or binary little-endian")
-    vertices = np.frombuffer(body, np.dtype(own), n["vertex"])
-    listed = np.frombuffer(body, np.dtype([("n", count), ("corners", index, 3)]), n["face"], vertices.nbytes)
+    face = np.dtype([("n", count), ("corners", index, 3)])
+    return _binary_ply(body, np.frombuffer(body, np.dtype(own), n["vertex"]), face, n["face"])
+
+
+def _binary_ply(body: bytes, vertices: NDArray[Any], face: np.dtype[Any], n: int) -> Reals:
+    listed = np.frombuffer(body, face, n, vertices.nbytes)
     if (listed["n"] != 3).any():
         raise ValueError("a face has more than three corners")
     return _corners(np.stack([vertices[axis] for axis in "xyz"], axis=1), listed["corners"])

@@ -3,6 +3,7 @@ mirrored frames."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -261,19 +262,24 @@ def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
     gravity = datasets.dataset(turns, "gravity")
     vertical = None if gravity is None else _direction(gravity)
     others = []
-    for name in turns:
-        item = datasets.dataset(turns, name)
-        if item is None or datasets.attribute(item, "transformation_type") != "rotation" or item.size != 1:
-            continue
-        angle, axis = float(np.degrees(datasets.radians(item, default="degrees"))[0]) % 360, _direction(item)
-        if not np.isfinite(angle) or min(angle, 360 - angle) < 1e-6:
-            continue
+    for name, angle, axis in _rotations(turns):
         if vertical not in (1, 2) or axis is None or abs(angle - 180) > 1e-6:
             others.append(f"{name} {angle:g}°")
             continue
         rows ^= axis != vertical
         cols ^= axis in (vertical, 0 if vertical == 2 else 2)  # the beam
     return (rows, cols), ", ".join(others)
+
+
+def _rotations(turns: h5py.Group) -> Iterator[tuple[str, float, int | None]]:
+    """Names, degrees and axes (of x, y, z; None: another) of the rotations that turn a detector."""
+    for name in turns:
+        item = datasets.dataset(turns, name)
+        if item is None or datasets.attribute(item, "transformation_type") != "rotation" or item.size != 1:
+            continue
+        angle = float(np.degrees(datasets.radians(item, default="degrees"))[0]) % 360
+        if np.isfinite(angle) and min(angle, 360 - angle) > 1e-6:
+            yield name, angle, _direction(item)
 
 
 def _flag(detector: h5py.Group, name: str) -> bool:
