@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.features.files.ingest import ingest
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from recon.base.volume import Grid, Volume
 from tests import faulty_disk
@@ -31,7 +30,6 @@ FILES = {  # what each command writes
     "export volume.h5 -o out/o.nrrd": {"o.nrrd"},
     "export volume.h5 -o out/o.zarr": {"o.zarr"},
     "ingest scan.h5 out/o.h5": {"o.h5"},
-    "archive ours.h5 -o out/o.h5": {"o.h5"},
 }
 RESULTS = {
     "recon scan.h5 -m fbp -o out/o.h5": {"o.h5", "o.html"},
@@ -66,7 +64,6 @@ def inputs(tmp_path: Path, rng: np.random.Generator) -> Path:
     os.utime(tmp_path / "volume.npy", (0, 0))
     write_exchange(tmp_path / "scan.h5", SCAN)
     write_exchange(tmp_path / "views.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 3.0))))
-    ingest(tmp_path / "scan.h5", tmp_path / "ours.h5")
     return tmp_path
 
 
