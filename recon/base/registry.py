@@ -26,7 +26,7 @@ ADD_ONS = {
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
     "tango": "splatline-tango",
-    "xafs": "splatline-spectral",
+    **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant
