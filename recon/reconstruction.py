@@ -15,11 +15,10 @@ from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
-from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
+from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod, candidates_of
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
 from recon.voxels.beyond_field import run_in_box_of_sample
@@ -85,7 +84,7 @@ def reconstruct(
         raise ValueError(sentence)
     warn_of_degrees(geometry.angles)
     grid = grid or Grid.matching(geometry)
-    _warn_of_unseen_cone(chosen, geometry, grid)
+    _warn_of_unseen_cone(chosen, geometry)
     begin = control.now()
     result = run_in_box_of_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
     return replace(
@@ -121,9 +120,9 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
         )
 
 
-def _warn_of_unseen_cone(method: Method, geometry: Geometry, grid: Grid) -> None:
+def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
-    if lean and isinstance(method, CostedMethod) and method.costs(geometry, grid).choice.amounts:
+    if lean and any(_chooses_prior(each) for each in candidates_of(method)):
         warnings.warn(
             f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
             "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
@@ -131,6 +130,11 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry, grid: Grid) -> None
             "edges",
             stacklevel=3,
         )
+
+
+def _chooses_prior(method: Method) -> bool:
+    """Whether views held out choose a weight of total variation: its own, or that of the finish of a fit."""
+    return bool(getattr(method, "trial_sweeps", 0) or getattr(method, "finish_sweeps", 0))
 
 
 def _refuse_one_side(geometry: Geometry) -> None:

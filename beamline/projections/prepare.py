@@ -27,8 +27,8 @@ from beamline.projections.selection import Selection, choose_views, cone_of, pix
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views
+from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.changed import JOINED_DEG
 from beamline.storage.rules.light import without_air
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64

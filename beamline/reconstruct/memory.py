@@ -21,7 +21,6 @@ from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
 from recon.base.registry import ADD_ONS, plugins
 from recon.base.volume import Grid
-from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
 from recon.voxels.matter_checks import stray_mass_memory, unexplained_memory
@@ -182,22 +181,8 @@ def memory_of(options: ReconOptions) -> int:
     return round(SHARE * free / (1 + local_workers(options.cluster)))
 
 
-def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError, before these views are corrected, if they are too few for several volumes."""
-    method = options.method
-    if not method.traits.several or not isinstance(method, CostedMethod):
-        return
-    try:
-        method.costs(geometry, Grid.matching(geometry))
-    except ValueError as error:
-        raise DataError(
-            f"{source.path} cannot be reconstructed by {method.name}: {error}. Nothing was written."
-        ) from error
-
-
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
     """Raise ConfigError for methods and options that need everything in memory."""
-    refuse_few_views(source, options, needs.geometry)
     if (traits := options.method.traits).several:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""

@@ -30,7 +30,6 @@ from beamline.reconstruct.memory import (
     local_workers,
     memory_of,
     recon_memory_of,
-    refuse_few_views,
     refuse_smallest,
     refuse_whole,
 )
@@ -52,7 +51,7 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.method import SampleRadius
+from recon.base.method import SampleRadius, volumes_of
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
@@ -165,7 +164,12 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
 
 def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
     """Raise DataError and ConfigError for views that are too few."""
-    refuse_few_views(source, options, geometry)
+    volumes, least = volumes_of(options.method), options.method.traits.least_views
+    if volumes * least > geometry.n_views:
+        raise DataError(
+            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes of {geometry.n_views} "
+            f"views: expected {least} views or more for each. Nothing was written."
+        )
     if options.uncertainty:
         refuse_views(options.method_for(geometry), geometry)
 

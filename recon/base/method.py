@@ -289,6 +289,7 @@ class Traits:
         in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
             `volume_names` if they are of materials; `Reconstruction.series` has all.
         by_energy: likewise, of each material, from scans at several energies.
+        least_views: of each of several volumes.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
         error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
@@ -304,6 +305,7 @@ class Traits:
     needs_matter: bool = False
     in_time: bool = False
     by_energy: bool = False
+    least_views: int = 0
     own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None

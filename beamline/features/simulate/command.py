@@ -1,11 +1,9 @@
-"""`beamline simulate`: frames of a scene without an instrument, their cost, their labels and the truth behind them."""
+"""`beamline simulate`: frames of a scene without an instrument, their steps and labels, and the truth behind them."""
 
 from __future__ import annotations
 
 import os
 import sys
-import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +12,10 @@ import click
 from beamline.cli.options import json_events, with_request
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import CostExplained, Done, Sink
+from beamline.core.events import Done, Sink, StepsListed
 from beamline.core.files import refuse_existing, remove, write_whole
 from beamline.core.installed import shipped_scenes
-from beamline.core.machine import free_memory, machine, machine_line
+from beamline.core.machine import free_memory
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
@@ -98,12 +96,19 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
 
 
 def _explain(scan: Scan, output: Output) -> None:
-    from beamline.features.simulate.write import cost_table, frame_cost
+    from beamline.features.simulate.write import steps_of, unused_effects
 
-    cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
-    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]
-    output.event(CostExplained(asdict(cost_of_frame) | {"costs": costs, "machine": where}))
-    output.lines(f"{machine_line(where)}\n\n{cost_table(cost_of_frame)}")
+    steps, unused = steps_of(scan.scene), unused_effects(scan.scene)
+    named = [dict(zip(("name", "domain", "summary"), step, strict=True)) for step in steps]
+    output.event(StepsListed({"steps": named, "unused": unused}))
+    output.lines(
+        "\n".join(
+            [f"{'step':<22}{'acts on':<15}what happens"]
+            + [f"{name:<22}{domain:<15}{summary}" for name, domain, summary in steps]
+            + ["\nNot named by the scene, hence neither imported nor computed:"]
+            + [f"  {name:<20}{summary}" for name, summary in unused]
+        )
+    )
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[str, object]:

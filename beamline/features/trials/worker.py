@@ -150,11 +150,7 @@ def _views_of(trial: Trial, data: TrialData) -> PreparedProjections:
     if trial.choice is None:
         angles, period = data.geometry.angles, data.geometry.period
         return data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
-    prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
-    if not trial.choice.arc:
-        return prepared
-    views = prepared.geometry
-    return replace(prepared, geometry=views.seen_with(replace(views.width, arc=trial.choice.arc), views.skew))
+    return averaged(data.prepared, trial.choice)
 
 
 def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dict[str, float], list[float]]:

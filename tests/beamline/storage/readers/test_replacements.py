@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.stacks import StacksSource
-from beamline.storage.readers.supplied import (
+from beamline.storage.readers.replacements import (
     assign,
     evenly_spaced_window,
     load_angles,
@@ -24,6 +23,7 @@ from beamline.storage.readers.supplied import (
     parse_angles,
     select_rows,
 )
+from beamline.storage.readers.stacks import StacksSource
 from drivers.base.frame import FrameKind
 
 KEY = [2, 1, 0, 0, 0, 1, -1]

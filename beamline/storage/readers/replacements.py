@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,14 @@ from beamline.core.files import text_in
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
+from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.stacks import dataset_at
+from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
-from beamline.storage.readers.wrapped import type_wrapped, unsigned
+from beamline.storage.readers.transforms import type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
@@ -90,14 +92,13 @@ def assign(
         spread[projections] = angles
         return spread
     numbers = source.numbers
-    if numbers is not None and _count_all(numbers, angles.size) and not of_views:
+    if numbers is not None and not of_views and _count_all(numbers, angles.size):
         return np.asarray(angles[numbers - numbers.min()])
     series = None if numbers is None else numbers[projections]
-    one_a_number = series is not None and _count_all(series, angles.size)
     all_frames = angles.size == key.size and not of_views
     if all_frames and source.in_order:
         return angles
-    if series is not None and one_a_number and (not all_frames or _in_equal_steps(angles)):
+    if series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
         spread[projections] = angles[series - series.min()]
         return spread
     if all_frames and int(np.isfinite(angles).sum()) == n:
@@ -280,3 +281,52 @@ def _stack(images: NDArray[Any], name: str) -> NDArray[Any]:
     if (dtype := type_wrapped(images)) is not None:
         images = unsigned(images, dtype)
     return images[None] if images.ndim == 2 else images
+
+
+_REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
+
+
+def overlaid(
+    base: ScanSource,
+    *,
+    darks: NDArray[Any] | None = None,
+    flats: NDArray[Any] | None = None,
+    quantity: Quantity | None = None,
+) -> ScanSource:
+    """A scan with references in front: darks, flats, then the frames of `base`.
+
+    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
+    all parts of the scan. All frames have one dtype, as of one camera.
+
+    Args:
+        darks, flats: [frame, row, col].
+
+    Raises:
+        DataError: shapes or counts do not fit.
+    """
+    given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
+    for kind, images in given.items():
+        if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
+            raise DataError(
+                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                f"{base.shape} as in {base.path}."
+            )
+    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
+        quantity = quantity or "counts"
+    base = Frames(
+        base,
+        quantity=quantity or base.quantity,
+        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
+    )
+    if not given:
+        return base
+    stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
+    front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
+    n = front.image_key.size
+    return Frames(
+        front,
+        base,
+        in_order=base.in_order,
+        checksummed=base.checksummed,
+        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
+    )

@@ -1,68 +1,18 @@
-"""Scans that are read with changes: other angles or references in front, or several frames as one view."""
+"""Scans whose views are means of several frames."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import ConfigError
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import Attributes, Quantity, ScanSource, frame_indices, read_known
+from beamline.storage.readers.base import Attributes, ScanSource, frame_indices, read_known
 from beamline.storage.readers.frames import BY_FRAME, Frames, Read
-from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
-
-def overlaid(
-    base: ScanSource,
-    *,
-    darks: NDArray[Any] | None = None,
-    flats: NDArray[Any] | None = None,
-    quantity: Quantity | None = None,
-) -> ScanSource:
-    """A scan with references in front: darks, flats, then the frames of `base`.
-
-    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
-    all parts of the scan. All frames have one dtype, as of one camera.
-
-    Args:
-        darks, flats: [frame, row, col].
-
-    Raises:
-        DataError: shapes or counts do not fit.
-    """
-    given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
-    for kind, images in given.items():
-        if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
-            raise DataError(
-                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
-                f"{base.shape} as in {base.path}."
-            )
-    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
-        quantity = quantity or "counts"
-    base = Frames(
-        base,
-        quantity=quantity or base.quantity,
-        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
-    )
-    if not given:
-        return base
-    stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
-    front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
-    n = front.image_key.size
-    return Frames(
-        front,
-        base,
-        in_order=base.in_order,
-        checksummed=base.checksummed,
-        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
-    )
-
-
-_REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
 JOINED_DEG = "frames_per_view_joined_deg"
 """Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
 _EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds

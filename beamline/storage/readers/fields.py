@@ -6,7 +6,6 @@ and that nobody uses; `info` shows them, and `validate` warns where such a value
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import printable
 from beamline.storage import datasets
-from beamline.storage.readers.base import NotUsed, ScanSource, Used
+from beamline.storage.readers.base import NotUsed, ScanSource
 from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
@@ -26,10 +25,6 @@ Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
 EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
 EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
-_UNKNOWN = "nothing reads this name"
-_MOST = 40  # fields of unknown names
-_CHANGES = re.compile(r"expos|count_?time|current|energ|wavelength|shift|transl|displac|jitter")
-_TOLD = re.compile(_CHANGES.pattern + r"|position|temperature")
 _HALF_PIXEL = 0.5  # what moves by less is not seen
 
 
@@ -55,13 +50,10 @@ class Entry:
 def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
     """The fields stated in a file but ignored; a value that may change the volume is a doubt.
 
-    Numbers that would be used, were their unit known, are among them, and fields whose names are not known.
+    Numbers that would be used, were their unit known, are among them.
     """
-    return (*_not_used(fields, root, source, detector), *_unknown_fields(fields, root, source, detector))
-
-
-def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
-    unused = []
+    views = int((source.image_key == FrameKind.PROJECTION).sum())
+    unused = list[NotUsed]()
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
         if item is None or item.size == 0:
@@ -69,67 +61,27 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
-        value, unit = np.asarray(datasets.values_of(item)), datasets.attribute(item, "units")
+        value, why, doubt = np.asarray(datasets.values_of(item)), field.use, True
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
-            unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
-        elif (
-            field.units is not None
-            and datasets.in_units(item, field.units) is None
-            and (datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source))
-        ):
-            why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
-            if value.dtype.kind not in "uifb":
-                why = "it is text; expected a number, and a known unit behind it or as its attribute `units`"
-            unused.append(NotUsed(field.where, _text(value, unit), why, True))
-        elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
+        elif value.size not in (1, source.image_key.size, views):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
-            unused.append(NotUsed(field.where, _text(value, unit), why, True))
-    return unused
+        else:
+            why = _unit_problem(field, value, item, source)
+        if why:
+            unused.append(NotUsed(field.where, _text(value, datasets.attribute(item, "units")), why, doubt))
+    return tuple(unused)
 
 
-def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
-    """The numbers stated in a file and used."""
-    unused, used = {field.where for field in source.not_used}, []
-    for field in fields:
-        item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
-        if item is None or not 0 < item.size * 8 <= datasets.BRIEF:
-            continue
-        in_text = field.units is not None and datasets.in_units(item, field.units) is not None
-        if (item.dtype.kind in "uif" or in_text) and (item.ndim <= 1 or item.size == 1):
-            text = _text(np.asarray(datasets.values_of(item)), datasets.attribute(item, "units"))
-            used.append(Used(field.where, text, field.use))
-    return tuple(used)
-
-
-def _unknown_fields(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
-    """What a file states of each frame, and of exposure, current, energy, position and temperature, under other names.
-
-    A doubt where what may change line integrals differs from view to view.
-    """
-    listed = [item for field in fields if (item := _dataset(root, field.where, detector)) is not None]
-    places, views = {_place(item) for item in listed}, source.image_key == FrameKind.PROJECTION
-    unknown = list[NotUsed]()
-
-    def visit(name: str, item: Any) -> None:
-        told = [key for key in item.attrs if _TOLD.search(key.lower()) and not key.endswith("_indices")]
-        unknown.extend(NotUsed(f"{name}@{key}", datasets.attribute(item, key), _UNKNOWN, False) for key in told)
-        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or _place(item) in places:
-            return
-        of_frames = item.ndim == 1 and item.size in (views.size, views.sum()) and item.size > 1
-        if of_frames or (item.size == 1 and _TOLD.search(name.rpartition("/")[2].lower())):
-            value = np.asarray(datasets.values_of(item))
-            of_views = value[views] if value.size == views.size else value
-            doubt = of_frames and bool(_CHANGES.search(name.lower())) and np.unique(of_views).size > 1
-            unknown.append(NotUsed(name, _text(value, datasets.attribute(item, "units")), _UNKNOWN, doubt))
-
-    root.visititems(visit)
-    return unknown[:_MOST]
-
-
-def _place(item: h5py.Dataset) -> tuple[int, int]:
-    known = h5py.h5o.get_info(item.id)
-    return known.fileno, known.addr
+def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> str:
+    """Why a number that would be used is not; "" where its unit is known, or nothing is stated."""
+    stated = datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source)
+    if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
+        return ""
+    if value.dtype.kind not in "uifb":
+        return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
+    unit = datasets.attribute(item, "units")
+    return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
@@ -190,7 +142,7 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _POSES = "give the shifts of views with --poses"
-_POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
+_POINTS = "NeXus does not say where it points on the detector; a CSV of shifts for --poses does"
 UPRIGHT = "the detector is taken to stand upright to the beam"
 _ENERGY = "energy, where the beams above state none"
 _WAVELENGTH = "energy, where no beam states one"

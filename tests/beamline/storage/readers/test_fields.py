@@ -14,8 +14,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Entry
 
 ROWS, COLS, VIEWS = 4, 6, 5
 KEY = np.r_[2, 1, [0] * VIEWS]
@@ -297,7 +297,7 @@ def test_numbers_in_text_and_units_in_full_are_used_or_named(tmp_path: Path, val
     path = nxtomo(tmp_path / "s.nx", (field, value, units))
     with open_scan(path) as source:
         assert source.pixel_size_mm == (None if um is None else pytest.approx(um * 1e-3))
-        assert any(each.where == field for each in (source.not_used if um is None else source.used))
+        assert any(each.where == field for each in source.not_used) is (um is None)
 
 
 @pytest.mark.parametrize(("value", "units"), [("25.0", "keV"), (b"25 keV", None), ("25000", "electronvolts")])
@@ -454,33 +454,6 @@ def test_the_page_lists_every_field() -> None:
     for field in (*NXTOMO, *EXCHANGE):
         use = field.use if field.used else f"not used{', warned of' if field.matters else ''}: {field.use}"
         assert f"| `{field.where}` | {use} |\n" in page, field.where
-
-
-# Values under names that nobody reads, and whether they may change a number.
-UNKNOWN: dict[str, tuple[Any, bool | None]] = {
-    "instrument/pco/exposure_of_frame": (np.r_[0, 0, np.arange(VIEWS)] * 0.1, True),
-    "instrument/pco/exposure_of_view": (np.arange(VIEWS) * 0.1, True),
-    "instrument/machine/current": (np.r_[1, 2, [200.0] * VIEWS], False),  # the same in all views
-    "instrument/thermometer/value": (np.arange(2.0 + VIEWS), False),
-    "sample/temperature": (293.0, False),
-    "instrument/pco/gain": (3.0, None),  # one number that tells nothing of these
-    "instrument/pco/table": (np.zeros(3), None),
-}
-
-
-@pytest.mark.parametrize("where", UNKNOWN)
-def test_what_is_stated_of_each_frame_under_another_name_is_named(tmp_path: Path, where: str) -> None:
-    value, doubt = UNKNOWN[where]
-    for store in (nxtomo, exchange):
-        hits = [hit for hit in validate(store(tmp_path / "s.h5", (where, value, None))) if where in hit.message]
-        assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
-
-
-def test_info_shows_what_is_used(tmp_path: Path) -> None:
-    path = nxtomo(tmp_path / "s.nx", ("control/data", np.arange(7.0) + 200, "mA"))
-    used = describe(path)["used"]
-    assert used["control/data"].startswith("200 to 206 mA (used: ring current of each frame")
-    assert used["sample/rotation_angle"].startswith("0 to 144 degree")
 
 
 def test_another_scan_of_the_file_is_named(tmp_path: Path) -> None:
