@@ -195,5 +195,5 @@ class MethodEntry:
     cls: str
     streams: bool = False
     compared: bool = True
-    several: Literal["", "times", "materials"] = ""
+    several: Literal["", "times"] = ""
     lengths: Lengths | None = None
