@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import DataUse, Energies, Progress, Reconstruction, RunControl
+from recon.base.method import DataUse, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
 from recon.base.vectors import geometry_of_vectors, vectors_of
 from recon.base.volume import Grid, Volume
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from recon.features.iterative.methods import Sirt as Sirt
     from recon.features.joint.energy_fit import EnergyViews
     from recon.features.joint.learnt_motion import register_energies
-    from recon.features.joint.methods import EnergySeries, TimeSeries
+    from recon.features.joint.methods import TimeSeries
     from recon.features.joint.proportions import fit_share
     from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
     from recon.features.joint.spectral import Materials, fit_materials
@@ -62,8 +62,6 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
-    "Energies",
-    "EnergySeries",
     "EnergyViews",
     "Fbp",
     "FistaTv",

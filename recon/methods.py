@@ -60,11 +60,6 @@ def names_of_one_volume() -> tuple[str, ...]:
     return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 
-def names_of_one_scan() -> tuple[str, ...]:
-    """Names of the methods that use a single scan; imports no module of this project."""
-    return tuple(name for name, entry in METHODS.items() if entry.several != "materials")
-
-
 def names_compared() -> tuple[str, ...]:
     """Names of the methods that a trade-off tries by default; imports no module of this project."""
     return tuple(name for name, entry in REGISTRY.items() if entry.compared)

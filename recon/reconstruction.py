@@ -154,7 +154,6 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         f"device {device!r}": ("device", device != "cpu"),
         "held_out": ("held_out", len(use.held_out) > 0),
         "times": ("in_time", use.times is not None),
-        "energies": ("by_energy", use.energies is not None),
         "resume": ("checkpoints", control.resume is not None),
         "on_checkpoint": ("checkpoints", control.on_checkpoint is not None),
     }

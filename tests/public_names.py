@@ -46,6 +46,7 @@ FOR_PACKAGES = {
     "recon.splatting.initialise": ("first_volume",),
     "recon.voxels.voxel_problem": ("density_unit",),
     "recon.testing": ("MethodConformance",),
+    "beamline.projections.prepare": ("prepare_projections",),
     "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
     "beamline.projections.step": ("StepDone", "StepMemory", "option"),
     "beamline.storage.datasets": ("copy_attributes", "missing_links"),

@@ -17,7 +17,7 @@ from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
-    from beamline.api.reconstruction import ReconResult, energy_scans, monitor, reconstruct, stream, volumes
+    from beamline.api.reconstruction import ReconResult, monitor, reconstruct, stream, volumes
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
 
@@ -37,7 +37,6 @@ __all__ = [
     "Selection",
     "StopRequest",
     "connect",
-    "energy_scans",
     "monitor",
     "reconstruct",
     "scan",
@@ -49,7 +48,7 @@ __all__ = [
 _LAZY = {
     **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reconstruction"),
-    **dict.fromkeys(("ReconResult", "energy_scans", "reconstruct"), "beamline.api.reconstruction"),
+    **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
     "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }

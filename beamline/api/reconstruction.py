@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,6 @@ from beamline.core.events import Event, VolumeDone
 from beamline.core.files import JOINED, SCAN, parts_of
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
-from beamline.energies import EnergyScans, read_spectra
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
@@ -28,7 +27,6 @@ from beamline.projections.replay import ScanVerdict, awaited, frames_of, replay,
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.scan.energies import scans_of
 from beamline.scan.runs import describe
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -40,32 +38,13 @@ from recon.auto import Auto
 from recon.base.choices import AUTO
 from recon.base.method import Method, volume_names_of
 from recon.base.volume import Volume
-from recon.features.joint.methods import EnergySeries
 from recon.methods import by_name
 
 ReconResult = ReconRecord  # what scripts get
 
 
-def energy_scans(paths: Sequence[str | Path], spectra: str | Path, *, registered: bool = False) -> EnergyScans:
-    """Scans of one sample at several energies, which `reconstruct` takes in place of one scan.
-
-    Args:
-        paths: a scan or a run's folder of each energy; the folder of a series stands for all of its scans.
-        spectra: CSV table of what pure materials attenuate, as of `beamline materials`.
-        registered: find where the sample stood in each scan, and its magnification; correct them.
-
-    Raises:
-        DataError: the table cannot be read, or there is no scan.
-    """
-    refuse_wrong_arguments(energy_scans, locals())
-    scans = scans_of([Path(path) for path in paths], lambda sentence: None)
-    if not scans:
-        raise DataError("There is no scan among these paths; expected one at each energy.")
-    return EnergyScans(tuple(map(SourceOptions, scans)), read_spectra(Path(spectra)), registered)
-
-
 def reconstruct(
-    path: str | Path | EnergyScans,
+    path: str | Path,
     method: str | Method = AUTO,
     *,
     rows: slice | tuple[int, int] | None = None,
@@ -80,10 +59,9 @@ def reconstruct(
     The first Ctrl-C during a fit or iterations ends with the volume so far (`ended_early`), the second discards it.
 
     Args:
-        path: a scan file, or the folder of a run; or scans at several energies, see `energy_scans`.
+        path: a scan file, or the folder of a run.
         method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
-            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`. Of several energies "auto"
-            is `recon.EnergySeries` of the materials in the table, whose volumes are there, too.
+            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`.
         rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.
@@ -98,8 +76,7 @@ def reconstruct(
         that exists or cannot be written. Nothing is written then.
     """
     refuse_wrong_arguments(reconstruct, locals())
-    source = path if isinstance(path, EnergyScans) else SourceOptions(scan_file(path), frames_per_view=None)
-    chosen = EnergySeries(source.spectra.names) if method == AUTO and path is source else _method(method)
+    source, chosen = SourceOptions(scan_file(path), frames_per_view=None), _method(method)
 
     def sink(event: Event) -> None:
         if say is not None and not isinstance(event, VolumeDone) and (text := sentence(event)):
@@ -109,8 +86,9 @@ def reconstruct(
     wanted = replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
     with target_of(output) as given:
         target = replace(given, names=volume_names_of(chosen))
-        place = str(source.path) if path is not source else list(map(str, (each.path for each in source.scans)))
-        command = f"beamline.api.reconstruct({place!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
+        command = (
+            f"beamline.api.reconstruct({str(source.path)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
+        )
         options = ReconOptions(source, target, wanted, chosen, command=command)
         record = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
     return record if output is not None else replace(record, output=None, outputs={})
@@ -135,7 +113,7 @@ def target_of(output: str | Path | None) -> Iterator[OutputPaths]:
         yield OutputPaths(Path(work) / "volume.h5", None, written=False)
 
 
-def _rows(source: SourceOptions | EnergyScans, rows: slice | tuple[int, int]) -> tuple[int, int]:
+def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, int]:
     if not isinstance(rows, slice):
         return rows
     with source.open() as opened:

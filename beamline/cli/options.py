@@ -81,7 +81,6 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 _ELSEWHERE = {
     "times": "makes several volumes, in time: use beamline recon --time N",
-    "materials": "takes scans at several energies: use beamline materials",
 }
 """Of methods that make several volumes: what takes them."""
 

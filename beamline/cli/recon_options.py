@@ -28,7 +28,7 @@ from beamline.cli.selection_options import selection_options
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.choices import AUTO
 from recon.base.registry import in_folders
-from recon.methods import names_of_one_scan
+from recon.methods import names
 
 if TYPE_CHECKING:
     from beamline.reconstruct.region import AroundSample, Region
@@ -91,7 +91,7 @@ recon_options = together(
     option(
         "-m",
         "--method",
-        type=MethodChoice((AUTO, *names_of_one_scan())),
+        type=MethodChoice((AUTO, *names())),
         help="auto chooses fbp, fista-tv, pnp-dct or r2 by held-out views. r2 fits Gaussians to the views, "
         "fbp is filtered back-projection, the others iterate on voxels; "
         f"{_FOR_COMPARISON} are there for comparison. Default: auto; r2 with --follow and with options of the fit.",

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.recon_record import Value
 from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.method import Energies, SampleRadius
+from recon.base.method import SampleRadius
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -47,8 +46,6 @@ class PreparedProjections:
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
         times: [view] s when each was exposed; None: no method asked for it.
-        energies: of the views, where they are of several scans; None: they are of one.
-        recorded: what the volume's file says of several scans, by name; empty of one.
         laws: what the views leave of the laws that hold for all of them, in words, by name.
         sample_radius: how far the sample reaches from the rotation axis, in the geometry's unit, as given or measured.
         inside: what the sample outside the volume adds to the views was subtracted from them.
@@ -73,8 +70,6 @@ class PreparedProjections:
     held_out_ids: NDArray[np.int64] | None = None
     held_out_weights: NDArray[np.float32] | None = None
     times: NDArray[np.float64] | None = None
-    energies: Energies | None = None
-    recorded: Mapping[str, Value] = field(default_factory=dict)
     sample_radius: float | SampleRadius | None = None
     inside: bool = False
     stretch: float = 1.0
@@ -137,7 +132,7 @@ class PreparedProjections:
         def some(array: Any) -> Any:
             return None if array is None else array[views]
 
-        whole, geometry, energies = self.projections, self.geometry.select(views), self.energies
+        whole, geometry = self.projections, self.geometry.select(views)
         return replace(
             self,
             projections=replace(
@@ -151,7 +146,6 @@ class PreparedProjections:
             view_weights=some(self.view_weights),
             shares=some(self.shares),
             times=some(self.times),
-            energies=energies and replace(energies, of_view=energies.of_view[views]),
         )
 
     @property

@@ -14,7 +14,7 @@ from beamline.projections.prepare import require_usable
 from beamline.projections.selection import check_axis, cone_of
 from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.memory import recon_memory_of
-from beamline.reconstruct.options import ReconOptions, SeveralScans
+from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.plan import planned, refuse_before_reading
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
@@ -143,5 +143,3 @@ def _refuse_scan(source: ScanSource, options: ReconOptions) -> None:
     for axis in (selection.axis_col, source.axis_col if cone_of(source, selection) is None else None):
         if axis is not None:
             check_axis(source, axis)
-    if isinstance(options.source, SeveralScans):
-        options.source.require_alike(selection)

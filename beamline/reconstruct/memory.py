@@ -15,7 +15,7 @@ from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.step import StepMemory
 from beamline.projections.views import stated_geometry
-from beamline.reconstruct.options import ReconOptions, views_of_others, with_as_many_views
+from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
@@ -150,22 +150,21 @@ def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
 
 
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
-    """Memory for reconstructing the chosen views of all scans, before any frame is read.
+    """Memory for reconstructing the chosen views of a scan, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not.
     """
     selection, method = options.selection, options.method
-    one = stated_geometry(source, selection)
-    geometry = with_as_many_views(one, one.n_views + views_of_others(options.source, selection))
+    geometry = stated_geometry(source, selection)
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
     part = ScanPart(source, selection, geometry)
     stated = {step.name: step.memory(part) for step in in_order(selection)}
     return ReconMemory(
         options.method_for(geometry),
         geometry,
-        one.n_views * math.prod(one.detector_shape) * pixel,  # a scan at a time
+        geometry.n_views * math.prod(geometry.detector_shape) * pixel,
         not method.traits.direct,
         StepMemory.of_all(stated.values()),
         max(stated, key=lambda name: stated[name].alone),

@@ -6,21 +6,14 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-import numpy as np
-
-from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import REPORT, refuse_existing
-from beamline.core.sinks import Warn
 from beamline.core.text import size
-from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.views import stated_geometry
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
@@ -40,57 +33,6 @@ from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
-
-
-@runtime_checkable
-class SeveralScans(Protocol):
-    """A source of several scans, where `SourceOptions` is that of a single scan."""
-
-    @property
-    def scans(self) -> tuple[SourceOptions, ...]:
-        """The scans; the report shows the facts of the first."""
-
-    @property
-    def path(self) -> Path | str:
-        """Path of the first scan."""
-
-    def open(self, *, follow: bool = False) -> ScanSource:
-        """Open the first scan."""
-
-    def refuse(self, method: Method, given: Collection[str]) -> None:
-        """Raise ConfigError if the scans do not fit the method or these options; opens no file."""
-
-    def require_alike(self, selection: Selection) -> None:
-        """Raise ConfigError if the metadata of the scans disagree; reads no frame."""
-
-    def prepare(
-        self, selection: Selection, warn: Warn, check: Callable[[Geometry], object], phases: Phases | None
-    ) -> PreparedProjections:
-        """`prepare_projections` of all scans; `check` gets the geometry of each.
-
-        Raises:
-            ConfigError: scans that do not go together. DataError: a scan cannot be read.
-        """
-
-
-def scans_of(source: SourceOptions | SeveralScans) -> tuple[SourceOptions, ...]:
-    """All scans of the source, or its single one."""
-    return source.scans if isinstance(source, SeveralScans) else (source,)
-
-
-def views_of_others(source: SourceOptions | SeveralScans, selection: Selection) -> int:
-    """Number of views in the scans after the first, before any frame is read; 0 for a single scan."""
-    views = 0
-    for each in scans_of(source)[1:]:
-        with each.open() as scan:
-            views += stated_geometry(scan, selection).n_views
-    return views
-
-
-def with_as_many_views(geometry: Geometry, views: int) -> Geometry:
-    """The same geometry with so many views."""
-    return geometry if views == geometry.n_views else geometry.select(np.resize(np.arange(geometry.n_views), views))
-
 
 _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 
@@ -210,7 +152,7 @@ class ReconOptions:
         recipe: its options that hold for any scan, as YAML, for the record.
     """
 
-    source: SourceOptions | SeveralScans
+    source: SourceOptions
     target: OutputPaths
     selection: Selection
     method: Method = field(default_factory=R2)

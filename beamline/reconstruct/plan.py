@@ -36,10 +36,6 @@ from beamline.reconstruct.memory import (
 from beamline.reconstruct.options import (
     OutputPaths,
     ReconOptions,
-    SeveralScans,
-    scans_of,
-    views_of_others,
-    with_as_many_views,
 )
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import refuse_impossible, refuse_views
@@ -238,13 +234,10 @@ def prepare_within(
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
         shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
-    others = views_of_others(options.source, selection)
 
     def check(geometry: Geometry) -> None:
-        refuse_geometry(source, options, plan, with_as_many_views(geometry, geometry.n_views + others))
+        refuse_geometry(source, options, plan, geometry)
 
-    if isinstance(options.source, SeveralScans):
-        return options.source.prepare(selection, warn, check, phases), plan
     prepared = prepare_projections(source, selection, warn, buffer, check, phases)
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
@@ -275,17 +268,12 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     """
     if options.follow is not None:
         _refuse_unfollowed(options)
-    for path in (*(each.path for each in scans_of(options.source)), options.target.output):
+    for path in (options.source.path, options.target.output):
         refuse_not_utf8(path)
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
     options.refuse_contradictions()
-    if isinstance(options.source, SeveralScans):
-        options.source.refuse(options.method, options.given)
-    elif options.method.traits.by_energy:
-        wanted = "scans at several energies, and spectra of the materials"
-        raise ConfigError(f"{options.method.name} takes {wanted}. Choose another method. Nothing was read.")
     if options.method.traits.several:
         _require_hdf5(options.target)
     if options.uncertainty:
@@ -297,11 +285,10 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
                 pass
     truth = None if options.truth is None else read_truth(options.truth)
     if options.follow is None:
-        for each in scans_of(options.source):
-            with each.open() as source:
-                _require_finished(source, options)
-                if options.selection.axis_col is not None:
-                    check_axis(source, options.selection.axis_col)
+        with options.source.open() as source:
+            _require_finished(source, options)
+            if options.selection.axis_col is not None:
+                check_axis(source, options.selection.axis_col)
     return truth
 
 

@@ -253,7 +253,6 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
-        **prepared.recorded,
         **(done := recorded(in_order(selection), prepared.done)),
         **({"view_shifts_px": geometry.shifts} if "jumps" in done or geometry.shifts.any() else {}),
         **({"slices_partly_seen": few} if (few := partly_seen(geometry)).size else {}),

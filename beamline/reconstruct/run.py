@@ -63,7 +63,6 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
         None if filled else prepared.ray_weights(len(held_out)),
         held_out,
         prepared.times if method.traits.in_time else None,
-        prepared.energies if method.traits.by_energy else None,
         prepared.sample_radius,
     )
     return data, geometry, use

@@ -64,19 +64,6 @@ def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
     return (usual, f"{SWEEPS_OF_TRIALS} as a rule") if trial <= usual else (most, f"{SWEEPS_OF_TRIALS} at most")
 
 
-@dataclass(frozen=True, eq=False)
-class Energies(Checked):
-    """The energy of each view, and the attenuation of the pure materials at these energies.
-
-    Attributes:
-        of_view: [view] index of the energy of each.
-        cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
-    """
-
-    of_view: NDArray[np.intp]
-    cross_sections: F64
-
-
 SAMPLE = "sample_radius"
 """Name of the decision on the radius, and how the settings begin that state it."""
 
@@ -113,8 +100,6 @@ class DataUse(Checked):
         held_out: numbers of the views that are not fitted; their residual is in the history.
         times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
             views.
-        energies: of the views, for a method of volumes of materials; None: all have one, at which there is one material
-            of attenuation 1.
         sample_radius: how far the sample reaches from the rotation axis, in mm, where it is wider than the field; None:
             that is measured.
     """
@@ -122,7 +107,6 @@ class DataUse(Checked):
     weights: F32 | None = None
     held_out: Sequence[int] = ()
     times: F64 | None = None
-    energies: Energies | None = None
     sample_radius: float | SampleRadius | None = None
 
 
@@ -288,7 +272,6 @@ class Traits:
         needs_matter: it refuses views without matter, such as those of a slab of air.
         in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
             `volume_names` if they are of materials; `Reconstruction.series` has all.
-        by_energy: likewise, of each material, from scans at several energies.
         least_views: of each of several volumes.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
@@ -304,7 +287,6 @@ class Traits:
     any_grid: bool = False
     needs_matter: bool = False
     in_time: bool = False
-    by_energy: bool = False
     least_views: int = 0
     own_length: bool = False
     halo: int = 0
@@ -313,7 +295,7 @@ class Traits:
     @property
     def several(self) -> bool:
         """Whether the method makes several volumes, which all views determine together."""
-        return self.in_time or self.by_energy
+        return self.in_time
 
 
 @runtime_checkable

@@ -1,7 +1,7 @@
 """Registry: entries of one kind by name: ours, and those that other installed packages add by entry points.
 
 Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check,
-effect or command; the entry point's name is the name of the addition.
+effect, command or workers; the entry point's name is the name of the addition.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ADD_ONS = {
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
     "tango": "splatline-tango",
-    "xafs": "splatline-spectral",
+    **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant
@@ -195,5 +195,5 @@ class MethodEntry:
     cls: str
     streams: bool = False
     compared: bool = True
-    several: Literal["", "times", "materials"] = ""
+    several: Literal["", "times"] = ""
     lengths: Lengths | None = None

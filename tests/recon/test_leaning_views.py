@@ -23,7 +23,7 @@ ANGLES = np.arange(32) * 2 * np.pi / 32
 # Their rays are those of r2 and fista-tv.
 QUICK = "fbp", "cgls", "fista-tv"
 CONES = "r2", "fbp", "sirt"  # whose rays of a cone are those of the others
-LIKE_OTHERS = "r2-published", "series", "materials"
+LIKE_OTHERS = "r2-published", "series"
 SHORT = {
     "r2": {"steps": 60, "gaussians": 300, "finish": 4},
     "r2-published": {"steps": 60, "gaussians": 300},

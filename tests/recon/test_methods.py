@@ -62,7 +62,7 @@ def test_negative_densities_are_kept_where_they_are_allowed(name: str, projectio
 
 
 def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
-    positive = {"series", "materials"}
+    positive = {"series"}
     others = set(methods.names()) - set(methods.with_trait("direct")) - positive
     assert set(methods.taking("allow_negative")) == others
 

@@ -113,7 +113,6 @@ def test_bad_settings_are_refused(method: type[R2], change: dict[str, object], m
 OF_A_FIT: dict[str, dict[str, object]] = {
     "held_out": {"use": DataUse(held_out=(3,))},
     "times": {"use": DataUse(times=np.arange(VIEWS.n_views, dtype=np.float64))},
-    "energies": {"use": DataUse(energies=recon.Energies(np.zeros(VIEWS.n_views, np.intp), np.ones((1, 1))))},
     "resume": {"control": RunControl(resume={})},
     "on_checkpoint": {"control": RunControl(on_checkpoint=print)},
     "device 'cuda'": {"device": "cuda"},
@@ -123,7 +122,7 @@ OF_A_FIT: dict[str, dict[str, object]] = {
 OF_FITS = r"\(of r2, r2-published\)"
 ON_DEVICES = r"\(of r2, fista-tv, pnp-dct, r2-published"
 OWNERS = {
-    "times": r"\(of series\)", "energies": r"\(of materials\)", "device 'cuda'": ON_DEVICES,
+    "times": r"\(of series\)", "device 'cuda'": ON_DEVICES,
 }  # fmt: skip
 MODELS = "r2", "r2-published"
 

@@ -77,7 +77,7 @@ def dump(path: Path, value: object) -> None:
         DataError: the disk did not take it.
     """
     if isinstance(value, TrialData):
-        bare = replace(value.prepared, axis=None, flags=None, done={}, laws={}, recorded={})
+        bare = replace(value.prepared, axis=None, flags=None, done={}, laws={})
         value = replace(value, prepared=bare)
     with named_on_failure(path), path.open("wb") as file:
         pickle.dump(value, file, protocol=5)

@@ -1,1 +1,1 @@
-"""Absorption over energies: the edge of a material, and the energy of its highest contrast."""
+"""Absorption over energies: edges, the energy of a material's highest contrast, and volumes of materials."""

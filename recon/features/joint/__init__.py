@@ -6,5 +6,4 @@ from recon.base.registry import MethodEntry
 
 METHODS = {
     "series": MethodEntry("recon.features.joint.methods", "TimeSeries", compared=False, several="times"),
-    "materials": MethodEntry("recon.features.joint.methods", "EnergySeries", compared=False, several="materials"),
 }

@@ -10,14 +10,11 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.declared_types import Bound, Checked, Count, NonNegative, check_settings
+from recon.base.declared_types import Bound, Checked, Count, NonNegative
 from recon.base.geometry import Geometry
-from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.features.joint.energy_fit import EnergyViews
-from recon.features.joint.proportions import STEPS, fit_share
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
-from recon.features.joint.spectral import MATERIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
 _OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
@@ -83,99 +80,6 @@ class TimeSeries(Checked):
         return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
 
 
-@dataclass(frozen=True)
-class EnergySeries:
-    """One volume per material, from views of one sample at several energies, see `fit_materials`.
-
-    Attributes:
-        materials: their names, one for each column of `Energies.cross_sections`.
-        states: names of two of them that are two states of the same one, so that the share of the second is smooth
-            within matter, see `fit_share`; empty: no such pair.
-        sweeps: of the fit.
-        weight: of total variation, `tv_weight` of `fit_materials`; None: what views held out prefer.
-
-    Raises:
-        ValueError: other values.
-    """
-
-    name: ClassVar[str] = "materials"
-    label: ClassVar[str] = "Materials"
-    traits: ClassVar[Traits] = Traits(by_energy=True)
-
-    materials: tuple[str, ...] = ("matter",)
-    states: tuple[str, ...] = ()
-    sweeps: Count = MATERIAL_SWEEPS
-    weight: NonNegative | None = None
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-        object.__setattr__(self, "materials", tuple(self.materials))
-        object.__setattr__(self, "states", tuple(self.states))
-        if not self.materials or len(set(self.materials)) < len(self.materials):
-            raise ValueError(
-                f"materials must be distinct names, at least one, got {', '.join(self.materials) or 'none'}"
-            )
-        two = len(self.states) == 2 and len(set(self.states) & set(self.materials)) == 2
-        if self.states and not two:
-            raise ValueError(
-                f"states are {','.join(self.states)}: expected two of the materials {', '.join(self.materials)}"
-            )
-
-    @property
-    def volumes(self) -> int:
-        return len(self.materials)
-
-    @property
-    def volume_names(self) -> tuple[str, ...]:
-        return self.materials
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        _require_own_grid(problem)
-        n = problem.geometry.n_views
-        energies = problem.use.energies or Energies(np.zeros(n, np.intp), np.ones((1, 1)))
-        if not (energies.cross_sections >= 0).all():
-            raise ValueError(f"cross sections must be 0 or more, got {energies.cross_sections.min():g}")
-        if energies.cross_sections.shape[1:] != (self.volumes,):
-            raise ValueError(
-                f"cross_sections have shape {energies.cross_sections.shape}; expected a column for each of "
-                f"{', '.join(self.materials)}"
-            )
-        data, weights = _measured(problem)
-        views = EnergyViews(data, problem.geometry, energies.of_view, energies.cross_sections, weights)
-        history = _History(self.sweeps, n, control)
-        made = fit_materials(
-            views,
-            problem.grid,
-            tv_weight=self.weight,
-            sweeps=self.sweeps,
-            seed=problem.seed,
-            go_on=history.heard,
-            stop=control.stop,
-        )
-        settings: dict[str, Any] = {"materials": ",".join(self.materials), "sweeps": self.sweeps}
-        settings |= {"weights": made.weights}
-        if self.states and not control.stop():
-            first, second = (self.materials.index(state) for state in self.states)
-            free = made
-            made = fit_share(views, free, (first, second), history.heard_share, control.stop)
-            settings |= {"states": ",".join(self.states)} if made is not free else {}
-        series = VolumeSeries(np.empty(0), made.densities, made.residual, self.materials)
-
-        def at(energy: float) -> F32:
-            shares = energies.cross_sections[int(energy)].astype(np.float32)
-            volume: F32 = np.tensordot(shares, series.data, 1)
-            return volume
-
-        return history.result(series, made.grid, settings, at)
-
-    def toy(self) -> Self:
-        return replace(self, materials=("matter",), states=(), sweeps=1)
-
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        volumes = max(_VOLUMES * self.volumes, self.volumes + _OF_SHARE if self.states else 0)
-        return volumes * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
-
-
 @dataclass
 class _History:
     """Progress of a fit: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
@@ -190,18 +94,13 @@ class _History:
         self.began = self.control.now()
 
     def heard(self, sweep: int, residual: float) -> bool:
-        """The `go_on` of `fit_series` and `fit_materials`."""
+        """The `go_on` of `fit_series`."""
         if sweep > 0:
             self.tell(sweep, residual)
         else:
             self.tried += 1
             self.control.tell_part(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
             self.tried = 0 if sweep == 0 else self.tried
-        return not self.control.stop()
-
-    def heard_share(self, steps_to_come: int) -> bool:
-        """The `go_on` of `fit_share`."""
-        self.control.tell_part(STEPS - steps_to_come, STEPS, self.began, self.n_views, "steps of the share")
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:

@@ -1,9 +1,8 @@
-"""A series of energies: a scan of each in one folder, which goes on after a stop, and materials of it."""
+"""A series of energies: a scan of each in one folder, which goes on after a stop."""
 
 import hashlib
 import json
 import signal
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,8 @@ from beamline.config.load import config_folder, load
 from beamline.features.doctor.examine import needs
 from beamline.scan.preflight import dry_run
 from beamline.storage.readers.open import open_scan
-from beamline.storage.volumes.files import opened_volume
 from drivers.base.frame import FrameKind
-from recon.features.joint import spectral
 from simulators.devices.camera import SimulatedOrcaQuest
-from simulators.samples.materials.materials import known
 
 pytest.importorskip("xraylib")
 ENERGIES = (8.32, 8.345, 8.3485, 8.352)
@@ -72,24 +68,11 @@ def beamline(*words: Any) -> Result:
     return CliRunner().invoke(main, [str(word) for word in words])
 
 
-def spectra(folder: Path) -> Path:
-    path = folder / "spectra.csv"
-    columns = [
-        replace(known("NMC811"), state_of_charge=charge).attenuation(np.array(ENERGIES)) for charge in (1.0, 0.0)
-    ]
-    rows = [f"{energy},{a},{b}" for energy, a, b in zip(ENERGIES, *columns, strict=True)]
-    path.write_text("\n".join(["energy_kev,charged,fresh", *rows]))
-    return path
-
-
 def digests(folder: Path) -> dict[str, str]:
     return {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*/scan.h5")}
 
 
-def test_each_energy_has_a_scan_and_all_of_them_give_the_materials(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spectral, "weights_by_views", lambda views, *_: np.full(views.cross_sections.shape[1], 7e-4))
+def test_each_energy_has_a_scan(config: Path, tmp_path: Path) -> None:
     done = beamline("scan", config, "-o", tmp_path / "runs")
     assert done.exit_code == 0, done.output
     assert f"Energy 4 of 4: {ENERGIES[3]} keV" in done.stderr and f"{ENERGIES[0]} keV" in done.stdout
@@ -108,18 +91,6 @@ def test_each_energy_has_a_scan_and_all_of_them_give_the_materials(
     assert not any((noise[0] == other).all() for other in noise[1:])  # each energy has noise of its own
     listed = beamline("runs", tmp_path / "runs").stdout
     assert all(f"{series.name}/{path.parent.name}" in listed for path in scans), listed
-    words = ("--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
-    cone = beamline("materials", series, *words, "--register", "--cone", "100:300")
-    assert cone.exit_code == 2 and "--register: " in cone.stderr and "is of a cone" in cone.stderr, cone.output
-    made = beamline("materials", series, *words)
-    assert made.exit_code == 0 and "energies have a complete scan" not in made.stderr, made.output
-    y, x = (np.mgrid[:64, :64] - 31.5) * PITCH
-    for name in GRAINS:
-        with opened_volume(tmp_path / f"out_{name}.h5") as record:
-            middle = np.asarray(record.volume.data)[1]
-        for grain, at in GRAINS.items():
-            inside = float(np.median(middle[np.hypot(x - at[0], y - at[1]) < 0.006]))
-            assert inside == pytest.approx(float(grain == name), abs=0.15)
 
 
 @pytest.mark.parametrize("at", [22 + 2, *(pytest.param(at, marks=pytest.mark.slow) for at in (3, 22 + 14))])
@@ -141,10 +112,6 @@ def test_a_series_that_was_stopped_goes_on(
     (series,) = tmp_path.iterdir()
     assert f"beamline scan --resume {series}" in ended.stderr.replace("\n", " ")
     before = digests(series)
-    if before:
-        words = ("--spectra", spectra(tmp_path), "-o", tmp_path / "no.txt")
-        early = beamline("materials", series, *words).stderr.replace("\n", " ")
-        assert f"{int(at > 22)} of 4 energies have a complete scan" in " ".join(early.split()), early
     whole = [name for name in before if f"{ENERGIES[0]}keV" in name and at > 22]
     done = beamline("scan", "--resume", series, "--json")
     assert done.exit_code == 0, done.output
@@ -218,32 +185,6 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("words", [("xafs",), ("materials", "-o", "out.h5", "--spectra", "spectra.csv")])
-def test_a_series_without_scans_is_refused(
-    config: Path, tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    spectra(tmp_path)
-    (tmp_path / "series").mkdir()
-    (tmp_path / "series" / "config.resolved.yaml").write_bytes(config.read_bytes())
-    ended = beamline(*words, "series")
-    assert ended.exit_code == 5 and "series has no scan yet: `beamline scan --resume series`" in ended.stderr
-
-
 def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None:
     ended = beamline("scan", config, "-o", tmp_path / "runs", "--documents", tmp_path / "d.jsonl")
     assert ended.exit_code == 2 and "leave it out with scan.energies" in ended.stderr
-
-
-@pytest.mark.slow
-def test_a_series_is_a_spectrum(config: Path, tmp_path: Path) -> None:
-    """The mean of a region over the views of each energy has the edge of the grains."""
-    energies = [round(8.33 + 0.002 * n, 4) for n in range(13)]
-    words = ("scan.angles.views=4", f"scan.energies={energies}", "scan.flats.count=2")
-    done = beamline("scan", config, "-o", tmp_path, *(part for word in words for part in ("--set", word)))
-    assert done.exit_code in (0, 7), done.output
-    (series,) = tmp_path.iterdir()
-    found = beamline("xafs", series, "--region", "0:4,8:56", "--json", "-o", tmp_path / "edge.png")
-    assert found.exit_code == 0, found.output
-    said = json.loads(found.stdout.splitlines()[-1])
-    assert said["n_energies"] == 13 and said["edge_kev"] == pytest.approx(8.344, abs=0.002)

@@ -1,0 +1,198 @@
+"""`beamline materials`: a volume of each material, from scans at several energies."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.cli.options import json_option
+from beamline.cli.terminal import answering
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import refuse_existing, text_in
+from beamline.core.text import safe_name
+
+_TABLE = "a first line 'energy_kev,NAME,NAME,...', then a line of keV and 1/mm for each energy"
+_PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this share, if they are registered
+_ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Attenuation of materials.
+
+    Attributes:
+        energies: keV, [n], rising.
+        attenuation: 1/mm of the pure material, [n, material].
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    energies: NDArray[np.float64]
+    attenuation: NDArray[np.float64]
+
+    def at(self, energy_kev: float | None, scan: Path) -> NDArray[np.float64]:
+        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError outside the table, or without energy."""
+        if energy_kev is None or not self.energies[0] <= energy_kev <= self.energies[-1]:
+            stated = "not stated" if energy_kev is None else f"{energy_kev:g} keV"
+            raise ConfigError(
+                f"The energy of {scan} is {stated}; expected {self.energies[0]:g} to {self.energies[-1]:g} keV, as "
+                f"{self.path} has them. Nothing was written."
+            )
+        return np.array([np.interp(energy_kev, self.energies, column) for column in self.attenuation.T])
+
+
+def read_spectra(path: Path) -> Spectra:
+    """Read a CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
+
+    Raises:
+        DataError: the file cannot be read, or is no such table.
+    """
+    try:
+        head, *rest = (line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip())
+        names = tuple(name.strip() for name in head[1:])
+        values = np.array([[float(cell) for _, cell in zip(head, line, strict=True)] for line in rest])
+        values = values[np.argsort(values[:, 0])]
+    except (OSError, csv.Error, ValueError, IndexError) as error:
+        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+    if head[0].strip() != "energy_kev" or not names or len({name.casefold() for name in names}) < len(names):
+        raise DataError(f"{path} begins {','.join(head)[:80]!r}. Expected {_TABLE}, with names that differ.")
+    if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
+        raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
+    if any(name != safe_name(name) for name in names):
+        raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
+    return Spectra(path, names, values[:, 0], values[:, 1:])
+
+
+@click.command()
+@click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--spectra", type=_FILE, required=True,
+              help="CSV table: energy_kev and names of materials in the first line, then keV and 1/mm.")  # fmt: skip
+@click.option("-o", "--output", metavar="PATH.h5", type=_FILE, required=True,
+              help="One file per material, with _NAME appended to this stem.")  # fmt: skip
+@click.option("--register", is_flag=True,
+              help="Find and correct the sample position and the magnification of each scan.")  # fmt: skip
+@click.option("--states", metavar="NAME,NAME",
+              help="Two materials that are two states of the same one: the share of the second is smooth.")  # fmt: skip
+@click.option("--axis", type=float, metavar="COL", help="Rotation axis. Default: that of the first scan.")
+@click.option("--rows", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Rows of the detector to use.")
+@click.option("--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Pixels joined each way.")
+@json_option
+def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
+    """Fit the volume of each material to scans at several energies, all at once.
+
+    Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
+    enough: all views together determine the materials. Views of different energies should have different angles. The
+    sample must not move between the scans, nor its magnification change, or --register finds how.
+    """
+    import recon
+    from beamline.api import Selection
+    from beamline.core.quantities import VoxelKind
+    from beamline.scan.energies import scans_of
+    from beamline.storage.volumes.base import bare_record
+    from beamline.storage.volumes.files import write_volume
+
+    table = read_spectra(spectra)
+    outputs = [output.with_name(f"{output.stem}_{name}{output.suffix}") for name in table.names]
+    states = [table.names.index(name) for name in (values["states"] or "").split(",") if name in table.names]
+    if values["states"] and len(states) != 2:
+        raise click.UsageError(f"--states {values['states']}: expected two of {', '.join(table.names)}.")
+    with answering(as_json) as answer:
+        for path in outputs:
+            refuse_existing(path)
+        scans = scans_of(files, answer.warn)
+        selection = Selection(rows=values["rows"], binning=values["binning"], axis_col=values["axis"])
+        try:
+            views = joined(scans, table, selection, values["register"], answer.warn)
+            moves: Sequence[Any] = ()
+            if values["register"]:
+                views, moves = recon.register_energies(views, answer.counting("registration"))
+            found = recon.fit_materials(views)
+            if states:
+                found = recon.fit_share(views, found, (states[0], states[1]))
+        except ValueError as error:
+            raise ConfigError(f"The scans cannot be fitted: {error}. Nothing was written.") from error
+        for name, path, densities in zip(table.names, outputs, found.densities, strict=True):
+            record = replace(
+                bare_record(scans[0], densities), volume=recon.Volume(densities, found.grid), length_unit="mm",
+                raw_file=str(scans[0].resolve()), title=f"volume fraction of {name}", kind=VoxelKind.SHARE,
+                time=answer.clock.now(),
+                parameters={
+                    "method": "materials", "material": name, "scans": ", ".join(str(each.resolve()) for each in scans),
+                    "tv_weights": found.weights, "displacements": np.array([astuple(move) for move in moves]),
+                },
+                metrics={"residual": found.residual},
+            )  # fmt: skip
+            write_volume(path, record)
+        facts = {"outputs": dict(zip(table.names, outputs, strict=True)), "residual": found.residual}
+        written = [f"{name:<12}{path}" for name, path in zip(table.names, outputs, strict=True)]
+        answer.done(facts, *written, *map(_move, moves))
+
+
+def _move(move: Any) -> str:
+    """Where the sample stood in a scan."""
+    at = ", ".join(f"{1e3 * getattr(move, axis):+.2f}" for axis in "xyz")
+    return f"displaced   {at} µm along x, y, z and {math.degrees(move.turn):+.3f}°; magnified {move.magnification:.4f}"
+
+
+def joined(
+    scans: Sequence[Path], spectra: Spectra, selection: Any, registered: bool, warn: Callable[[str], None]
+) -> Any:
+    """The corrected views of all scans as `recon.EnergyViews`; the axis of the first one is used for the others.
+
+    Raises:
+        ConfigError: scans that do not fit together, or energies that are not in the table. DataError: a scan cannot be
+            read. ValueError: energies that do not tell the materials apart.
+    """
+    import recon
+    from beamline.projections.prepare import prepare_projections
+    from beamline.storage.readers.open import open_scan
+
+    attenuation, parts = [], []
+    for path in scans:
+        with open_scan(path) as scan:
+            attenuation.append(spectra.at(scan.energy_kev, path))
+    for path in scans:
+        with open_scan(path) as scan:
+            parts.append(prepare_projections(scan, selection, warn))
+        selection = replace(selection, axis_col=parts[0].axis_col)
+    if parts[0].length_unit != "mm":
+        raise ConfigError("The spectra are in 1/mm, and the scans state no pixel size. Nothing was written.")
+    first, weights = parts[0].geometry, [part.ray_weights() for part in parts]
+    geometry = first
+    for number, own in enumerate((part.geometry for part in parts[1:]), 2):
+        _refuse_unlike(first, own, number, _PIXELS_ALIKE if registered else 1e-6)
+        displaced = np.array([own.axis_col - first.axis_col, 0.0])
+        own = replace(own, pixel_pitch=first.pixel_pitch, shifts=own.shifts + displaced)
+        geometry = geometry.followed_by(own)
+    data = np.concatenate([part.projections.data for part in parts])
+    weight = None
+    if any(each is not None for each in weights):
+        shapes = [part.projections.data.shape for part in parts]
+        filled = [np.ones(shape) if each is None else each for each, shape in zip(weights, shapes, strict=True)]
+        broad = [np.broadcast_to(each, shape) for each, shape in zip(filled, shapes, strict=True)]
+        weight = np.concatenate(broad).astype(np.float32)
+        data = np.where(weight > 0, data, np.float32(0))
+    energy = np.repeat(np.arange(len(parts)), [part.geometry.n_views for part in parts])
+    return recon.EnergyViews(data, geometry, energy, np.array(attenuation), weight)
+
+
+def _refuse_unlike(first: Any, own: Any, number: int, pixels: float) -> None:
+    """One geometry is of all views: they share detector, beam, and the motion of the stage in an exposure."""
+    alike = math.isclose(own.pixel_pitch, first.pixel_pitch, rel_tol=0 if own.is_cone else pixels)
+    turns = ((first.width.arc, own.width.arc), (first.skew, own.skew))
+    alike &= all(math.isclose(*turn, rel_tol=_ARCS_ALIKE) for turn in turns)
+    if (own.detector_shape, own.sod, own.sdd) != (first.detector_shape, first.sod, first.sdd) or not alike:
+        raise ConfigError(
+            f"Scan {number} does not fit scan 1: {own.detector_shape} pixels of {own.pixel_pitch:g} mm, an exposure of "
+            f"{math.degrees(own.width.arc):.3g}°, not {first.detector_shape} of {first.pixel_pitch:g}, "
+            f"{math.degrees(first.width.arc):.3g}°. Pixels that differ by up to a tenth need --register."
+        )
