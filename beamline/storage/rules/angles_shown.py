@@ -115,7 +115,7 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     kinds = set(source.image_key.tolist())
     counts = source.quantity == "counts"
-    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+    if source.quantity == "unknown" or source.shifts is not None:
         return None
     if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
         return None
