@@ -44,18 +44,13 @@ class MonitorRequest:
         type=click.Path(path_type=Path, dir_okay=False),
         help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
     )
-    volume: Path | None = set_by(
-        "--volume",
-        type=click.Path(path_type=Path, dir_okay=False),
-        help="Compare each view with the render of this volume, which `beamline recon` made of all rows of FILE.",
-    )
     values: Mapping[str, Any] = others(scan_options)
     as_json: bool = set_by(json_option)
 
 
 @click.command(
     cls=Grouped,
-    first=("follow", "config", "overrides", "sheet", "volume", "angles", "darks", "flats", "data_path", "as_json"),
+    first=("follow", "config", "overrides", "sheet", "angles", "darks", "flats", "quantity", "data_path", "as_json"),
 )
 @heading(DATA)
 @with_request(MonitorRequest)
@@ -130,12 +125,7 @@ def _watched(
     active: set[tuple[str, Level]] = set()
     stopping, opened = StopOnSignal("Stopping."), SourceOptions(request.file, **request.values)
     with opened.open(follow=request.follow) as source, stopping() as stopped:
-        model = None
-        if request.volume is not None:
-            from beamline.projections.rendered import rendered  # loads numba
-
-            model = rendered(request.volume, source)
-        for judged in replay(source, checks, model=model, follow=follow, should_stop=stopped):
+        for judged in replay(source, checks, follow=follow, should_stop=stopped):
             frames.append(judged)
             if not request.follow:
                 progress(len(frames), judged.n)

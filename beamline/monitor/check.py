@@ -7,7 +7,6 @@ frame after another and carries what it needs to remember as an immutable state,
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import Field, dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -19,7 +18,7 @@ from beamline.core.flag import Flag as Flag
 from beamline.core.flag import Level as Level
 from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import NO_SPOTS, CellGrid, CellValues, CellView, Spots
+from beamline.monitor.view import NO_SPOTS, CellGrid, CellView, Spots
 from drivers.base.frame import Frame
 
 State = TypeVar("State")
@@ -49,8 +48,6 @@ class ScanContext:
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
         integrals: frames were line integrals, and are judged as counts of a beam without flats of its own.
-        model: line integrals of a volume at an angle in radians, float32 [row, col] means of cells of so many pixels a
-            side. None where no volume is known.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
@@ -79,7 +76,6 @@ class ScanContext:
     cone: bool = False
     axis_col: float | None = None
     integrals: bool = False
-    model: Callable[[float, int], CellValues] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan

@@ -95,22 +95,28 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     known = prepared.measured is None and prepared.projections.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or len(data) < _LEAST_VIEWS or not known:
         return {}
-    some = spread(np.arange(len(data)), _VIEWS)
-    edges = FieldEdges.of(data, geometry)
-    wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
-    laws = list[Law]()
-    if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
-        if wide or faint > 1 or air_is_off:
-            frames = prepared.projections.view_ids[some]
-            laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
-        elif data.shape[1] >= _LEAST_ROWS and selection.rows is None:
-            laws = _laws_within_the_field(prepared, some)
-    if (wide or not air_is_off) and not any(law.broken for law in laws):
-        laws.append(_at_rest(data, geometry, prepared.projections.view_ids, max(faint, 1.0)))
+    laws = _laws_of(prepared, whole=selection.rows is None)
     for law in laws:
         if law.broken:
             warn(law.sentence)
     return {law.name: law.in_words() for law in laws if np.isfinite(law.residual)}
+
+
+def _laws_of(prepared: PreparedProjections, *, whole: bool) -> list[Law]:
+    """The laws that these views have to obey; `whole`: all rows of the detector are there."""
+    geometry, data = prepared.geometry, prepared.projections.data
+    some = spread(np.arange(len(data)), _VIEWS)
+    edges, frames = FieldEdges.of(data, geometry), prepared.projections.view_ids
+    wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
+    laws = list[Law]()
+    if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
+        if wide or faint > 1 or air_is_off:
+            laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames[some])]
+        elif data.shape[1] >= _LEAST_ROWS and whole:
+            laws = _laws_within_the_field(prepared, some)
+    if (wide or not air_is_off) and not any(law.broken for law in laws):
+        laws.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
+    return laws
 
 
 def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[Law]:

@@ -157,7 +157,6 @@ def replay(
     source: ScanSource,
     checks: Sequence[Check] = CHECKS,
     *,
-    model: Callable[[float, int], NDArray[np.float32]] | None = None,
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[FrameVerdict]:
@@ -167,14 +166,13 @@ def replay(
     equal.
 
     Args:
-        model: what a volume of the scan lets expect, see beamline.projections.rendered.
         follow: the clock to wait by for further frames, until the file is finished; None: the frames that are there.
         should_stop: asked before each frame.
 
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, aside = start(replace(context_of(source), model=model), checks), SkippedChecks()
+    monitor, aside = start(context_of(source), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)

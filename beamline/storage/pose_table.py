@@ -99,17 +99,8 @@ def read_poses(text: str) -> PoseTable:
 def _of_csv(path: Path, content: str) -> PoseTable:
     lines = [line for line in content.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     head, *rows = list(csv.reader(lines)) or [[]]
-    names, poses = [name.strip().lower() for name in head], (*_PIXELS, *_TURNS)
-    if not set(names) & set(_KEYS) or not set(names) & set(poses):
-        raise ValueError(
-            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"some of {', '.join(poses)}"
-        )
-    for name in names:
-        if name not in (*_KEYS, *poses, *_FOR_PEOPLE) or names.count(name) > 1:
-            raise ValueError(
-                f"{path}: column {name!r} is unknown or there twice; known: {', '.join((*_KEYS, *poses, *_FOR_PEOPLE))}"
-            )
+    names = [name.strip().lower() for name in head]
+    _require_header(path, names)
     values = np.empty((len(rows), len(names)))
     for number, row in enumerate(rows):
         try:
@@ -125,6 +116,19 @@ def _of_csv(path: Path, content: str) -> PoseTable:
         raise ValueError(f"{path}: {by} holds {keys[bad][:3].tolist()}; expected whole numbers from 0 on")
     shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
     return PoseTable(path, by, keys, columns.get("angle_deg"), shifts, turns)
+
+
+def _require_header(path: Path, names: list[str]) -> None:
+    """ValueError for a first line without a key or without poses, or with other names."""
+    poses, known = (*_PIXELS, *_TURNS), (*_KEYS, *_PIXELS, *_TURNS, *_FOR_PEOPLE)
+    if not set(names) & set(_KEYS) or not set(names) & set(poses):
+        raise ValueError(
+            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
+            f"some of {', '.join(poses)}"
+        )
+    for name in names:
+        if name not in known or names.count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(known)}")
 
 
 def _of_arrays(path: Path) -> PoseTable:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 _MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
 _LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
-TO_MIDDLE = "middle_of_exposure_deg"
-"""Parameter of a volume: angle of a view less that in the file, where the arc is too short to be modelled."""
 
 
 class _Motion(NamedTuple):
@@ -130,7 +128,7 @@ class Width:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
             elif stated.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
                 geometry = replace(geometry, angles=geometry.angles + stated.arc / 2)
-                parameters[TO_MIDDLE] = math.degrees(stated.arc / 2)
+                parameters["middle_of_exposure_deg"] = math.degrees(stated.arc / 2)
         if not (width or any(motion)):
             return geometry, StepDone(parameters=parameters)
         first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2

@@ -25,7 +25,6 @@ BITS |= {
     "blur": 14,
     "zingers": 32,
     "opposite": 15,
-    "model": 33,
 }
 """As files hold them since the first version: a number here is never changed."""
 

@@ -9,14 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from numpy.typing import NDArray
 
-from beamline.cli.main import main
-from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.foreign.model import ModelCheck
-from beamline.projections.rendered import rendered
 from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
@@ -98,28 +93,3 @@ def test_what_is_put_into_a_real_scan_is_found(shared_data: Path, share: Share, 
     found = [flag for flag in flags(shared_data / DIAMOND, share) if (flag.check, flag.frames) not in own]
     assert check in {flag.check for flag in found}
     assert all(40 <= frame <= 42 + 35 for flag in found for frame in flag.frames)
-
-
-def speck(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
-    return 1 - 0.15 * np.exp(-0.5 * ((row - 60) ** 2 + (col - 100) ** 2) / 4.0**2) * (50 <= view < 53)
-
-
-@pytest.mark.slow
-def test_a_view_that_the_volume_does_not_explain_is_flagged_with_its_place(shared_data: Path, tmp_path: Path) -> None:
-    """A speck of 15 % that stands still in three views: no check sees it but by the reconstruction."""
-    words = ["recon", str(shared_data / DIAMOND), "-m", "fbp", "-o", str(tmp_path / "v.h5"), "--no-report"]
-    assert CliRunner().invoke(main, words, catch_exceptions=False).exit_code == 0
-    with open_scan(shared_data / DIAMOND) as source:
-        model = rendered(tmp_path / "v.h5", source)
-        changed = Changed(source, speck)
-        for scan, expected in ((source, []), (changed, [52, 53, 54])):
-            found = [flag for judged in replay(scan, [ModelCheck()], model=model) for flag in judged.flags]  # type: ignore[arg-type]
-            assert [flag.frame for flag in found] == expected
-        for flag in found:
-            assert flag.region is not None
-            top, below, first, last = flag.region
-            assert top <= 60 < below and first <= 100 < last and (below - top) * (last - first) <= 32 * 32
-    said = CliRunner().invoke(main, ["monitor", str(shared_data / DIAMOND), "--volume", str(tmp_path / "v.h5")])
-    assert said.exit_code == 0, said.output
-    with pytest.raises(DataError, match="need 2"), open_scan(shared_data / TOOTH) as other:
-        rendered(tmp_path / "v.h5", other)
