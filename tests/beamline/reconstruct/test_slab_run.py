@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakSet
 
-import h5py
 import numpy as np
 import pytest
 
@@ -25,7 +24,6 @@ from beamline.reconstruct import memory as module
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers import partial_volume
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from recon.base.geometry import Geometry
@@ -106,32 +104,6 @@ def test_a_volume_that_lay_where_its_slabs_did_is_as_any_other(made: Path) -> No
     found = read_reconstruction(made / "whole.h5")
     assert found.parameters["slabs"] == 3 and "partial" not in found.parameters
     assert (made / "whole.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("error", [OSError("the disk is full"), KeyboardInterrupt()])
-def test_a_volume_that_could_not_be_completed_is_resumed(
-    made: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    """After KeyboardInterrupt the file is as after a kill."""
-
-    def fail(path: Path, record: ReconRecord) -> None:
-        with h5py.File(path, "r+") as file:
-            del file["entry/reconstruction"]
-            file["entry/filled"] = np.ones(1000)
-        raise error
-
-    with monkeypatch.context() as patch:
-        patch.setattr(partial_volume, "rewrite_facts", fail)
-        failed = beamline(*FISTA, "-o", "parts.h5")
-    assert failed.exit_code == (5 if isinstance(error, OSError) else 4) and not Path("parts.h5").exists()
-    said = beamline("validate", "parts.partial.h5")
-    told = "96 of 96 slices" if isinstance(error, OSError) else "recon --resume parts.partial.h5"
-    assert said.exit_code == 5 and told in said.output and isinstance(said.exception, SystemExit)
-    resumed = beamline(*FISTA, "-o", "parts.h5", "--resume", "parts.partial.h5")
-    assert resumed.exit_code == 0 and "96 of 96 slices are there." in resumed.stderr, resumed.output
-    assert left(folder) == {"scan.h5", "parts.h5"}
-    parts_and_whole(made)
 
 
 @pytest.mark.slow
