@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.text import printable
+from beamline.core.text import NUMBER, printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
 from beamline.storage.structure import plain_name
 
@@ -28,7 +28,7 @@ LENGTH_UNITS = {  # mm
 ENERGY_UNITS = {"ev": 1e-3, "electronvolt": 1e-3, "kev": 1.0, "kiloelectronvolt": 1.0, "j": _JOULE, "joule": _JOULE}
 WAVELENGTH_UNITS = {"angstrom": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "nanometer": 10.0, "pm": 0.01, "m": 1e10}  # Å
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6}  # s
-_WRITTEN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(.*)", re.I)  # a number, and perhaps its unit
+_WRITTEN = re.compile(rf"([-+]?{NUMBER})\s*(.*)")  # a number, and perhaps its unit
 
 
 def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
