@@ -20,7 +20,6 @@ from beamline.reconstruct.region import AroundSample, Region, selection_around
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
-from beamline.storage.writers.partial_volume import can_become
 from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
@@ -197,12 +196,6 @@ class ReconOptions:
         if why := contradiction(RULES, given, one_method=True) or of_other_methods(RULES, given, self.method.name):
             raise ConfigError(why)
 
-    @property
-    def becomes_output(self) -> bool:
-        """Whether a volume made in slabs is renamed to the output without a copy."""
-        alone = self.region is None and not self.uncertainty
-        return alone and self.target.written and can_become(self.target.output)
-
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
         """Bytes on disk for the result, and for temporary files, of a volume of so many bytes."""
         if not in_slabs:
@@ -212,8 +205,6 @@ class ReconOptions:
         bars = self.uncertainty
         if not self.target.written:
             return 0, (slabs + compared + bars) * volume
-        if self.becomes_output:
-            return slabs * volume, compared * volume
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:

@@ -285,8 +285,7 @@ def reconstruct_file(
             recipe=options.recipe, region=job.region, phases=job.channels.phases, leaves=job.leaves,
             filter=options.filter,
         )  # fmt: skip
-        partial_volume = options.partial_path if job.slabs and options.becomes_output else None
         with job.stopping():  # the volume is there: the first signal no longer discards it
-            record = write_result(made, prepared, truth, options.target, context, sink, clock, partial_volume)
+            record = write_result(made, prepared, truth, options.target, context, sink, clock, bool(job.slabs))
         del made, prepared  # Windows removes no file that is mapped
     return record

@@ -25,7 +25,6 @@ from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
 from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
 from beamline.storage.volumes.files import opened_volume, write_volume
-from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
@@ -63,29 +62,27 @@ def write_result(
     context: ReportContext,
     sink: Sink,
     clock: Clock,
-    partial_volume: Path | None = None,
+    in_parts: bool = False,
 ) -> ReconRecord:
     """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
     The record's voxels are read from the file where they are used; where no file is written it holds the volume.
 
     Args:
-        partial_volume: the partial volume that becomes the output as it is; None: the volume is written.
+        in_parts: it was made in slabs, and its voxels are on the disk.
 
     Raises:
         DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
     phases = context.phases
     phases.enter("measuring the volume")
-    judged = judge(made, prepared.ordinary, truth, target, context, sink, clock, partial_volume is not None)
+    judged = judge(made, prepared.ordinary, truth, target, context, sink, clock, in_parts)
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
     stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
     context = replace(context, warnings=remarks, stray=stray)
     record, volumes = _record(judged, prepared, context, clock.now())
     phases.enter("writing the volume")
-    if partial_volume is not None:
-        complete(partial_volume, record, target.output, replace=target.replace)
-    elif target.written:
+    if target.written:
         _write(record, target)
     timed: Callable[[float], None] = _nothing
     if (page := target.report) is not None:

@@ -30,7 +30,6 @@ from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import held
-from beamline.storage.writers.partial_volume import completion_cut_short
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
@@ -76,9 +75,6 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
         deep: every frame is read and compared with its checksum; is told how many of how many.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
-    if completion_cut_short(path):
-        sentence = f"Its writer was killed when it became the output; recon --resume {path} makes that of it."
-        return [Finding("error", "partial", sentence)]
     findings = list[Finding]()
     try:
         if volume_format(path) is not None:

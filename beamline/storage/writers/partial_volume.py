@@ -8,10 +8,7 @@ added by half is taken out again when the file is opened.
 from __future__ import annotations
 
 import json
-import os
-import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import bring_to_disk, refuse_existing, replaceable, whole_file
+from beamline.core.files import whole_file
 from beamline.storage import datasets, hdf5
 from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
-from beamline.storage.writers.recon_file import SUFFIXES, rewrite_facts, value_of, write_record
+from beamline.storage.writers.recon_file import value_of, write_record
 from recon.base.volume import Slab
 
 _SLABS = "entry/reconstruction/slabs"
@@ -111,7 +108,6 @@ def create_partial(
     """
     nz, *shape = record.volume.grid.shape
     with whole_file(path) as partial:
-        _structure_of(path).unlink(missing_ok=True)  # of one whose writer was killed when it had become its target
         write_record(partial, record, empty=True)
         with hdf5.changed(partial) as file:
             file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())
@@ -135,7 +131,6 @@ def open_partial(path: Path) -> PartialVolume:
     Raises:
         DataError: it is no such file, is damaged, or another process adds to it.
     """
-    _put_back(path)
     _refuse_unusable(path)
     lock = WriterLock(path)
     with hdf5.readable(path), opened_whole(path) as file:
@@ -152,77 +147,12 @@ def open_partial(path: Path) -> PartialVolume:
     return volume
 
 
-def can_become(target: Path) -> bool:
-    """Whether a partial volume can be renamed to `target`: the format fits; Windows renames no file in use."""
-    return target.suffix.lower() in SUFFIXES and sys.platform != "win32"
-
-
-def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = False) -> None:
-    """Turn a partial volume with all its slabs into the reconstruction file `target` of `record`, without copying
-    voxels.
-
-    Raises:
-        DataError: `target` exists and `replace` is not set, or the disk refuses; the partial volume stays.
-    """
-    if replace:
-        target = replaceable(target)
-    else:
-        refuse_existing(target)
-    try:
-        _save_structure(path)
-        rewrite_facts(path, record)
-        path.replace(target)
-        _structure_of(path).unlink()
-    except (OSError, DataError) as error:
-        with suppress(OSError):  # else the next call does it
-            _put_back(path)
-        raise DataError(
-            f"{target} could not be written ({hdf5.reason(error)}). Check the disk. {path} keeps all slabs: give "
-            f"--resume {path}."
-        ) from error
-
-
-def _structure_of(path: Path) -> Path:
-    """Where all of a partial volume but its voxels is kept while that is rewritten."""
-    return path.with_name(f".{path.name}.structure")
-
-
-def _save_structure(path: Path) -> None:
-    """First four numbers of eight bytes: where the volume and the shared slices begin and end."""
-    with hdf5.readable(path), h5py.File(path, "r", locking=False) as file:
-        voxels = [file[_PLACES[name]].id for name in ("volume", "shared_before")]
-        ends = [at for item in voxels for at in (item.get_offset(), item.get_offset() + item.get_storage_size())]
-    with whole_file(_structure_of(path), replace=True) as saved, path.open("rb") as source, saved.open("wb") as out:
-        out.write(b"".join(end.to_bytes(8, "little") for end in ends))
-        for first, end in zip((0, *ends[1::2]), (*ends[::2], path.stat().st_size), strict=True):
-            source.seek(first)
-            out.write(source.read(end - first))
-
-
-def _put_back(path: Path) -> None:
-    """Undo a completion that was cut short, if there was one. Shared slices are lost, which no slab needs any more."""
-    saved = _structure_of(path)
-    if not completion_cut_short(path) or held(path):
-        return
-    with saved.open("rb") as source, path.open("r+b") as out:
-        ends = [int.from_bytes(source.read(8), "little") for _ in range(4)]
-        for first, end in zip((0, *ends[1::2]), ends[::2], strict=False):
-            out.seek(first)
-            out.write(source.read(end - first))
-        out.seek(ends[-1])
-        out.write(source.read())
-        out.truncate()
-    bring_to_disk(path)
-    saved.unlink()
-
-
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
-    """All slabs, and the unfinished ones; undoes a completion that was interrupted.
+    """All slabs, and the unfinished ones.
 
     Raises:
         DataError: as `open_partial`.
     """
-    _put_back(path)
     _refuse_unusable(path)
     with hdf5.readable(path), opened_whole(path) as file:
         slabs, state = _slabs_in(file[_SLABS]), file[_PLACES["state"]][()]
@@ -245,11 +175,9 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a file is a partial volume, by its content; also one whose completion was interrupted."""
+    """Whether a file is a partial volume, by its content."""
     if not path.is_file():
         return False
-    if completion_cut_short(path):
-        return True
     if not hdf5.is_hdf5(path):
         return False
     try:
@@ -257,12 +185,6 @@ def is_partial(path: Path) -> bool:
             return isinstance(datasets.resolve(file, _SLABS), h5py.Group)
     except (DataError, OSError):
         return False
-
-
-def completion_cut_short(path: Path) -> bool:
-    """Whether the completion of a partial volume was interrupted; opening the file to add slabs undoes it."""
-    structure = _structure_of(path)
-    return path.is_file() and os.path.isfile(structure)  # noqa: PTH113 - Path.is_file raises for a name too long
 
 
 def _shared(slab: Slab) -> list[int]:

@@ -62,15 +62,6 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
         file.attrs["default"] = "entry"
 
 
-def rewrite_facts(path: Path, record: ReconRecord) -> None:
-    """Replace everything but voxels and axes by the values of `record`. Raises OSError on a disk error."""
-    with hdf5.changed(path) as file:
-        entry = file["entry"]
-        for name in set(entry) - {"data"}:
-            del entry[name]
-        _write_facts(entry, record)
-
-
 def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     entry = _group(file, "entry", "NXentry")
     entry.attrs["default"] = "data"

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakSet
 
-import h5py
 import numpy as np
 import pytest
 
@@ -24,7 +23,6 @@ from beamline.reconstruct import memory as module
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers import partial_volume
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from recon.forecast import Forecast
@@ -37,15 +35,12 @@ FISTA += ("--memory", "4.1M")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A noisy scan of 96 rows, scan.h5, and its volume, whole.h5, of three slabs that became the output where they lay,
-    beside what a killed call had left there."""
+    """A noisy scan of 96 rows, scan.h5, and its volume, whole.h5, of three slabs."""
     folder = tmp_path_factory.mktemp("made")
     scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(96, 32), axis_col=15.7)
     counts = 100 + np.random.default_rng(20261120).poisson(scan.counts().astype(float) - 100)
     write_exchange(folder / "scan.h5", scan, {"data": counts.astype(np.uint16)})
-    (folder / ".whole.partial.h5.structure").write_bytes(bytes(100))
-    with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beamline.reconstruct.result.write_volume", None)
+    with contextlib.chdir(folder):
         assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
     assert left(folder) == {"scan.h5", "whole.h5"}
     return folder
@@ -98,37 +93,11 @@ def test_resumed_is_uninterrupted_to_the_bit(made: Path, folder: Path, monkeypat
     assert left(folder) == {"scan.h5", "parts.h5"}
 
 
-def test_a_volume_that_lay_where_its_slabs_did_is_as_any_other(made: Path) -> None:
+def test_a_volume_of_slabs_is_as_any_other(made: Path) -> None:
     assert beamline("validate", str(made / "whole.h5")).exit_code == 0
     found = read_reconstruction(made / "whole.h5")
     assert found.parameters["slabs"] == 3 and "partial" not in found.parameters
     assert (made / "whole.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("error", [OSError("the disk is full"), KeyboardInterrupt()])
-def test_a_volume_that_could_not_be_completed_is_resumed(
-    made: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    """After KeyboardInterrupt the file is as after a kill."""
-
-    def fail(path: Path, record: ReconRecord) -> None:
-        with h5py.File(path, "r+") as file:
-            del file["entry/reconstruction"]
-            file["entry/filled"] = np.ones(1000)
-        raise error
-
-    with monkeypatch.context() as patch:
-        patch.setattr(partial_volume, "rewrite_facts", fail)
-        failed = beamline(*FISTA, "-o", "parts.h5")
-    assert failed.exit_code == (5 if isinstance(error, OSError) else 4) and not Path("parts.h5").exists()
-    said = beamline("validate", "parts.partial.h5")
-    told = "96 of 96 slices" if isinstance(error, OSError) else "recon --resume parts.partial.h5"
-    assert said.exit_code == 5 and told in said.output and isinstance(said.exception, SystemExit)
-    resumed = beamline(*FISTA, "-o", "parts.h5", "--resume", "parts.partial.h5")
-    assert resumed.exit_code == 0 and "96 of 96 slices are there." in resumed.stderr, resumed.output
-    assert left(folder) == {"scan.h5", "parts.h5"}
-    parts_and_whole(made)
 
 
 @pytest.mark.slow
