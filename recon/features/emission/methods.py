@@ -20,7 +20,7 @@ from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.prep.counts import Emission
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import interleaved, iterative_memory
+from recon.voxels.voxel_problem import Buffers, bytes_of, interleaved
 
 _RANGE = 1e30  # products of a sensitivity and an activity beyond it, or below 1 / it, leave float32
 _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
@@ -267,7 +267,7 @@ class Mlem(Checked):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         subsets = self.parts(geometry.n_views)
-        return iterative_memory(geometry, grid, 4.5 + subsets, 5.2 + 4 / subsets, 1.1 * weighted)
+        return bytes_of(Buffers(4.5 + subsets, 5.2 + 4 / subsets, 1.1), geometry, grid, weighted)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import first_volume
-from recon.voxels.voxel_problem import density_unit, iterative_memory
+from recon.voxels.voxel_problem import Buffers, bytes_of, density_unit
 
 CHUNK = 2**15  # Samples that one pass through the network takes
 _FLOATS = 24  # of a sample and a number of its layers: activations and their slopes
@@ -97,7 +97,7 @@ class FieldMethod(Checked, ABC):
             values = sum(part.numel() for part in self.network(across).parameters())
         line = max(CHUNK, 2 * across)
         of_network = 4 * (4 * values + _FLOATS * self.width * line)
-        return of_network + iterative_memory(geometry, grid, 6, 3, 2 * weighted, filtered=True)
+        return of_network + bytes_of(Buffers(6, 3, 2, filtered=True), geometry, grid, weighted)
 
 
 @dataclass(frozen=True, eq=False)
