@@ -32,7 +32,6 @@ _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
 _REGIONS, _REGION = 2**21, 12  # voxels at most of the regions that judge volumes (`metrics.sampled`); bytes of a voxel
 _NO_STEPS = StepMemory()
-_EMISSION = 6 * 4  # bytes a pixel: counts, survival, background and weights, and what they are made of
 _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
 
 
@@ -161,7 +160,6 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
     one = stated_geometry(source, selection)
     geometry = with_as_many_views(one, one.n_views + views_of_others(options.source, selection))
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
-    pixel = pixel if source.emission is None else _EMISSION
     part = ScanPart(source, selection, geometry)
     stated = {step.name: step.memory(part) for step in in_order(selection)}
     return ReconMemory(

@@ -59,12 +59,9 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     # Rays that weigh nothing were filled on disk, as a direct method does it.
     filled = method.traits.direct and prepared.on_disk
-    emission = prepared.emission  # of pixels that were binned, or beside views held out, the line integrals speak alone
-    alike = emission is not None and emission.counts.shape == (geometry.n_views, *geometry.detector_shape)
     use = DataUse(
         None if filled else prepared.ray_weights(len(held_out)),
         held_out,
-        emission if alike else None,
         prepared.times if method.traits.in_time else None,
         prepared.energies if method.traits.by_energy else None,
         prepared.sample_radius,

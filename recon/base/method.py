@@ -111,8 +111,6 @@ class DataUse(Checked):
         weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
             neighbours and takes all others alike.
         held_out: numbers of the views that are not fitted; their residual is in the history.
-        emission: a `recon.Emission`, which this module must not import: the counts that projections and weights are
-            made of. None: these are all there is.
         times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
             views.
         energies: of the views, for a method of volumes of materials; None: all have one, at which there is one material
@@ -123,7 +121,6 @@ class DataUse(Checked):
 
     weights: F32 | None = None
     held_out: Sequence[int] = ()
-    emission: Any = None
     times: F64 | None = None
     energies: Energies | None = None
     sample_radius: float | SampleRadius | None = None

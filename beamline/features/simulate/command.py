@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,14 +34,13 @@ def simulate(request: SimulateRequest) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
     Only the effects that the scene names are computed. The file has the format of the instrument, which
-    `beamline recon` reads. A scene with `emission` gives the counts of a sample that emits (PET), which it reads, too.
-    The first Ctrl-C stops after the current frame, with a readable file and its labels; the
+    `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
     second stops at once.
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
     from beamline.features.simulate.write import check_output, exposure_errors, scan_of, sheet
-    from beamline.scenes.scene_file import feature_of, open_scene
+    from beamline.scenes.scene_file import open_scene
 
     clock = SystemClock()
     with terminated_like_interrupted(), json_events(request.as_json) as sink, exposure_errors(request.scene):
@@ -50,9 +48,6 @@ def simulate(request: SimulateRequest) -> None:
             raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
         if request.truth_bin and not request.truth:
             raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
-        if (module := feature_of(request.scene, request.overrides)) is not None:
-            import_module(module).run(request, Output(sink, clock, plain=not request.as_json), sink)
-            return
         picture = request.out.with_suffix(".png") if request.out and not request.picture else request.picture
         _refuse_outputs(request.out, request.truth, picture)
         opened = open_scene(request.scene, request.overrides)

@@ -21,7 +21,6 @@ from beamline.reconstruct.run import fit_within, warnings_told
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
-from recon.features.neural.methods import NAF
 from recon.splatting.r2 import R2
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -61,13 +60,6 @@ def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> Non
     left, _, said = _within(12.0, spent=9.0)
     assert left == 0
     assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
-
-
-def test_the_method_is_named() -> None:
-    said: list[str] = []
-    target = OutputPaths(Path("out.h5"), None)
-    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), SteppedClock(112.0), said.append)
-    assert len(said) == 1 and "nothing is left for the NAF method" in said[0]
 
 
 def test_warnings_of_python_are_told_as_sentences() -> None:
