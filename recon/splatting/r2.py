@@ -25,7 +25,7 @@ from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.voxels.methods import PnpDct
-from recon.voxels.voxel_problem import iterative_memory
+from recon.voxels.voxel_problem import Buffers, bytes_of
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
@@ -159,5 +159,5 @@ class R2(Checked):
         count = given or default_count(geometry, grid.voxel_size)
         grown = growth(self.fit) / DensityPolicy.growth
         of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
-        refined = iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)
+        refined = bytes_of(Buffers(10, 9, 9, filtered=True), geometry, grid, weighted)
         return max(of_gaussians + refined, PnpDct().memory(geometry, grid, weighted))

@@ -21,14 +21,14 @@ from numba import get_num_threads, set_num_threads
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.declared_types import Checked, Count
-from recon.base.geometry import require_views
+from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.volume import Grid, Volume
 from recon.voxels.held_out import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.resolution import smoothed
-from recon.voxels.voxel_problem import VoxelProblem
+from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of
 
 UNITS = "units"  # name of the decision on them
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
@@ -129,16 +129,21 @@ class VoxelMethod(Checked, ABC):
     """A method whose iterations improve a volume of voxels; a subclass adds its settings.
 
     Attributes:
+        buffers: at the peak of a run.
         first_sweeps: over the views, for the first volume; they are counted before the iterations.
         trial_sweeps: those of all trials that choose its prior, as a rule.
     """
 
+    buffers: ClassVar[Buffers]
     first_sweeps: ClassVar[int] = 0
     iterations: Count
 
     @property
     def trial_sweeps(self) -> int:
         return 0
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return bytes_of(self.buffers, geometry, grid, weighted)
 
     @abstractmethod
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

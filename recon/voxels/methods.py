@@ -26,13 +26,14 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct
 from recon.voxels.voxel_problem import (
+    Buffers,
     Momentum,
     TotalVariationProx,
     VoxelProblem,
+    bytes_of,
     density_unit,
     difference_weights,
     interleaved,
-    iterative_memory,
     largest_eigenvalue,
 )
 
@@ -53,6 +54,7 @@ class FistaTv(VoxelMethod):
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
     traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=12, error_bars=(2.2, 0.1))
+    buffers: ClassVar[Buffers] = Buffers(7.3, 3.0, 4.8, filtered=True)
 
     iterations: Count = TRIAL_SWEEPS
     tv_weight: NonNegative | None = None
@@ -90,9 +92,6 @@ class FistaTv(VoxelMethod):
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 7.3, 3.0, 4.8 * weighted, filtered=True)
-
 
 @dataclass(frozen=True)
 class OsSirtTv(VoxelMethod):
@@ -112,6 +111,7 @@ class OsSirtTv(VoxelMethod):
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
     traits: ClassVar[Traits] = Traits(budget=True, halo=20)
+    buffers: ClassVar[Buffers] = Buffers(8.1, 5.2, 8.2, filtered=True)
 
     iterations: Count = 40
     subsets: Count = 9
@@ -155,7 +155,8 @@ class OsSirtTv(VoxelMethod):
         return x
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 8.1 + 2 * self.momentum, 5.2, 8.2 * weighted, filtered=True)
+        ahead = 2 * 4 * math.prod(grid.shape) if self.momentum else 0
+        return ahead + super().memory(geometry, grid, weighted)
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class PnpDct(VoxelMethod):
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
     traits: ClassVar[Traits] = Traits(device=True, halo=16, own_length=True, error_bars=(2.3, 0.25))
+    buffers: ClassVar[Buffers] = Buffers(5.3, 3.0, 2.2)
 
     iterations: Count = 35
     patch_threshold: NonNegative | None = None
@@ -215,9 +217,10 @@ class PnpDct(VoxelMethod):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape
-        patches = 4 * scratch_values((ny, nx, nz)) + iterative_memory(geometry, grid, 5.3, 3.0, 2.2 * weighted)
+        patches = 4 * scratch_values((ny, nx, nz)) + bytes_of(self.buffers, geometry, grid, weighted)
         # Beside the first volume, trials make total variation of copies of the views: where rows are few, of all.
-        first = FistaTv().memory(geometry, grid, weighted) + iterative_memory(geometry, grid, 1.0, 2.2, 2.2 * weighted)
+        trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
+        first = FistaTv().memory(geometry, grid, weighted) + trials
         return max(first, patches)
 
 

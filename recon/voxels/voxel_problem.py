@@ -249,20 +249,30 @@ def slices_are_rows(projector: Projector) -> bool:
     return same and geometry.rows_show_slices
 
 
-def iterative_memory(
-    geometry: Geometry, grid: Grid, volumes: float, rays: float, weights: float, *, filtered: bool = False
-) -> int:
-    """Bytes of so many volumes, copies of the projections, and copies of their weights.
+@dataclass(frozen=True)
+class Buffers:
+    """Arrays of float32 that are in memory at the peak of a run.
 
-    Args:
-        filtered: the method makes a filtered back-projection, too.
+    Attributes:
+        volumes, rays, weights: copies of the volume, of the projections and of their weights.
+        filtered: a filtered back-projection is made, too.
     """
+
+    volumes: float
+    rays: float
+    weights: float
+    filtered: bool = False
+
+
+def bytes_of(buffers: Buffers, geometry: Geometry, grid: Grid, weighted: bool = True) -> int:
+    """Bytes of these buffers for some views and voxels, without weights unless rays are `weighted`."""
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
     wide = max(geometry.detector_shape[1], grid.shape[2])
-    volumes += geometry.width.arc > 0  # of the moments of an exposure
-    rays += bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
-    beside = fbp_memory(geometry.n_views, wide) if filtered else 0
-    return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
+    volumes = buffers.volumes + (geometry.width.arc > 0)  # of the moments of an exposure
+    rays = buffers.rays + bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
+    rays += buffers.weights * weighted
+    beside = fbp_memory(geometry.n_views, wide) if buffers.filtered else 0
+    return round(4 * (volumes * math.prod(grid.shape) + rays * n_rays)) + beside
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:

@@ -25,7 +25,7 @@ from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import iterative_memory
+from recon.voxels.voxel_problem import Buffers, bytes_of
 
 LEAST_VIEWS, LEAST_COLS = 40, NARROWEST
 NEAR_AXIS = AT_AXIS
@@ -36,7 +36,7 @@ _TV_WEIGHT = 1e-3  # three times as much takes a sixth of a ball on the axis
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
 _BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `beyond_chance`
 _LOOKED_AT = 8  # rows
-_VOLUMES, _RAYS, _WEIGHTS = 8.5, 7.0, 5.0  # float32 copies at most
+_BUFFERS = Buffers(8.5, 7.0, 5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def gains_memory(geometry: Geometry) -> int:
     rows, cols = geometry.detector_shape
     outer = min(_height(geometry) + 2 * _HALO, rows)
     band = geometry if outer == rows else geometry.rows(0, outer)
-    return iterative_memory(band, Grid.matching(band), _VOLUMES, _RAYS, _WEIGHTS) + 8 * rows * cols
+    return bytes_of(_BUFFERS, band, Grid.matching(band)) + 8 * rows * cols
 
 
 def _stripes_seen(projections: F32, geometry: Geometry) -> bool:

@@ -13,13 +13,11 @@ import numpy as np
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.declared_types import Count, Natural, NonNegative, Positive
-from recon.base.geometry import Geometry
 from recon.base.method import Traits
-from recon.base.volume import Grid
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.voxel_problem import VoxelProblem, density_unit, difference_weights, interleaved, iterative_memory
+from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit, difference_weights, interleaved
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,7 @@ class Sirt(VoxelMethod):
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
     traits: ClassVar[Traits] = Traits()
+    buffers: ClassVar[Buffers] = Buffers(4.5, 3.2, 3.1)
 
     iterations: Count = 100
     relaxation: Positive = 1.0
@@ -42,9 +41,6 @@ class Sirt(VoxelMethod):
                 break
         return x
 
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 4.5, 3.2, 3.1 * weighted)
-
 
 @dataclass(frozen=True)
 class Sart(VoxelMethod):
@@ -56,6 +52,7 @@ class Sart(VoxelMethod):
     name: ClassVar[str] = "sart"
     label: ClassVar[str] = "SART"
     traits: ClassVar[Traits] = Traits()
+    buffers: ClassVar[Buffers] = Buffers(3.5, 6.6, 4.1)
 
     iterations: Count = 20
     relaxation: Positive = 1.0
@@ -70,9 +67,6 @@ class Sart(VoxelMethod):
                 break
         return x
 
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 3.5, 6.6, 4.1 * weighted)
-
 
 @dataclass(frozen=True)
 class Cgls(VoxelMethod):
@@ -85,6 +79,7 @@ class Cgls(VoxelMethod):
     name: ClassVar[str] = "cgls"
     label: ClassVar[str] = "CGLS"
     traits: ClassVar[Traits] = Traits(own_length=True)
+    buffers: ClassVar[Buffers] = Buffers(3.1, 4.5, 4.1)
 
     iterations: Count = 10
     allow_negative: bool = False
@@ -117,9 +112,6 @@ class Cgls(VoxelMethod):
             np.maximum(x, 0, out=x)
         return x
 
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
-
 
 @dataclass(frozen=True)
 class AsdPocs(VoxelMethod):
@@ -138,6 +130,7 @@ class AsdPocs(VoxelMethod):
     name: ClassVar[str] = "asd-pocs"
     label: ClassVar[str] = "ASD-POCS"
     traits: ClassVar[Traits] = Traits(halo=8)
+    buffers: ClassVar[Buffers] = Buffers(5.1, 7.8, 4.1, filtered=True)
 
     iterations: Count = 10
     relaxation: Positive = 1.0
@@ -181,9 +174,6 @@ class AsdPocs(VoxelMethod):
             if decide("shorter", partial(bool, undone and error > goal)):
                 step *= self.alpha_decay
         return x
-
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return iterative_memory(geometry, grid, 5.1, 7.8, 4.1 * weighted, filtered=True)
 
 
 def _share(step: float, norm: float) -> float:
