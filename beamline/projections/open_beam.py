@@ -22,8 +22,7 @@ from beamline.projections.read import read_binned, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.exposures import views_differ
-from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
+from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
@@ -74,7 +73,7 @@ class OpenBeam:
         asked = selection.step(Preparation)
         alike = not (asked.by_current or views_differ(source))
         light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
-        used = groups_taken(source) if asked.accepted else reference_groups(source).good()
+        used = groups_taken(source) if asked.accepted else reference_groups(source)
         references = read_references(source, used, read, selection)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)

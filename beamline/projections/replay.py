@@ -17,7 +17,8 @@ from beamline.monitor.change import SPAN
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
-from beamline.monitor.references import ReferenceLimits, full_scale
+from beamline.monitor.evidence import full_scale
+from beamline.monitor.references import ReferenceLimits
 from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import NotReadyError
@@ -244,14 +245,14 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(rows_replaced(source).tolist())
-    groups = reference_groups(source, limits).judged if source.quantity == "counts" else ()
+    found = reference_groups(source, limits).findings if source.quantity == "counts" else ()
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
-        references=tuple(group.described() for group in groups if group.faults),
+        references=tuple(finding.message for finding in found if finding.frames),
         altered=altered_sentence(source) if source.altered else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
         drift=judged[-1].drift if judged else "",

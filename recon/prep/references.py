@@ -15,6 +15,7 @@ from scipy import ndimage
 from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation, without_mask
 from recon.base.declared_types import check_settings
 from recon.base.masks import NEIGHBOURS, Image
+from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
 
 Kept = TypeVar("Kept", F32, F64)
@@ -242,8 +243,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
     for profile in (profiles[:, 0], profiles[:, 1]):
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
-        wide = profile.shape[2] > 1
-        noise = median_deviation(np.diff(relative, axis=2)) / np.sqrt(2) if wide else 0.0
+        noise = deviation_between_neighbours(relative)
         # One view in twenty may deviate: noise has tails, and the median over the columns tolerates it.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)

@@ -36,7 +36,7 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
         DataError: all frames of a kind are damaged.
     """
     from beamline.projections.read import spoilt_frames
-    from beamline.storage.rules.exposures import usual_exposure
+    from beamline.storage.rules.references import usual_exposure
     from recon.prep.correct import References
 
     binning, use_damaged = selection.binning, not selection.step(Preparation).uses_flags
@@ -63,7 +63,7 @@ def _darks(
     source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int, use_damaged: bool
 ) -> list[tuple[float, NDArray[np.float64]]]:
     """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
-    from beamline.storage.rules.exposures import by_exposure
+    from beamline.storage.rules.references import by_exposure
 
     means = [
         (seconds, _mean(source, some, rows, binning, None, use_damaged))
@@ -182,7 +182,7 @@ def _mean(
 
 def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
     """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
-    from beamline.storage.rules.exposures import views_differ
+    from beamline.storage.rules.references import views_differ
 
     sentences = []
     if views_differ(source):

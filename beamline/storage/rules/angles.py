@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding, Severity
-from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups
+from beamline.storage.rules.references import VIEWS, reference_groups, seen_frame
 from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_degrees
@@ -167,8 +167,7 @@ class CoarseViews:
         return self._depths[row]
 
     def _lines(self, row: int) -> NDArray[np.float64]:
-        cells = reference_frame(self.source, row).cells
-        assert cells is not None
+        cells = seen_frame(self.source, row).places
         if self.light.dark is None or self.light.flat is None:
             return np.nan_to_num(cells.astype(np.float64))
         beam = np.nan_to_num(self.light.flat - self.light.dark)
@@ -179,7 +178,7 @@ class CoarseViews:
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether views have light and show a sample [view]."""
         for row in set(rows.tolist()) - self._lit.keys():
-            known = reference_frame(self.source, row).cells
+            known = seen_frame(self.source, row).cells
             if known is None or self.light.dark is None or self.light.flat is None:
                 self._lit[row] = bool(np.ptp(self._lines(row)))
             else:
@@ -217,7 +216,7 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
         return None
     if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
         return None
-    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
+    light = ViewLight.of(source, reference_groups(source) if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
     return CoarseViews(source, light, views) if views.size >= _LEAST_SEEN else None
 

@@ -8,7 +8,6 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.projections.selection import Selection
 from beamline.storage.rules.light import BRIGHTER, WARN, views_scaled
-from beamline.storage.rules.references import references_usable
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 
@@ -68,19 +67,7 @@ def test_counts_shifted_by_bits(bits: int, radius: float) -> None:
     darks, flats, views = counts(radius)
     said = told(darks, flats, views * 2**bits)
     assert said.startswith("refused: ")
-    assert f"counts of the views are multiples of {2**bits}" in said
-
-
-def test_multiples_are_those_of_all_frames() -> None:
-    darks, flats, views = counts(20.0)
-    views = views * 4
-    views[:-1] *= 2  # the first frame alone has only multiples of 8
-    assert "counts of the views are multiples of 4" in told(darks, flats, views)
-
-
-def test_an_offset_of_signed_numbers() -> None:
-    darks, flats, views = counts(20.0)
-    assert "They differ by 32768" in told(darks, flats, views + 32768)
+    assert "times as bright as the flats" in said
 
 
 def test_multiplied_flats_of_a_sample_that_fills_the_field_have_another_noise() -> None:
@@ -106,14 +93,6 @@ def test_flats_that_end_at_one_count_everywhere() -> None:
     darks, flats, views = counts(20.0)
     darks = darks + np.random.default_rng(0).normal(0, 3, darks.shape)
     assert "every pixel of them holds 2500, though" in told(darks, np.minimum(flats, 2500), np.minimum(views, 2500))
-
-
-@pytest.mark.parametrize(("radius", "dark"), [(31.0, 0.0), (20.0, 100.0)])
-def test_flats_and_views_that_end_at_one_count_beside_darks_of_one_number(radius: float, dark: float) -> None:
-    _, flats, views = counts(radius)
-    said = told(np.full_like(flats, dark), np.minimum(flats, 2800), np.minimum(views, 2800))
-    assert said.startswith("refused: ")
-    assert "counts end there" in said
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.03])
@@ -207,26 +186,6 @@ def test_flats_saturated_everywhere_beside_darks_of_one_number(end: float) -> No
     assert "100.00% of their pixels are saturated" in said
 
 
-def test_flats_stuck_at_one_number_beside_darks_of_one_number() -> None:
-    darks, flats, views = counts(20.0)
-    said = told(np.full_like(darks, 100), np.full_like(flats, 3500), views)
-    assert "every pixel of the flats 3500, which no camera gives" in said
-
-
-def test_real_numbers_that_end_in_flats() -> None:
-    darks, flats, views = counts(20.0)
-    frames = darks + np.random.default_rng(4).normal(0, 1, darks.shape), np.minimum(flats + 0.37, 3080.3), views
-    found = [list(references_usable(scan_of(*each, ANGLES, np.float32))) for each in (frames, (darks, flats, views))]  # type: ignore[arg-type]
-    assert "counts end there" in found[0][0].message
-    assert not found[1]
-
-
-def test_views_alone_that_end_at_one_count() -> None:
-    darks, flats, views = counts(20.0)
-    assert "of the views looked at hold 2800 without the noise" in told(darks, flats, np.minimum(views, 2800))
-    assert "saturated" not in told(darks, flats, views)
-
-
 @pytest.mark.parametrize(
     ("lights", "of_flats", "step"),
     [
@@ -234,7 +193,6 @@ def test_views_alone_that_end_at_one_count() -> None:
         ((1, 0.45), (1,), "--frames 0::2 takes one"),
         ((1, 4), (1,), "--frames 0::2 takes one"),
         ((1, 0.6, 0.3), (1, 0.6, 0.3), "--frames 0::3 or --frames 1::3 or --frames 2::3 takes one"),
-        ((1, 0.5), (0.5, 1), "No step"),
     ],
 )
 @pytest.mark.parametrize("radius", [20.0, 60.0])
@@ -259,16 +217,3 @@ def test_a_beam_that_flickers_or_drifts_has_no_lights_in_turn() -> None:
         1 - 0.3 * np.random.default_rng(2).random(45),
     ):
         assert "in turn" not in told(darks, flats, 100 + (views - 100) * factors[:, None, None])
-
-
-def test_flats_and_the_brightest_views_at_one_number_beside_darks_of_another() -> None:
-    """Where the sample varies more than the noise, what is below the end tells of it in its smoothest parts."""
-    darks, flats, views = counts(20.0)
-    structure = np.abs(np.sin(np.arange(SHAPE[0])[:, None] / 2.5) * np.sin(np.arange(SHAPE[1]) / 2.5)).clip(max=0.5)
-    rng = np.random.default_rng(0)
-    bright = 400 + np.exp(9.0 - 1.5 * structure) * np.exp(rng.normal(0, 0.002, views.shape))
-    ends = np.minimum(bright, 6000).astype(np.uint16)
-    constants = [np.full_like(each, number) for each, number in ((darks, 100), (flats, 6000))]
-    assert "and every pixel of the flats 6000, which no camera gives; the views reach 59" in told(*constants, ends)
-    smooth = np.minimum(400 + np.exp(9.0 - 1.5 * structure), 6000).astype(np.uint16)
-    assert "no camera gives" not in told(*constants, np.broadcast_to(smooth, views.shape).copy())
