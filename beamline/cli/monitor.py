@@ -95,8 +95,7 @@ def monitor(request: MonitorRequest) -> None:
             end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
         back = [f"On the way back: {view.in_words()}." for view in returned]
-        drift = [summed.drift] if summed.drift else []
-        lines = [*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *watched.ended, end]
+        lines = [*table(summed.kinds), *references, *altered, *left_out, *back, *watched.ended, end]
         click.echo("\n".join(lines))
     if watched.stopped:
         raise ScanStopped(f"{request.file}: stopped after {n} frames.")
@@ -161,7 +160,7 @@ def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) ->
     return {
         "file": file, "n_frames": summed.n_frames, "alarmed_frames": len(summed.alarmed),
         "retaken": len(summed.retaken), "flags": summed.flags, "references": summed.references,
-        "aside": summed.aside, "drift": summed.drift, "returned": [vars(view) for view in returned],
+        "aside": summed.aside, "returned": [vars(view) for view in returned],
         "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
     }  # fmt: skip
 

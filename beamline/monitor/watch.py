@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
 from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
@@ -50,8 +49,7 @@ class Monitor:
         recent: the last projections with light, oldest first, each a neighbour of the one before in angle.
         kept: a projection with light every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
-        light: of the beam, over the views so far.
-        shake: of the sample, likewise.
+        shake: of the sample, over the views so far.
         saturated: fraction of the pixels of the last good view; 1 before any.
     """
 
@@ -64,14 +62,8 @@ class Monitor:
     recent: tuple[CellView, ...] = ()
     kept: tuple[CellView, ...] = ()
     cut: float = 0.0
-    light: LightOverScan = field(default_factory=LightOverScan)
     shake: Shake = field(default_factory=Shake)
     saturated: float = 1.0
-
-    def drift(self) -> str:
-        """Drift of the beam's light over the scan, in words; "" if it is within the limit of `beam`."""
-        limits = [check.drift for check in self.checks if isinstance(check, BeamCheck)]
-        return self.light.in_words(limits[0], self.context.integrals) if limits else ""
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
@@ -225,11 +217,8 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     context = replace(context, view=view, change=change, dimmer=dimmer, shake=shake.size)
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
-    light = monitor.light.with_view(frame.index, in_air(context))
     saturated = digest.saturated_fraction
-    return replace(
-        monitor, context=context, recent=recent, kept=kept, cut=cut, light=light, shake=shake, saturated=saturated
-    )
+    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, shake=shake, saturated=saturated)
 
 
 def _of_one_view(apart: float, step: float) -> bool:

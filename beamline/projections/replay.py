@@ -91,7 +91,6 @@ class FrameVerdict:
         flags: what the checks found.
         n: frames in the file so far.
         aside: which checks left out views so far.
-        drift: of the light so far, in words; "" where it is within its limit.
         failures: a sentence on each check that failed at this frame, and is off from here on.
     """
 
@@ -100,7 +99,6 @@ class FrameVerdict:
     flags: tuple[Flag, ...]
     n: int
     aside: SkippedChecks
-    drift: str = ""
     failures: tuple[str, ...] = ()
 
 
@@ -131,7 +129,6 @@ class ScanVerdict:
         references: what is wrong with darks and flats, a text for each group.
         altered: what of the file is not as it was written; "" where all is.
         aside: which checks could not look at which views, or failed.
-        drift: of the light over the scan, in words; "" where it is within its limit.
     """
 
     n_frames: int
@@ -141,7 +138,6 @@ class ScanVerdict:
     references: tuple[str, ...]
     altered: str
     aside: tuple[str, ...]
-    drift: str = ""
 
     @property
     def flags(self) -> Mapping[str, Mapping[str, int]]:
@@ -180,7 +176,7 @@ def replay(
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, failures)
 
 
 def frames_of(
@@ -255,7 +251,6 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
         references=tuple(finding.message for finding in found if finding.frames),
         altered=altered_sentence(source) if source.altered else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
-        drift=judged[-1].drift if judged else "",
     )
 
 

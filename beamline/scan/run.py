@@ -303,7 +303,7 @@ class _Run:
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
             error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
-        for remark in filter(None, (*writer.remarks, recorder.drift, recorder.unjudged)):
+        for remark in filter(None, (*writer.remarks, recorder.unjudged)):
             self.sink(Warned(remark))
         error = self._worse(error, _failure_of(release))
         path, n_frames = writer.path, writer.committed

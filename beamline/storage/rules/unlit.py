@@ -17,7 +17,7 @@ from recon.base.views import spread
 
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
 _SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
-_ACROSS = 16  # cells a side, at most
+_ACROSS = 32  # pixels a side, about, by which a view is suspected
 _TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
 
 
@@ -57,14 +57,11 @@ class ViewLight:
         uniform = np.array([view.min() == view.max() for view in data], np.bool_)
         if dark is None or flat is None or not len(data):
             return uniform
-        views, (dark, flat) = np.stack([_binned(view) for view in data]), map(_binned, (dark, flat))
-        lit, least = lit_places(flat - dark), _SUSPECT * max(self.usual, 0.0)
-        shares = (views[:, lit] - dark[lit]) / (flat - dark)[lit]
-        dim = np.ones(len(data), np.bool_)
-        if lit.any():
-            dim = ~(np.isfinite(shares).all(axis=1) & (np.median(shares, axis=1) >= least))
-        dim[dim] = [brightness(view, dark, flat) < least for view in views[dim]]  # that of the others is no less
-        return uniform | dim
+        some = tuple(slice(None, None, max(1, n // _ACROSS)) for n in dark.shape)
+        dark, light = dark[some], (flat - dark)[some]
+        lit, least = lit_places(light), _SUSPECT * max(self.usual, 0.0)
+        shares = [np.median((view[some] - dark)[lit] / light[lit]) if lit.any() else 0.0 for view in data]
+        return uniform | ~(np.array(shares) >= least)
 
     def unlit(self, frame: int) -> bool:
         """Whether a whole view is dark, or uniform while the flats are not."""
@@ -98,13 +95,3 @@ def brightness(view: F32, dark: F32, flat: F32) -> float:
     if not known.size:
         return 0.0
     return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)
-
-
-def _binned(image: NDArray[np.generic]) -> F32:
-    """Means [cell row, cell col] of an image; cells at the lower and right edge may be smaller."""
-    starts = [np.arange(0, n, -(-n // _ACROSS)) for n in image.shape]
-    sums = np.nan_to_num(image).astype(np.float64, copy=False)
-    for axis, at in enumerate(starts):
-        sums = np.add.reduceat(sums, at, axis=axis)
-    each = [np.diff(np.append(at, n)) for at, n in zip(starts, image.shape, strict=True)]
-    return np.asarray(sums / np.multiply.outer(*each), np.float32)
