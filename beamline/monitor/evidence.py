@@ -116,6 +116,10 @@ class Evidence:
         """The groups of darks, or of flats."""
         return [group for group in self.groups if group[0].kind is kind]
 
+    def frames(self, kind: FrameKind) -> list[SeenFrame]:
+        """All darks, or all flats."""
+        return [frame for group in self.of_kind(kind) for frame in group]
+
     @cached_property
     def darkest(self) -> Group:
         """The darks with the lowest level; empty without any."""
@@ -148,7 +152,7 @@ class Evidence:
     @cached_property
     def base(self) -> F32 | float:
         """Counts without light at the places of the frames, the mean of all darks; 0 without any."""
-        darks = [frame.places for group in self.of_kind(FrameKind.DARK) for frame in group]
+        darks = [frame.places for frame in self.frames(FrameKind.DARK)]
         return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
 
     def light(self, frame: SeenFrame) -> F32:

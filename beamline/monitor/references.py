@@ -93,21 +93,25 @@ def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Fi
     """
     judged: list[Finding] = []
     for name, kind, rule in RULES:
-        if not (frames := [frame for group in evidence.of_kind(kind) for frame in group]):
+        if not (frames := evidence.frames(kind)):
             continue
         odd = list(rule(evidence, limits or ReferenceLimits()))
         rows = {frame.row for each in odd for frame in each.frames}
         none_left = bool(rows) and rows == {frame.row for frame in frames}
-        for sentence in dict.fromkeys(each.sentence for each in odd):
-            alike = [each for each in odd if each.sentence == sentence]
-            own = tuple(sorted(frame.row for each in alike for frame in each.frames))
-            text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
-            severity: Severity = "error" if none_left else "warning"
-            judged.append(Finding(severity, name, text, own, alike[0].score, alike[0].limit))
+        judged += _in_words(name, kind, odd, "error" if none_left else "warning")
         if none_left:
             break
         evidence = evidence.without(rows)
     return tuple(judged)
+
+
+def _in_words(name: str, kind: FrameKind, odd: list[Odd], severity: Severity) -> Iterator[Finding]:
+    """One finding for all frames of which one sentence holds."""
+    for sentence in dict.fromkeys(each.sentence for each in odd):
+        alike = [each for each in odd if each.sentence == sentence]
+        own = tuple(sorted(frame.row for each in alike for frame in each.frames))
+        text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
+        yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)
 
 
 def _with_holes(kind: FrameKind) -> Rule:
@@ -128,7 +132,7 @@ def _with_holes(kind: FrameKind) -> Rule:
 
 def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
     """Darks of zeros, unlike most others."""
-    frames = [frame for group in evidence.of_kind(DARK) for frame in group]
+    frames = evidence.frames(DARK)
     zero = [frame for frame in frames if not np.any(frame.blocks)]
     if zero and 2 * sum(not frame.even for frame in frames) > len(frames):
         yield Odd(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
@@ -136,8 +140,8 @@ def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
 
 def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
     """Darks above the darkest of their exposure: light only adds to counts."""
-    darks = [frame for group in evidence.of_kind(DARK) for frame in group]
-    flats = [level([frame]) for group in evidence.of_kind(FLAT) for frame in group if not frame.blank]
+    darks = evidence.frames(DARK)
+    flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
     for exposure in {frame.rounded_exposure for frame in darks}:
         same = [frame for frame in darks if frame.rounded_exposure == exposure]
         levels = np.array([level([frame]) for frame in same])
@@ -157,20 +161,18 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
 
     Not those that were written, not exposed: the number that stands for all light, such as 65535 beside 0.
     """
-    darks = [dark for group in evidence.of_kind(DARK) for dark in group]
+    darks = evidence.frames(DARK)
     hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
     for group in evidence.of_kind(FLAT):
-        written, limit = all(flat.even for flat in group), saturation_limit(group[0].pixels, limits)
-        over = [flat for flat in group if flat.saturated - hot > limit]
-        if written and all(dark.even for dark in darks) and not (over and level(darks or group)):
+        shares, limit = np.array([flat.saturated - hot for flat in group]), saturation_limit(group[0].pixels, limits)
+        over, most = shares > limit, float(shares.max())
+        if all(frame.even for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
             continue
-        if over:
-            shares = [flat.saturated - hot for flat in over]
-            what = (
-                f"{max(shares):.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known"
-            )
-            yield Odd(over, max(shares), limit, f"{what}. Shorten the exposure or add a filter.")
-        elif written:
+        if over.any():
+            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), and their light is not known"
+            odd = [group[at] for at in np.flatnonzero(over).tolist()]
+            yield Odd(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
+        elif all(flat.even for flat in group):
             what = f"every pixel of them holds {level(group):g}, though those of the darks vary: counts end there"
             yield Odd(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 

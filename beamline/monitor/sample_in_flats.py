@@ -145,7 +145,7 @@ def mass_missing(evidence: Evidence, _: Any) -> Iterator[Odd]:
     """
     if (depth := _depth_over_air(evidence)) is None:
         return
-    flats = [flat for group in evidence.of_kind(FrameKind.FLAT) for flat in group]
+    flats = evidence.frames(FrameKind.FLAT)
     mean = depth.mean(axis=0)
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
@@ -186,7 +186,7 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
 
     Only views that have air there; None where they or places are too few.
     """
-    light = np.mean([evidence.light(flat) for group in evidence.of_kind(FrameKind.FLAT) for flat in group], axis=0)
+    light = np.mean([evidence.light(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
     lit = lit_places(light)
     rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
     cols = np.flatnonzero(lit[rows].all(axis=0))

@@ -21,7 +21,16 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side, digests
 from beamline.monitor.field import PixelsCheck
 from beamline.monitor.motion import Shake
-from beamline.monitor.view import NO_SPOTS, CellView, dimmer_than_flats, grid_of, light_left, spots_of, view_of
+from beamline.monitor.view import (
+    NO_SPOTS,
+    CellGrid,
+    CellView,
+    dimmer_than_flats,
+    grid_of,
+    light_left,
+    spots_of,
+    view_of,
+)
 from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
@@ -191,9 +200,14 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     context = replace(context, grid=grid, light_left=left, follows=follows)
     if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
         return replace(monitor, context=context)  # no measure for the views after it
+    return _with_good_view(replace(monitor, context=context, saturated=digest.saturated_fraction), view, recent, grid)
+
+
+def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ...], grid: CellGrid) -> Monitor:
+    """The monitor with a projection that has light; `recent`: those before it, each a neighbour in angle."""
+    context = monitor.context
     change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
-    recent = (*recent, view)[-SPAN:]
     kept = monitor.kept
     if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
         kept = (*kept, view)
@@ -202,8 +216,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     context = replace(context, view=view, change=change, dimmer=dimmer, shake=shake.size)
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
-    saturated = digest.saturated_fraction
-    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, shake=shake, saturated=saturated)
+    return replace(monitor, context=context, recent=(*recent, view)[-SPAN:], kept=kept, cut=cut, shake=shake)
 
 
 def _of_one_view(apart: float, step: float) -> bool:

@@ -294,16 +294,21 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
     beside = np.median(np.abs(np.diff(source.angles[ends[0]]))) <= _BESIDE
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
-    shares = np.array([_share_of_flats(source, slice(first, None, n), most) for first in range(n)])
-    steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
-    way = f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
-    no_way = f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
     yield Finding(
         "error" if lights_in_turn(_light_levels(source, flats[:_IN_A_ROW])) else "warning",
         "light",
         f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
-        f"apart): thresholds, exposures or energies, of which a volume takes one. {way if steps else no_way}",
+        f"apart): thresholds, exposures or energies, of which a volume takes one. {_way_of_steps(source, n, most)}",
     )
+
+
+def _way_of_steps(source: ScanSource, n: int, most: float) -> str:
+    """Which step through the views takes one of so many lights, with its flats."""
+    shares = np.array([_share_of_flats(source, slice(first, None, n), most) for first in range(n)])
+    steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
+    if not steps:
+        return f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
+    return f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
 
 
 def _light_levels(source: ScanSource, rows: I64) -> F64:
