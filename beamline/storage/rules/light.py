@@ -13,7 +13,7 @@ from beamline.monitor.evidence import BRIGHT, lights_in_turn, lit_places, place_
 from beamline.monitor.references import LIT, LIT_SIGMAS, ReferenceLimits
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
-from beamline.storage.readers.wrapped import in_words, of_energies, selected
+from beamline.storage.readers.transforms import in_words, of_energies, selected
 from beamline.storage.rules.references import (
     EXPOSURE_TOLERANCE,
     ReferenceGroups,
