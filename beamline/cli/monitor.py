@@ -65,7 +65,6 @@ def monitor(request: MonitorRequest) -> None:
     from beamline.config.load import load
     from beamline.config.monitor import configured_checks, reference_limits
     from beamline.monitor.checks import CHECKS
-    from beamline.storage.flag_legend import counted
 
     if request.overrides and request.config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
@@ -85,14 +84,7 @@ def monitor(request: MonitorRequest) -> None:
         sink(Done(_facts(request.file, summed, returned), time=clock.now()))
     n, alarmed, references = summed.n_frames, summed.alarmed, summed.references
     if not request.as_json:
-        end = f"{one_line(str(request.file), SENTENCE)}: {n} frames, flagged: {counted(summed.flags)}"
-        if again := summed.retaken:
-            end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
-        left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
-        back = [f"On the way back: {view.in_words()}." for view in returned]
-        drift = [summed.drift] if summed.drift else []
-        lines = [*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *watched.ended, end]
-        click.echo("\n".join(lines))
+        click.echo("\n".join(_in_lines(request.file, watched)))
     if watched.stopped:
         raise ScanStopped(f"{request.file}: stopped after {n} frames.")
     if alarmed or references:
@@ -108,6 +100,20 @@ class _Watched:
     returned: Sequence[ReturnedView]
     ended: Sequence[str]
     stopped: bool
+
+
+def _in_lines(file: Path, watched: _Watched) -> list[str]:
+    """The verdict on a scan as the terminal shows it."""
+    from beamline.storage.flag_legend import counted
+
+    summed = watched.verdict
+    end = f"{one_line(str(file), SENTENCE)}: {summed.n_frames} frames, flagged: {counted(summed.flags)}"
+    if again := summed.retaken:
+        end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
+    altered = [summed.altered] if summed.altered else []
+    left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
+    back = [f"On the way back: {view.in_words()}." for view in watched.returned]
+    return [*table(summed.kinds), *summed.references, *altered, *left_out, *back, *watched.ended, end]
 
 
 def _watched(
@@ -151,7 +157,7 @@ def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) ->
     return {
         "file": file, "n_frames": summed.n_frames, "alarmed_frames": len(summed.alarmed),
         "retaken": len(summed.retaken), "flags": summed.flags, "references": summed.references,
-        "aside": summed.aside, "drift": summed.drift, "returned": [vars(view) for view in returned],
+        "aside": summed.aside, "returned": [vars(view) for view in returned],
         "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
     }  # fmt: skip
 

@@ -1,10 +1,12 @@
-"""Flag: the finding of a monitor check about a frame; the event `flag` carries it."""
+"""Flag: what a check of the monitor says of a frame, which the event `flag` carries; finding: what a rule says of a
+scan."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -64,3 +66,26 @@ class Flag:
     def event_values(self) -> dict[str, Any]:
         """Values of the event `flag` by name."""
         return {name: value for name, value in vars(self).items() if name != "from_region" or value is not None}
+
+
+Severity = Literal["error", "warning", "info"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a rule finds in a scan or a file.
+
+    Attributes:
+        severity: "error": not fit for reconstruction, or not a valid file.
+        rule: its name.
+        message: in words, with what to do.
+        frames: their rows in the file; empty: of all, or of none in particular.
+        score, limit: the figure and the limit that it violates; NaN where there is none.
+    """
+
+    severity: Severity
+    rule: str
+    message: str
+    frames: tuple[int, ...] = ()
+    score: float = math.nan
+    limit: float = math.nan

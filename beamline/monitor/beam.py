@@ -1,7 +1,7 @@
 """Beam: drift of the light against the flats, and its dips and flashes.
 
 The drift against the flats is judged in air: the brightest place of a view. It is reported when it begins, as a fact
-each time it has doubled, and as a whole after the last view. A dip is judged by the change from view to view
+each time it has doubled. A dip is judged by the change from view to view
 (beamline.monitor.change), which needs no air. These changes have errors of one sign where dense particles turn fast;
 these would sum up to a dip. A change counts only where the light of the whole view moved with it.
 """
@@ -47,55 +47,6 @@ class BeamState:
     # changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit
     # is at most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
-
-
-@dataclass(frozen=True)
-class LightOverScan:
-    """Light of the views in air, as the logarithm of the fraction lost since the flats.
-
-    Attributes:
-        views: with air so far.
-        first: mean of the first LASTS of them.
-        recent: the last LASTS of them, oldest first.
-        least, most: of the means of LASTS.
-        rows: of the file, of the first and the last of them.
-    """
-
-    views: int = 0
-    first: float = 0.0
-    recent: tuple[float, ...] = ()
-    least: float = math.inf
-    most: float = -math.inf
-    rows: tuple[int, int] = (0, 0)
-
-    def with_view(self, row: int, air: float) -> LightOverScan:
-        """The state after the next view, see in_air."""
-        if math.isnan(air):
-            return self
-        recent = (*self.recent, air)[-LASTS:]
-        mean = sum(recent) / len(recent)
-        least, most = (min(self.least, mean), max(self.most, mean)) if len(recent) == LASTS else (self.least, self.most)
-        first = mean if self.views < LASTS else self.first
-        return LightOverScan(self.views + 1, first, recent, least, most, (self.rows[0] if self.views else row, row))
-
-    def in_words(self, limit: float, integrals: bool) -> str:
-        """The drift over the scan in words, of light or of `integrals`; "" if it is within the limit, a fraction of the
-        light.
-        """
-        if self.views < 2 * LASTS:
-            return ""
-        change = math.expm1(self.first - sum(self.recent) / LASTS)
-        between = -math.expm1(self.least - self.most)
-        if max(abs(change), between) <= limit:
-            return ""
-        rows = f"frames {self.rows[0]} ... {self.rows[1]}, where there is air"
-        if integrals:
-            risen = sum(self.recent) / LASTS - self.first
-            return f"Line integrals of air change by {risen:+.3g} over the scan ({rows}). {TAKEN_OFF}"
-        way = f"{'fell' if change < 0 else 'rose'} by {abs(change):.1%} over the scan ({rows})"
-        if between > abs(change) + limit:
-            way += f"; {between:.1%} lie between its least and its most"
-        return f"The light {way}. {REMEDY}"
 
 
 @dataclass(frozen=True)

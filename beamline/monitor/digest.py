@@ -9,7 +9,7 @@ counts (LARGEST), are counted and otherwise ignored: they never spread into a me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -112,18 +112,11 @@ def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: in
     """The digest of a frame for the checks, with blocks of `check_block`, and that for a file, with blocks of
     `preview_bin`: each to the bit as `digest` makes it.
 
-    So what the checks find depends on the frames alone, and their file gives the same findings later. Blocks are joined
-    where one side is a multiple of the other; else the pixels are read a second time.
+    So what the checks find depends on the frames alone, and their file gives the same findings later. Where the sides
+    differ, the pixels are read twice.
     """
-    block = check_block(image.shape)
-    if max(block, preview_bin) % min(block, preview_bin):
-        return digest(image, saturation, block), digest(image, saturation, preview_bin)
-    fine = digest(image, saturation, min(block, preview_bin))
-    if block == preview_bin:
-        return fine, fine
-    side = min(block, preview_bin)
-    coarse = _joined(fine, image.shape, side, max(block, preview_bin) // side)
-    return (fine, coarse) if block < preview_bin else (coarse, fine)
+    seen = digest(image, saturation, check_block(image.shape))
+    return seen, seen if preview_bin == check_block(image.shape) else digest(image, saturation, preview_bin)
 
 
 def block_means(image: NDArray[Any], side: int) -> NDArray[np.float32]:
@@ -275,19 +268,6 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):
                 for col in range(cols):
                     saturated += image[row, col] >= full
     return least, int(high), total, squares, saturated, histogram
-
-
-def _joined(fine: FrameDigest, shape: tuple[int, ...], side: int, times: int) -> FrameDigest:
-    """The digest with blocks of `times` x `times` of those of `side` pixels; sums of counts are exact."""
-    pixels = [np.minimum(side, n - np.arange(0, n, side)) for n in shape]
-    first = [np.arange(0, each.size, times) for each in pixels]
-
-    def over_blocks(join: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray(join.reduceat(join.reduceat(values, first[0], axis=0), first[1], axis=1))
-
-    counts = np.outer(*pixels)
-    means = over_blocks(np.add, np.rint(fine.preview.astype(np.float64) * counts)) / over_blocks(np.add, counts)
-    return replace(fine, preview=means.astype(np.float32), peaks=over_blocks(np.maximum, fine.peaks))
 
 
 @njit(nogil=True, cache=True)

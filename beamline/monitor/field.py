@@ -21,6 +21,7 @@ from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
+from recon.base.noise import deviation_between_neighbours
 from recon.voxels.field_edges import LEAST
 
 LASTS = 5  # views in a row with matter at an edge
@@ -78,7 +79,7 @@ class FieldOfViewCheck(Logged):
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
         rows, cols = frame.counts.shape
-        if bright <= NO_BEAM * _noise(light):
+        if bright <= NO_BEAM * deviation_between_neighbours(light[::2]):
             advice = "No part of this flat has light that the darks have not: is the beam on, and the shutter open?"
             return Flag(self.name, Level.WARN, frame.index, 1.0, self.unlit, advice, (0, rows, 0, cols))
         unlit = light < UNLIT * bright
@@ -122,11 +123,6 @@ def beyond_the_field(cut: Mapping[str, float]) -> str:
         f"The sample goes on beyond the {' and '.join(cut)} edge of the field (line integral {max(cut.values()):.2f} "
         "there)."
     )
-
-
-def _noise(light: NDArray[np.float32]) -> float:
-    """Standard deviation of a block, from the differences of neighbours in a row: the beam's shape is smooth."""
-    return median_deviation(np.diff(light[::2], axis=1)) / math.sqrt(2.0)
 
 
 def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:

@@ -114,22 +114,30 @@ class OppositeCheck(Logged):
         kept = _with_view(state.kept, view, frame.replaces, follows=context.follows)
         state = replace(state, kept=kept)
         for at, one in enumerate(kept):
-            turn = _folded(view.angle - one.view.angle)
-            if one.after is None or view.index - one.view.index < LATER:
-                continue
-            step = one.after.angle - one.view.angle
-            beside = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1]))
-            other = math.copysign(math.pi, turn)
-            if not one.turned and abs(turn - other) <= beside:
-                state = replace(state, kept=(*kept[:at], replace(one, turned=True), *kept[at + 1 :]))
-                return self._mirrored(state, one, (turn - other) / step, view, context)
-            if not one.again and abs(turn) <= beside:
-                state = replace(state, kept=(*kept[:at], replace(one, again=True), *kept[at + 1 :]))
-                fit = lay_on(one, turn / step, view, grid, mirrored=False)
-                if fit is None:
-                    return Look(state)
-                return Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
+            late = one.after is not None and view.index - one.view.index >= LATER
+            if late and (looked := self._compared(state, at, view, context)) is not None:
+                return looked
         return Look(state)
+
+    def _compared(
+        self, state: OppositeState, at: int, view: CellView, context: ScanContext
+    ) -> Look[OppositeState] | None:
+        """The view against one that was kept; None where they are neither opposite nor at one angle."""
+        one, grid = state.kept[at], context.grid
+        assert one.after is not None and grid is not None
+        turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
+        beside, other = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1])), math.copysign(math.pi, turn)
+        if not one.turned and abs(turn - other) <= beside:
+            kept = (*state.kept[:at], replace(one, turned=True), *state.kept[at + 1 :])
+            return self._mirrored(replace(state, kept=kept), one, (turn - other) / step, view, context)
+        if not one.again and abs(turn) <= beside:
+            kept = (*state.kept[:at], replace(one, again=True), *state.kept[at + 1 :])
+            fit = lay_on(one, turn / step, view, grid, mirrored=False)
+            again = f"frame {one.view.index}, taken again"
+            return Look(
+                replace(state, kept=kept), None if fit is None else self._moved(fit, view.index, again, context)
+            )
+        return None
 
     def _mirrored(
         self, state: OppositeState, one: Kept, steps: float, view: CellView, context: ScanContext

@@ -1,38 +1,52 @@
-"""Darks and flats judged as groups: saturated, without light, uneven, or lit though they should be dark.
+"""Darks and flats: saturated, without light, uneven, lit though they should be dark, never written, or with the sample.
 
-Bad references spoil a volume as surely as bad views. So they are judged before the first projection is taken,
-and once more before a file is reconstructed. All functions are pure: values of frames in, faults with figures out.
+Bad references spoil a volume as surely as bad views. So the same rules judge them before the first projection is taken,
+in `validate` and before a reconstruction: each frame beside its group, the other groups and the views. A new check is a
+predicate and a row in RULES.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from enum import StrEnum, auto
 from typing import Annotated
 
 import numpy as np
 import pydantic
-from numpy.typing import NDArray
 
+from beamline.core.flag import Finding, Severity
 from beamline.core.text import spans
-from beamline.monitor.digest import LARGEST, FrameDigest, thinned
+from beamline.monitor.digest import LARGEST
+from beamline.monitor.evidence import (
+    BRIGHT,
+    UNLIT,
+    Evidence,
+    Odd,
+    figures,
+    level,
+    lights_in_turn,
+    offset,
+    pixel_noise,
+    place_noise,
+)
+from beamline.monitor.sample_in_flats import (
+    flats_like_views,
+    mass_missing,
+    outshone,
+    views_brighter,
+    views_show_nothing,
+)
 from drivers.base.frame import FrameKind
-from recon.base.arrays import median_deviation
+from recon.base.arrays import MEDIAN
 
-LEAST_NOISE = 0.5  # counts: what rounding hides
 READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
 FEW = 20.0  # noises of the darks: flats with less light have hardly more noise, so that their variance tells nothing
-BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
-UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
 CHANGE_SIGMAS = 8.0  # standard deviations: a larger change between two flats is not noise
-LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
-ZINGER = 12.0  # times the median change: more is not noise
-BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
-CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
-IN_TURN = 3.0  # times the change to the next frame of the same light: 1 of a drift, less of what is random
-WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
+WORST = 0.01  # share of the places of a flat that may be zingers
 ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
+LIT = 0.02  # share of the flats' light from which a dark is lit: 0.02 of transmission, if it were the only dark
+LIT_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
+INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
 
 
 @dataclass(frozen=True)
@@ -68,371 +82,225 @@ class ReferenceLimits:
     ] = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class ReferenceFrame:
-    """Statistics of a dark or a flat.
+DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
 
-    Attributes:
-        row: in the file.
-        kind: DARK or FLAT.
-        exposure: s, NaN where unknown.
-        saturated: fraction of the pixels at or above the saturation value.
-        blocks: float32, means of blocks of pixels; a part of the preview where that is large.
-        block: pixels a side of a block.
-        rounding: noise that the pixels' type may hide; 0 of real numbers.
-        invalid: fraction of the pixels that are not finite.
-        cells: float32, means of larger blocks that cover the frame; None: not needed.
-        largest: the largest count that more than BY_CHANCE pixels hold; at_largest: fraction of the pixels that hold
-            it, less those, or, where other pixels have more, less those that hold one count less. NaN and 0 where
-            nobody looked.
+
+def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
+    """Findings on darks and flats: errors on all of a kind, warnings on frames beside good ones.
+
+    A rule does not see the frames that earlier ones found, unless none would be left: then later ones mean nothing.
+    Rules that compare flats with the sample need `cells`.
     """
-
-    row: int
-    kind: FrameKind
-    exposure: float
-    saturated: float
-    blocks: NDArray[np.float32]
-    block: int
-    rounding: float = LEAST_NOISE
-    invalid: float = 0.0
-    cells: NDArray[np.float32] | None = None
-    largest: float = np.nan
-    at_largest: float = 0.0
-
-    @classmethod
-    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
-        return cls.seen(row, kind, exposure, digest.saturated_fraction, digest.preview, block)
-
-    @classmethod
-    def seen(
-        cls, row: int, kind: FrameKind, exposure: float, saturated: float, preview: NDArray[np.float32], block: int
-    ) -> ReferenceFrame:
-        return cls(row, kind, exposure, saturated, np.array(thinned(preview)), block)
-
-
-class FaultKind(StrEnum):
-    """Kinds of faults of darks and flats."""
-
-    SATURATED = auto()
-    NO_BEAM = auto()  # flats at the darks' level
-    BEAM_LOST = auto()  # flats with much less light than others
-    DIMMER_THAN_VIEWS = auto()
-    UNEVEN = auto()
-    MOSTLY_UNLIT = auto()
-    LIGHT_IN_DARKS = auto()
-    UNWRITTEN = auto()  # frames of one value
-    NOT_FINITE = auto()
-    SAMPLE_IN = auto()  # flats that look like views
-
-
-@dataclass(frozen=True)
-class ReferenceFault:
-    """A fault of a group."""
-
-    kind: FaultKind  # which fault
-    # score, limit: the figure, and the violated limit
-    score: float
-    limit: float
-    message: str  # both in words, with advice
-
-
-@dataclass(frozen=True)
-class GroupVerdict:
-    """The result of all checks on a group of references.
-
-    Attributes:
-        kind: DARK or FLAT.
-        rows: all of them, in the file.
-        faults: none for a good group.
-    """
-
-    kind: FrameKind
-    rows: tuple[int, ...]
-    faults: tuple[ReferenceFault, ...]
-
-    @property
-    def name(self) -> str:
-        return f"{self.kind.name.lower()}s {spans(self.rows)}"
-
-    def described(self) -> str:
-        """Name and faults of the group, in words."""
-        return f"The {self.name}: {' '.join(fault.message for fault in self.faults)}"
-
-
-Group = Sequence[ReferenceFrame]
-
-
-def judge(
-    groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
-) -> tuple[GroupVerdict, ...]:
-    """Check groups of darks and flats, each by itself and against the others.
-
-    Args:
-        groups: of one kind each, none empty, in the order of the file.
-        views: some projections, if there are any.
-    """
-    limits = limits or ReferenceLimits()
-    numbers = [group for group in groups if not is_blank(group)]
-    views = [view for view in views if not is_blank([view])]
-    base = min((group for group in numbers if group[0].kind is FrameKind.DARK), key=level, default=None)
-    flats = [group for group in numbers if group[0].kind is FrameKind.FLAT]
-    known = [group for group in flats if _saturated(group, base, limits) is None] or flats
-    bright = max(known, key=lambda group: _light(group, base), default=None)
-    judged = []
-    for group in groups:
-        if is_blank(group):
-            faults: list[ReferenceFault | None] = [_BLANK]
-        elif group[0].kind is FrameKind.DARK:
-            faults = [] if bright is None else [_lit(group, bright, base or group, limits)]
-        else:
-            faults = _of_flats(group, base, bright or group, views, limits)
-        rows = tuple(reference.row for reference in group)
-        judged.append(GroupVerdict(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
+    judged: list[Finding] = []
+    for name, kind, rule in RULES:
+        if not (frames := evidence.frames(kind)):
+            continue
+        odd = list(rule(evidence, limits or ReferenceLimits()))
+        rows = {frame.row for each in odd for frame in each.frames}
+        none_left = bool(rows) and rows == {frame.row for frame in frames}
+        judged += _in_words(name, kind, odd, "error" if none_left else "warning")
+        if none_left:
+            break
+        evidence = evidence.without(rows)
     return tuple(judged)
 
 
-def _of_flats(
-    flats: Group, darks: Group | None, bright: Group, views: Group, limits: ReferenceLimits
-) -> list[ReferenceFault | None]:
-    """The faults of a group of flats; the later ones mean nothing where there is an earlier one."""
-    faults = [_saturated(flats, darks, limits), _without_beam(flats, darks, bright, limits)]
-    if not any(faults):
-        faults = [_outshone(flats, darks, views, limits)]
-    return faults if any(faults) else [_uneven(flats, darks, limits), _unlit(flats, darks, limits)]
+def _in_words(name: str, kind: FrameKind, odd: list[Odd], severity: Severity) -> Iterator[Finding]:
+    """One finding for all frames of which one sentence holds."""
+    for sentence in dict.fromkeys(each.sentence for each in odd):
+        alike = [each for each in odd if each.sentence == sentence]
+        own = tuple(sorted(frame.row for each in alike for frame in each.frames))
+        text = f"The {kind.name.lower()}s {spans(own)}: {sentence}" if own else sentence
+        yield Finding(severity, name, text, own, alike[0].score, alike[0].limit)
 
 
-def is_blank(group: Group) -> bool:
-    """Whether no pixel of its frames has a finite value."""
-    return all(np.isnan(reference.blocks).all() for reference in group)
+def _with_holes(kind: FrameKind) -> Rule:
+    """Frames with numbers that are not finite, unlike the best of their group; or without any number."""
+
+    def with_holes(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+        for group in evidence.of_kind(kind):
+            limit = min(min(frame.invalid for frame in group) + INVALID, 0.5)
+            if odd := [frame for frame in group if frame.invalid > limit or frame.blank]:
+                text = figures([frame.invalid for frame in odd])
+                sentence = f"a share of {text} of the pixels is not finite (limit {limit:.3g})."
+                if all(frame.blank for frame in odd):
+                    sentence = f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
+                yield Odd(odd, max(frame.invalid for frame in odd), limit, sentence)
+
+    return with_holes
 
 
-_BLANK = ReferenceFault(
-    FaultKind.NOT_FINITE, 1.0, 0.0, f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
-)
+def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+    """Darks of zeros, unlike most others."""
+    frames = evidence.frames(DARK)
+    zero = [frame for frame in frames if not np.any(frame.blocks)]
+    if zero and 2 * sum(not frame.even for frame in frames) > len(frames):
+        yield Odd(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
 
 
-def photons(flats: Group, darks: Group) -> float | None:
-    """Median number of photons in a lit pixel of the flats: light squared over the variance that it adds.
+def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+    """Darks above the darkest of their exposure: light only adds to counts."""
+    darks = evidence.frames(DARK)
+    flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
+    for exposure in {frame.rounded_exposure for frame in darks}:
+        same = [frame for frame in darks if frame.rounded_exposure == exposure]
+        levels = np.array([level([frame]) for frame in same])
+        base, lowest = same[int(levels.argmin())], float(levels.min())
+        light = (max(flats) if flats else float(levels.max())) - lowest
+        limit = max(LIT * light, LIT_SIGMAS * place_noise(base.blocks))
+        if (above := levels[levels - lowest > limit] - lowest).size:
+            odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
+            yield Odd(odd, float(above.max()), limit, (
+                f"there is light in them, or their offset moved: {figures(above)} counts above the darkest dark, frame "
+                f"{base.row} with {lowest:.6g} (limit {limit:.3g}, by the {light:.6g} of light in the flats)."
+            ))  # fmt: skip
 
-    Photon transfer (Janesick 2007), of what changes from frame to frame between neighbouring blocks: a beam that
-    flickers or moves is no noise. None where frames or blocks are too few, or the flats have no noise by their light.
+
+def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats with many pixels at the end of their counts, or all at one number.
+
+    Not those that were written, not exposed: the number that stands for all light, such as 65535 beside 0.
     """
-    light = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
-    lit = light > UNLIT * float(np.nanpercentile(light, BRIGHT))
-    beside = lit[:, 1:] & lit[:, :-1]
-    if len(flats) < 2 or (len(flats) - 1) * beside.sum() < LEAST_BLOCKS:
-        return None
-    levels = np.array([np.median((flat.blocks - offset(darks))[lit]) for flat in flats])
-    even = np.stack([flat.blocks for flat in flats]) * (levels.mean() / levels)[:, None, None].astype(np.float32)
-    change = np.diff(np.diff(even, axis=0), axis=2)[:, beside]
-    squares = change.astype(np.float64) ** 2
-    variance = float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 4 * flats[0].block ** 2
-    brought = variance - _noise(darks) ** 2
-    return float(np.median(light[lit]) * light[lit].mean()) / brought if brought > 0 else None
+    darks = evidence.frames(DARK)
+    hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
+    for group in evidence.of_kind(FLAT):
+        shares, limit = np.array([flat.saturated - hot for flat in group]), saturation_limit(group[0].pixels, limits)
+        over, most = shares > limit, float(shares.max())
+        if all(frame.even for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
+            continue
+        if over.any():
+            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), and their light is not known"
+            odd = [group[at] for at in np.flatnonzero(over).tolist()]
+            yield Odd(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
+        elif all(flat.even for flat in group):
+            what = f"every pixel of them holds {level(group):g}, though those of the darks vary: counts end there"
+            yield Odd(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 
 
-def full_scale(largest: float) -> float:
-    """The saturation count of a detector, estimated from its largest count: the end of its 8, 10, 12, 14 or 16 bits."""
-    return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
-
-
-def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    written = all(map(_of_one_number, flats))
-    if written and all(map(_of_one_number, darks or ())) and not (flats[0].saturated and level(darks or flats)):
-        return None  # not exposed: the number that stands for all light, such as the full scale of 16 bits beside 0
-    hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
-    score, limit = float(np.median([flat.saturated for flat in flats])) - hot, saturation_limit(flats[0], limits)
-    if score > limit:
-        what = f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known."
-    elif written:
-        score, what = (
-            1.0,
-            f"every pixel of them holds {level(flats):g}, though those of the darks vary: counts end there.",
-        )
-    else:
-        return _clipped(flats, darks, limits)
-    sentence = f"{what} Shorten the exposure or add a filter."
-    return ReferenceFault(FaultKind.SATURATED, score, limit, sentence)
-
-
-def saturation_limit(frame: ReferenceFrame, limits: ReferenceLimits) -> float:
+def saturation_limit(pixels: int, limits: ReferenceLimits) -> float:
     """Fraction of the pixels of a frame that may be saturated."""
-    return max(limits.saturated, (ZINGERS + 0.9) / (frame.blocks.size * frame.block**2))  # blocks go beyond the edge
+    return max(limits.saturated, (ZINGERS + 0.9) / pixels)
 
 
-def _of_one_number(frame: ReferenceFrame) -> bool:
-    return bool(np.ptp(frame.blocks) == 0)
+def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats at the level of the darks."""
+    if not (darks := evidence.darkest):
+        return
+    noise, limit = max(pixel_noise(darks), darks[0].rounding), limits.light_over_noise
+    for group in evidence.of_kind(FLAT):
+        light = level(group) - level(darks)
+        if light <= limit * noise:
+            yield Odd(group, light / noise if noise else 0.0, limit, (
+                f"there is no beam in them: their level {level(group):.6g} is {light:.3g} above the darks' "
+                f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limit:g} times it). Was the shutter "
+                "open for them, and closed for the darks?"
+            ))  # fmt: skip
 
 
-def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    """Flats whose counts end below the end of their type. Where pixels vary from frame to frame, few share the largest
-    count, and it is not the same in all frames; hot pixels and zingers, which are few, have more."""
-    hot = [dark.at_largest for dark in darks or () if dark.largest == flats[0].largest]
-    score = float(np.median([flat.at_largest for flat in flats])) - max(hot, default=0.0)
-    if len(flats) < 2 or score <= saturation_limit(flats[0], limits) or len({flat.largest for flat in flats}) > 1:
-        return None
-    blocks = np.stack([flat.blocks for flat in flats])
-    change = np.abs(np.diff(blocks, axis=0))
-    varied = change[change > 0]  # blocks at the end of the counts do not; a few that differ are damage
-    noise = median_deviation(varied) / 2**0.5 * flats[0].block if varied.size > BY_CHANCE else 0.0
-    if (
-        not max(CLIPPED_NOISE * (flats[0].rounding > 0), 1e-30) <= noise <= limits.uneven * flats[0].largest
-    ):  # one that is damaged or moved varies by more
-        return None
-    sentence = (
-        f"{score:.2%} of their pixels hold {flats[0].largest:g}, the largest count but for a few, though pixels vary "
-        f"by {noise:.3g} from frame to frame (limit {limits.saturated:.2%}): counts end there, and the light is not "
-        "known. Shorten the exposure, or look for what cut the counts off."
-    )
-    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
+def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats with much less light than the brightest group."""
+    bright, limit = evidence.brightest, limits.light_gone
+    for group in evidence.of_kind(FLAT):
+        gone = np.array([1 - evidence.light_of([flat]) / evidence.light_of(bright) for flat in group])
+        if (gone > limit).any():
+            others, most = spans([flat.row for flat in bright]), float(gone.max())
+            sentence = f"{most:.0%} of the light of the flats {others} is gone (limit {limit:.0%}): the beam was lost."
+            yield Odd([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
-def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> ReferenceFault | None:
-    if darks is None:
-        return None
-    if not _has_light(flats, darks, limits):
-        light, noise = level(flats) - level(darks), max(_noise(darks), darks[0].rounding)
-        sentence = (
-            f"there is no beam in them: their level {level(flats):.6g} is {light:.3g} above the darks' "
-            f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
-            "Was the shutter open for them, and closed for the darks?"
-        )
-        return ReferenceFault(FaultKind.NO_BEAM, light / noise if noise else 0.0, limits.light_over_noise, sentence)
-    most = _light(bright, darks)
-    gone = 1 - _light(flats, darks) / most
-    if gone <= limits.light_gone:
-        return None
-    where = spans([reference.row for reference in bright])
-    sentence = (
-        f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.light_gone:.0%}): the beam was lost."
-    )
-    return ReferenceFault(FaultKind.BEAM_LOST, gone, limits.light_gone, sentence)
+def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats darker than views, if both exposures are known: a sample only takes light."""
+    views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
+    limit = 1 - limits.light_gone
+    for group in evidence.of_kind(FLAT) if views else ():
+        share = evidence.light_of(group) / evidence.light_of(views)
+        if share < limit and all(flat.exposure > 0 for flat in group):
+            yield Odd(group, share, limit, (
+                f"they have {share:.2%} of the light of the views (limit {limit:.0%}), though a sample only "
+                "takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
+            ))  # fmt: skip
 
 
-def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> ReferenceFault | None:
-    """Faults of flats darker than views, if both exposures are known: a sample only takes light."""
-    views = [view for view in views if view.saturated <= limits.saturated and np.isfinite(view.blocks).any()]
-    if not views or not all(frame.exposure > 0 for frame in (*flats, *views)):
-        return None
-    there, most = _light(flats, darks), _light(views, darks)
-    if there >= (1 - limits.light_gone) * most:
-        return None
-    share = there / most
-    sentence = (
-        f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
-        f"takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
-    )
-    return ReferenceFault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, sentence)
+def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats with other light than most of their group, as a whole or in places; all, where half of them have."""
+    base, limit = offset(evidence.darkest), limits.uneven
+    for group in evidence.of_kind(FLAT):
+        light = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
+        usual = np.median(light, axis=0)
+        lit = usual > max(0.0, UNLIT * float(np.nanpercentile(usual, BRIGHT)))
+        if len(group) < 2 or not lit.any():
+            continue
+        ratio = light[:, lit] / usual[lit]
+        levels = np.nanmedian(ratio, axis=1)
+        local = np.sort(np.nan_to_num(np.abs(ratio / levels[:, None] - 1)), axis=1)
+        places = local[:, max(0, lit.sum() - 1 - max(ZINGERS, round(lit.sum() * WORST)))]
+        changed, noise = float(np.ptp(levels)), float(np.median(local)) / MEDIAN
+        far = np.abs(levels - np.median(levels)) > limit / 2 if changed > limit else np.zeros(levels.size, np.bool_)
+        moved = (places > max(limit, CHANGE_SIGMAS * noise)) & ~far
+        odd = [flat for flat, is_odd in zip(group, far | moved, strict=True) if is_odd]
+        whole = 2 * len(odd) >= len(group)
+        how = "from flat to flat" if whole else "from the usual flat of their group"
+        if far.any():
+            n = lights_in_turn(levels)
+            why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
+            sentence = f"their light differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
+            yield Odd(group if whole else odd, changed, limit, sentence)
+        elif odd:
+            yield Odd(group if whole else odd, float(places.max()), limit, (
+                f"in places their light differs by {places.max():.0%} {how} (limit {limit:.0%}): something was in the "
+                "beam. Is the sample out?"
+            ))  # fmt: skip
 
 
-def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    """The light of each flat against the group's mean, as a whole and place by place."""
-    if len(flats) < 2:
-        return None
-    light = np.stack([(flat.blocks - offset(darks)) / seconds(flat) for flat in flats])
-    mean = light.mean(axis=0)
-    lit = mean > max(0.0, UNLIT * float(np.nanpercentile(mean, BRIGHT)))
-    if not lit.any():
-        return None
-    ratio = light[:, lit] / mean[lit]
-    levels = np.median(ratio, axis=1)
-    local = np.abs(ratio / levels[:, None] - 1)
-    noise = median_deviation(local)
-    changed = float(np.ptp(levels))
-    place = float(worst_place(local).max())
-    if changed > limits.uneven:
-        n = lights_in_turn(levels)
-        why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
-        sentence = f"their light changes by {changed:.0%} from flat to flat (limit {limits.uneven:.0%}): {why}."
-        return ReferenceFault(FaultKind.UNEVEN, changed, limits.uneven, sentence)
-    if place > max(limits.uneven, CHANGE_SIGMAS * noise):
-        sentence = (
-            f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
-            "moved in the beam. Is the sample out?"
-        )
-        return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, sentence)
-    return None
+def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Flats that leave most of the frame dark."""
+    for group in evidence.of_kind(FLAT):
+        light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
+        score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
+        if score > limit:
+            yield Odd(group, score, limit, (
+                f"{score:.0%} of the frame has no light in them (limit {limit:.0%}): move beam and detector onto one "
+                "another, or read fewer pixels."
+            ))  # fmt: skip
 
 
-def lights_in_turn(levels: NDArray[np.floating]) -> int:
-    """How many lights frames in a row [frame] have in turn, 2 or 3; 0: their light does not change so."""
-    for n in range(2, min(3, levels.size // 2) + 1):
-        between = float(np.ptp([np.median(levels[first::n]) for first in range(n)]))
-        if between > IN_TURN * float(np.abs(levels[n:] - levels[:-n]).max()):
-            return n
-    return 0
+def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+    """Darks with the level and the noise of light."""
+    flats = evidence.brightest
+    for darks in evidence.of_kind(DARK) if flats else ():
+        share = level(darks) / level(flats) if level(flats) > 0 else np.inf
+        noise, of_flats = pixel_noise(darks), pixel_noise(flats)
+        known = of_flats > 0  # otherwise the frames have no noise, as only simulated ones
+        variance = (noise / of_flats) ** 2 if known else share
+        limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
+        unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
+        if min(share, variance) > limit and level(darks) > 0 and not unsure:
+            yield Odd(darks, min(share, variance), limit, (
+                f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' "
+                f"{level(flats):.6g}"
+                + (f" and their variance {variance:.0%}" if known else "")
+                + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
+            ))  # fmt: skip
 
 
-def worst_place(changes: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The change [frame] that counts of those of its places [frame, place]: few of these may be zingers."""
-    n = changes.shape[1]
-    return np.sort(changes, axis=1)[:, max(0, n - 1 - max(ZINGERS, round(n * (1 - WORST / 100))))]
-
-
-def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    light = np.mean([flat.blocks - offset(darks) for flat in flats], axis=0)
-    score = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean())
-    if score <= limits.unlit:
-        return None
-    sentence = (
-        f"{score:.0%} of the frame has no light in them (limit {limits.unlit:.0%}): move beam and detector onto one "
-        "another, or read fewer pixels."
-    )
-    return ReferenceFault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, sentence)
-
-
-def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> ReferenceFault | None:
-    if not _has_light(flats, base, limits):
-        return None  # both have the same light: the flats' fault reports it, because the wrong one is unknown
-    share = level(darks) / level(flats) if level(flats) > 0 else np.inf
-    noise, of_flats = _noise(darks), _noise(flats)
-    known = of_flats > 0  # otherwise the frames have no noise, as only simulated ones
-    variance = (noise / of_flats) ** 2 if known else share
-    score = min(share, variance)
-    limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
-    if known and noise < READOUT and level(flats) - level(darks) < FEW * noise:
-        return None
-    if score <= limit or level(darks) <= 0:
-        return None
-    sentence = (
-        f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' {level(flats):.6g}"
-        + (f" and their variance {variance:.0%}" if known else "")
-        + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
-    )
-    return ReferenceFault(FaultKind.LIGHT_IN_DARKS, score, limit, sentence)
-
-
-def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
-    return level(flats) - level(darks) > limits.light_over_noise * max(_noise(darks), darks[0].rounding)
-
-
-def level(group: Group) -> float:
-    """Counts in the bright part of a frame: a beam may be narrower than the detector."""
-    return float(np.median([np.nanpercentile(reference.blocks, BRIGHT) for reference in group]))
-
-
-def offset(darks: Group | None) -> NDArray[np.float32] | float:
-    return np.asarray(np.mean([dark.blocks for dark in darks], axis=0)) if darks else 0.0
-
-
-def seconds(reference: ReferenceFrame) -> float:
-    return reference.exposure if reference.exposure > 0 else 1.0
-
-
-def _light(group: Group, darks: Group | None) -> float:
-    """Counts above the darks, a second where the exposure is known."""
-    dark = 0.0 if darks is None else level(darks)
-    return float(np.median([(np.nanpercentile(flat.blocks, BRIGHT) - dark) / seconds(flat) for flat in group]))
-
-
-def _noise(group: Group) -> float:
-    """Standard deviation of a pixel from frame to frame; of a single frame, from place to place."""
-    if len(group) == 1:
-        blocks, pairs = group[0].blocks, 1.0
-        change = blocks - np.nanmedian(blocks)
-    else:
-        # Neighbours in time share slow drift and all fixed pattern.
-        before, after = (np.stack([r.blocks for r in part]) for part in (group[:-1], group[1:]))
-        change, pairs = after - before, 2.0
-        change = change - np.nanmedian(change, axis=(1, 2), keepdims=True)
-    return median_deviation(change) / pairs**0.5 * group[0].block
+Rule = Callable[[Evidence, ReferenceLimits], Iterator[Odd]]
+RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
+    ("not_finite", DARK, _with_holes(DARK)),
+    ("unwritten", DARK, _unwritten),
+    ("light_in_darks", DARK, _above_darkest),
+    ("not_finite", FLAT, _with_holes(FLAT)),
+    ("no_beam", FLAT, _without_beam),
+    ("saturated", FLAT, _saturated),
+    ("beam_lost", FLAT, _beam_lost),
+    ("light_in_darks", DARK, _light_in_darks),
+    ("dimmer_than_views", FLAT, _dimmer_than_views),
+    ("uneven", FLAT, _uneven),
+    ("mostly_unlit", FLAT, _mostly_unlit),
+    ("sample_in", FLAT, flats_like_views(single=True)),
+    ("sample_in", FLAT, outshone),
+    ("sample_in", FLAT, flats_like_views(single=False)),
+    ("sample_in", FLAT, mass_missing),
+    ("views_alike", FLAT, views_show_nothing),
+    ("views_brighter", FLAT, views_brighter),
+)
+"""What is found, on frames of which kind, and how; in their order."""

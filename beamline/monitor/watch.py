@@ -11,14 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
 from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.field import PixelsCheck
 from beamline.monitor.motion import Shake
-from beamline.monitor.view import NO_SPOTS, CellView, dimmer_than_flats, grid_of, light_left, spots_of, view_of
+from beamline.monitor.view import (
+    NO_SPOTS,
+    CellGrid,
+    CellView,
+    dimmer_than_flats,
+    grid_of,
+    light_left,
+    spots_of,
+    view_of,
+)
 from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
@@ -45,8 +53,7 @@ class Monitor:
         recent: the last projections with light, oldest first, each a neighbour of the one before in angle.
         kept: a projection with light every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
-        light: of the beam, over the views so far.
-        shake: of the sample, likewise.
+        shake: of the sample, over the views so far.
         saturated: fraction of the pixels of the last good view; 1 before any.
     """
 
@@ -59,14 +66,8 @@ class Monitor:
     recent: tuple[CellView, ...] = ()
     kept: tuple[CellView, ...] = ()
     cut: float = 0.0
-    light: LightOverScan = field(default_factory=LightOverScan)
     shake: Shake = field(default_factory=Shake)
     saturated: float = 1.0
-
-    def drift(self) -> str:
-        """Drift of the beam's light over the scan, in words; "" if it is within the limit of `beam`."""
-        limits = [check.drift for check in self.checks if isinstance(check, BeamCheck)]
-        return self.light.in_words(limits[0], self.context.integrals) if limits else ""
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
@@ -197,9 +198,14 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     context = replace(context, grid=grid, light_left=left, follows=follows)
     if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
         return replace(monitor, context=context)  # no measure for the views after it
+    return _with_good_view(replace(monitor, context=context, saturated=digest.saturated_fraction), view, recent, grid)
+
+
+def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ...], grid: CellGrid) -> Monitor:
+    """The monitor with a projection that has light; `recent`: those before it, each a neighbour in angle."""
+    context = monitor.context
     change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
-    recent = (*recent, view)[-SPAN:]
     kept = monitor.kept
     if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
         kept = (*kept, view)
@@ -208,11 +214,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     context = replace(context, view=view, change=change, dimmer=dimmer, shake=shake.size)
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
-    light = monitor.light.with_view(frame.index, in_air(context))
-    saturated = digest.saturated_fraction
-    return replace(
-        monitor, context=context, recent=recent, kept=kept, cut=cut, light=light, shake=shake, saturated=saturated
-    )
+    return replace(monitor, context=context, recent=(*recent, view)[-SPAN:], kept=kept, cut=cut, shake=shake)
 
 
 def _of_one_view(apart: float, step: float) -> bool:

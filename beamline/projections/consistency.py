@@ -149,7 +149,7 @@ def compare_with_flats(
         return {}
     accepted = selection.step(Preparation).accepted
     said = selection.step(Air).model != "auto"  # columns that are said to be air
-    groups = groups_taken(source) if accepted else reference_groups(source).good()
+    groups = groups_taken(source) if accepted else reference_groups(source)
     if not (groups.darks and groups.flats):
         return {}
     if any(projections.air_columns):

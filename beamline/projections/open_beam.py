@@ -18,18 +18,17 @@ from beamline.projections.corrections.references import (
     warn_of_parts_without_flats,
     with_dynamic_flats,
 )
-from beamline.projections.read import read_binned, tell_damaged
+from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.exposures import views_differ
-from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
+from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
 from recon.prep.correct import Correction, CorrectionSettings, References
-from recon.prep.counts import Photons
+from recon.prep.counts import Photons, photon_transfer
 from recon.prep.references import SHADOW_REACH, shadowed
 
 _LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
@@ -74,7 +73,7 @@ class OpenBeam:
         asked = selection.step(Preparation)
         alike = not (asked.by_current or views_differ(source))
         light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
-        used = groups_taken(source) if asked.accepted else reference_groups(source).good()
+        used = groups_taken(source) if asked.accepted else reference_groups(source)
         references = read_references(source, used, read, selection)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
@@ -155,9 +154,6 @@ def photons_of(
         ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
             the open beam too many or too few for any detector.
     """
-    from beamline.projections.read import read_binned, spoilt_frames
-    from recon.prep.counts import Photons, photon_transfer
-
     model = selection.step(Preparation)
     if model.noise == "log":
         return None

@@ -17,7 +17,8 @@ from beamline.monitor.change import SPAN
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
-from beamline.monitor.references import ReferenceLimits, full_scale
+from beamline.monitor.evidence import full_scale
+from beamline.monitor.references import ReferenceLimits
 from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import NotReadyError
@@ -90,7 +91,6 @@ class FrameVerdict:
         flags: what the checks found.
         n: frames in the file so far.
         aside: which checks left out views so far.
-        drift: of the light so far, in words; "" where it is within its limit.
         failures: a sentence on each check that failed at this frame, and is off from here on.
     """
 
@@ -99,7 +99,6 @@ class FrameVerdict:
     flags: tuple[Flag, ...]
     n: int
     aside: SkippedChecks
-    drift: str = ""
     failures: tuple[str, ...] = ()
 
 
@@ -130,7 +129,6 @@ class ScanVerdict:
         references: what is wrong with darks and flats, a text for each group.
         altered: what of the file is not as it was written; "" where all is.
         aside: which checks could not look at which views, or failed.
-        drift: of the light over the scan, in words; "" where it is within its limit.
     """
 
     n_frames: int
@@ -140,7 +138,6 @@ class ScanVerdict:
     references: tuple[str, ...]
     altered: str
     aside: tuple[str, ...]
-    drift: str = ""
 
     @property
     def flags(self) -> Mapping[str, Mapping[str, int]]:
@@ -177,7 +174,7 @@ def replay(
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, failures)
 
 
 def frames_of(
@@ -242,17 +239,16 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(rows_replaced(source).tolist())
-    groups = reference_groups(source, limits).judged if source.quantity == "counts" else ()
+    found = reference_groups(source, limits).findings if source.quantity == "counts" else ()
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
-        references=tuple(group.described() for group in groups if group.faults),
+        references=tuple(finding.message for finding in found if finding.frames),
         altered=altered_sentence(source) if source.altered else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
-        drift=judged[-1].drift if judged else "",
     )
 
 

@@ -188,11 +188,6 @@ class Recorder:
         return flagged
 
     @property
-    def drift(self) -> str:
-        """Drift of the light over the frames so far, in words; "" if it is within its limit."""
-        return self._monitor.drift()
-
-    @property
     def alarmed_frames(self) -> int:
         """Frames so far with an alarm of any check, except those that were repeated."""
         return len(self._alarmed)

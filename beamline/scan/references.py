@@ -8,7 +8,8 @@ from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest, check_block
-from beamline.monitor.references import ReferenceFrame, ReferenceLimits, judge, photons
+from beamline.monitor.evidence import Evidence, SeenFrame, photons
+from beamline.monitor.references import ReferenceLimits, judge
 from beamline.plan.plan import Block
 from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
@@ -18,31 +19,22 @@ VIEWS = 4  # enough for a median
 
 
 class ReferenceLog:
-    """Statistics of the darks and flats of a scan, to check them group by group."""
+    """The evidence of the darks, the flats and the first views of a scan, as they are recorded."""
 
     def __init__(self) -> None:
-        self._groups: list[list[ReferenceFrame]] = []
-        self._views: list[ReferenceFrame] = []
-        self._before = FrameKind.INVALID
+        self.evidence, self._before = Evidence(), FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """Record a frame, in the order of the file; also the first views, to compare their light with the flats.
-        `digest`: that of the checks."""
-        block = check_block(frame.counts.shape)
-        if frame.kind in REFERENCES:
-            if frame.kind is not self._before:
-                self._groups.append([])
-            reference = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block)
-            self._groups[-1].append(reference)
-        elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
-            self._views.append(ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block))
+        """The next frame, in the order of the file. `digest`: that of the checks."""
+        if frame.kind in REFERENCES or (frame.kind is FrameKind.PROJECTION and len(self.evidence.views) < VIEWS):
+            seen = SeenFrame.of(frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape))
+            self.evidence = self.evidence.with_frame(seen, begins=frame.kind is not self._before)
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
         if frame.replaces >= 0:
-            for known in (*self._groups, self._views):
-                known[:] = [one for one in known if one.row != frame.replaces]
+            self.evidence = self.evidence.without({frame.replaces})
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """The faults of the groups so far, by the name of the group, in one or more sentences each.
+        """What is wrong with darks and flats so far, by what it is of, in one or more sentences each.
 
         Args:
             planned: blocks that are over by now; references without any frame are missing.
@@ -50,19 +42,17 @@ class ReferenceLog:
         missing = {
             block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the views did not come."
             for block in planned
-            if block.kind in REFERENCES and not any(group[0].kind is block.kind for group in self._groups)
+            if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }
-        judged = judge(self._groups, limits, self._views)
-        return missing | {group.name: group.described() for group in judged if group.faults}
+        found = (finding for finding in judge(self.evidence, limits) if finding.frames)
+        return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
         `exposure`: s, of the views."""
-        judged = judge(self._groups, limits, self._views)
-        good = [group for group, found in zip(self._groups, judged, strict=True) if not found.faults]
-        flats, darks = (
-            next((group for group in good if group[0].kind is kind), None) for kind in (FrameKind.FLAT, FrameKind.DARK)
-        )
+        bad = {row for finding in judge(self.evidence, limits) for row in finding.frames}
+        good = self.evidence.without(bad)
+        flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
         found = photons(flats, darks) if flats and darks else None
         if not flats or found is None:
             return None

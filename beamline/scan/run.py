@@ -303,7 +303,7 @@ class _Run:
         with ended.kept():
             if self.instrument.simulated is not None and not recorder.hangs:
                 write_labels(labels_path(writer.path), labels.runs(writer.committed), writer.committed)
-        for remark in filter(None, (*writer.remarks, recorder.drift, recorder.unjudged)):
+        for remark in filter(None, (*writer.remarks, recorder.unjudged)):
             self.sink(Warned(remark))
         with ended.kept():
             release()

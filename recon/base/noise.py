@@ -56,6 +56,22 @@ def noise_level(images: F32) -> float:
     return low * float(gains[min(at, gains.size - 1)]) ** (axes / 2)
 
 
+def deviation_between_neighbours(values: NDArray[np.floating[Any]], order: int = 1, axis: int = -1) -> float:
+    """Standard deviation of white noise with the same differences of this order along an axis; 0 if none is finite."""
+    return median_deviation(np.diff(values, order, axis=axis)) / math.sqrt(math.comb(2 * order, order))
+
+
+def deviation_between_frames(frames: NDArray[np.floating[Any]]) -> float:
+    """Standard deviation of a pixel of frames [frame, row, col] from each to the next, without changes of the whole.
+
+    Neighbours in time share slow drift and all fixed pattern. Of a single frame, from place to place.
+    """
+    if len(frames) == 1:
+        return median_deviation(frames - np.nanmedian(frames))
+    change = np.diff(frames, axis=0)
+    return median_deviation(change - np.nanmedian(change, axis=(1, 2), keepdims=True)) / math.sqrt(2.0)
+
+
 def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
     """The smaller of `noise_level` and the noise at frequencies above those of the sample's structure.
 

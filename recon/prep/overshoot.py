@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.base.arrays import F32, I64, median_deviation
+from recon.base.arrays import F32, I64
+from recon.base.noise import deviation_between_neighbours
 from recon.base.views import spread
 
 _LEVELS = 1, 4, 16  # rows averaged on either side of the comparison: a can shows one edge in all, grains one in each
@@ -107,7 +108,7 @@ def _edges(sought: F32, measured: F32, kind: int) -> tuple[F32, I64]:
         kind: side and half of the rows, 0 to 3, a part of the place.
     """
     sought = sought - sought[:, :, :_AIR].mean(axis=2, keepdims=True)
-    threshold = _EDGE * median_deviation(np.diff(sought[:, :, :_AIR], axis=2)) / np.sqrt(2)
+    threshold = _EDGE * deviation_between_neighbours(sought[:, :, :_AIR])
     matter = sought > max(threshold, _OF_DEEPEST * float(np.percentile(sought, 98)))
     view, row = np.nonzero(~matter[:, :, : _AIR + 1].any(axis=2) & matter[:, :, : sought.shape[2] // 2].any(axis=2))
     first = matter[view, row].argmax(axis=1)

@@ -15,6 +15,7 @@ from scipy import ndimage
 from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation, without_mask
 from recon.base.declared_types import check_settings
 from recon.base.masks import NEIGHBOURS, Image
+from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
 
 Kept = TypeVar("Kept", F32, F64)
@@ -104,11 +105,6 @@ def flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tup
 
 _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
 SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
-_SORT_8 = (
-    *((0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7), (0, 1), (2, 3), (4, 5), (6, 7), (2, 4), (3, 5)),
-    *((1, 4), (3, 6), (1, 2), (3, 4), (5, 6)),
-)
-"""A network of exchanges that sorts eight values (Knuth 1998, section 5.3.4)."""
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
 
 
@@ -170,22 +166,6 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
     """Median and third brightest of the eight neighbours of each (r, c); at the image's edge the brightest."""
     rows, cols = image.shape
-    edge = (r == 0) | (r == rows - 1) | (c == 0) | (c == cols - 1)
-    if edge.all():
-        return _around_edge(image, r, c)
-    steps = NEIGHBOURS[:, 0] * cols + NEIGHBOURS[:, 1]
-    values = [image.ravel().take(r * cols + c + step, mode="clip") for step in steps]
-    for i, j in _SORT_8:
-        values[i], values[j] = np.minimum(values[i], values[j]), np.maximum(values[i], values[j])
-    middle, brightest = (values[3] + values[4]) / 2, values[5]
-    if edge.any():
-        middle[edge], brightest[edge] = _around_edge(image, r[edge], c[edge])
-    return middle, brightest
-
-
-def _around_edge(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """`_around` for pixels whose neighbours may lie beyond the edge."""
-    rows, cols = image.shape
     nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
     values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
@@ -242,8 +222,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
     for profile in (profiles[:, 0], profiles[:, 1]):
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
-        wide = profile.shape[2] > 1
-        noise = median_deviation(np.diff(relative, axis=2)) / np.sqrt(2) if wide else 0.0
+        noise = deviation_between_neighbours(relative)
         # One view in twenty may deviate: noise has tails, and the median over the columns tolerates it.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)

@@ -10,9 +10,10 @@ from itertools import combinations
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
-from recon.base.arrays import F32, median_deviation
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
+from recon.base.noise import deviation_between_neighbours
 from recon.base.volume import Grid, Volume, part_of
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
@@ -201,8 +202,8 @@ def _differences(
         compared += len(model) * model.shape[1]
         progress(compared * geometry.n_views // all_rows, geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
-        third = np.diff(seen[view], 3, axis=1)  # noise of the view; the finest detail of the sample counts as noise
-        noise = max(median_deviation(third) / math.sqrt(20.0), _LEAST_NOISE / side * float(np.abs(seen[view]).max()))
+        own = deviation_between_neighbours(seen[view], 3)  # the finest detail of the sample counts as noise
+        noise = max(own, _LEAST_NOISE / side * float(np.abs(seen[view]).max()))
         if not lit[view].any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue

@@ -62,7 +62,6 @@ def of_source(source: ScanSource, axis: float | None = None) -> list[Row]:
     whole = verdict(source, judged)
     rows += [["monitor", "references", "", "", sentence] for sentence in whole.references]
     rows += [["monitor", "left out", "", "", sentence] for sentence in whole.aside]
-    rows += [["monitor", "drift", "", "", whole.drift]] if whole.drift else []
     found = dict.fromkeys([*source_findings(source), *views_lit(source, every=True)])
     rows += [["validate", each.rule, each.severity, "", each.message] for each in found]
     return rows + prepared(source, axis)

@@ -181,7 +181,7 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
         findings, now = findings_of(SourceOptions(file, **scan_facts), progress), answer.clock.now()
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for finding in findings:
-            answer.sink(RuleBroken(**vars(finding), time=now))
+            answer.sink(RuleBroken(finding.severity, finding.rule, finding.message, time=now))
         errors = count(counts["error"], "error")
         lines = [
             f"{finding.severity:<9}{finding.rule:<16}{one_line(finding.message, SENTENCE)}" for finding in findings

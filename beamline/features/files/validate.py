@@ -118,7 +118,7 @@ def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
     if not counted or not kinds <= {*source.image_key.tolist()}:
         return
     looked_at = views if every else spread(views, VIEWS)
-    light = ViewLight.of(source, reference_groups(source).good())
+    light = ViewLight.of(source, reference_groups(source))
     unlit = [row for row in looked_at.tolist() if light.unlit(row)]
     if unlit:
         of = f"{views.size} views" if every else f"{looked_at.size} views looked at"

@@ -22,7 +22,8 @@ from beamline.core.stop import StopRequest
 from beamline.core.text import degrees, rounded
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.digest import digest
-from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimits, judge
+from beamline.monitor.evidence import Evidence, SeenFrame
+from beamline.monitor.references import ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
@@ -186,12 +187,12 @@ def evaluate(
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
     references = [
-        ReferenceFrame.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
+        SeenFrame.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
-    judged = judge([references[: len(darks)], references[len(darks) :]], limits)
-    faults = [fault for group in judged for fault in group.faults]
-    known = not any(fault.kind in (FaultKind.LIGHT_IN_DARKS, FaultKind.NO_BEAM) for fault in faults)
+    groups = tuple(references[: len(darks)]), tuple(references[len(darks) :])
+    faults = judge(Evidence(groups), limits)
+    known = not any(fault.rule in ("light_in_darks", "no_beam") for fault in faults)
     advised = rounded(min(used * room, longest)) if known else math.nan
     n = max(plan.flats.count, 1)
     longer = typical * advised / used

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.sinks import Warn
 from beamline.core.text import count
 from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.read import read_binned, spoilt_frames
+from beamline.projections.selection import Selection
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import (
+    ReferenceGroups,
+    by_exposure,
+    exposures_of,
+    usual_exposure,
+    views_differ,
+)
 from drivers.base.frame import FrameKind
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from beamline.core.sinks import Warn
-    from beamline.projections.selection import Selection
-    from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.references import ReferenceGroups
-    from recon.prep.correct import References
+from recon.prep.correct import References
+from recon.prep.dynamic_flats import find_dynamic_flats
+from recon.prep.references import dark_at, dead_pixels
 
 _STEADY = 0.01  # of the ring current: top-up keeps it so
 
@@ -35,9 +40,6 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
     Raises:
         DataError: all frames of a kind are damaged.
     """
-    from beamline.projections.read import spoilt_frames
-    from beamline.storage.rules.exposures import usual_exposure
-    from recon.prep.correct import References
 
     binning, use_damaged = selection.binning, not selection.step(Preparation).uses_flags
     darks = _darks(source, np.concatenate(groups.darks), rows, binning, use_damaged)
@@ -63,7 +65,6 @@ def _darks(
     source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int, use_damaged: bool
 ) -> list[tuple[float, NDArray[np.float64]]]:
     """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
-    from beamline.storage.rules.exposures import by_exposure
 
     means = [
         (seconds, _mean(source, some, rows, binning, None, use_damaged))
@@ -74,7 +75,6 @@ def _darks(
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
     """That of an exposure; the mean of all where it is unknown. None without darks."""
-    from recon.prep.references import dark_at
 
     if len(darks) < 2:
         return darks[0][1] if darks else None
@@ -89,9 +89,6 @@ def with_dynamic_flats(
     Raises:
         ConfigError: there are too few flats.
     """
-    from beamline.projections.read import read_binned, spoilt_frames
-    from recon.prep.dynamic_flats import find_dynamic_flats
-    from recon.prep.references import dead_pixels
 
     asked = selection.step(Preparation)
     frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))
@@ -116,7 +113,6 @@ def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.floa
     """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown. With
     `by_current` also from its own ring current.
     """
-    from beamline.storage.rules.references import exposures_of
 
     scale = _to_median(exposures_of(source), source.image_key)
     return scale * current_scale(source) if by_current else scale
@@ -169,7 +165,6 @@ def _mean(
     use_damaged: bool,
 ) -> NDArray[np.float64] | None:
     """Mean of the frames that may be used, each times its weight; float64 [row, col], binned; None where none may."""
-    from beamline.projections.read import read_binned, spoilt_frames
 
     total, n = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64), 0
     for i, frame in enumerate(frames):
@@ -182,7 +177,6 @@ def _mean(
 
 def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
     """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
-    from beamline.storage.rules.exposures import views_differ
 
     sentences = []
     if views_differ(source):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups
+from beamline.storage.rules.references import VIEWS, reference_groups, seen_frame
 from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
@@ -62,7 +62,7 @@ class CoarseViews:
         return self._depths[row]
 
     def _lines(self, row: int) -> NDArray[np.float64]:
-        cells = reference_frame(self.source, row).cells
+        cells = seen_frame(self.source, row).cells
         assert cells is not None
         if self.light.dark is None or self.light.flat is None:
             return np.nan_to_num(cells.astype(np.float64))
@@ -72,7 +72,7 @@ class CoarseViews:
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
     def _is_lit(self, row: int) -> bool:
-        cells, dark, flat = reference_frame(self.source, row).cells, self.light.dark, self.light.flat
+        cells, dark, flat = seen_frame(self.source, row).cells, self.light.dark, self.light.flat
         if cells is None or dark is None or flat is None:
             return bool(np.ptp(self._lines(row)))
         return brightness(cells, dark, flat) > LEAST * self.light.usual
@@ -119,7 +119,7 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
         return None
     if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
         return None
-    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
+    light = ViewLight.of(source, reference_groups(source) if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
     return CoarseViews(source, light, views, np.degrees(source.angles)) if views.size >= _LEAST_SEEN else None
 

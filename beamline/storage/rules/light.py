@@ -8,23 +8,26 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, lit_places, noise_of
-from beamline.monitor.odd_references import LIT
+from beamline.core.flag import Finding
+from beamline.monitor.evidence import BRIGHT, lights_in_turn, lit_places, place_noise
+from beamline.monitor.references import LIT, LIT_SIGMAS, ReferenceLimits
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
-from beamline.storage.rules import Finding
-from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure, views_differ
+from beamline.storage.readers.transforms import in_words, of_energies, selected
 from beamline.storage.rules.references import (
+    EXPOSURE_TOLERANCE,
     ReferenceGroups,
     cells_of,
     exposures_of,
     groups_taken,
     mean_cells,
     reference_groups,
+    usual_exposure,
+    views_differ,
 )
 from drivers.base.frame import FrameKind
-from recon.base.arrays import F32, F64, median_deviation
-from recon.base.noise import noise_level
+from recon.base.arrays import F32, F64, I64
+from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
@@ -35,21 +38,13 @@ WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from it
 REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
 BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
 NEAR = 0.02  # share by which a factor may be off a whole number that explains it
-LEAST_SHIFT = 4  # 14 bits in 16; half of all frames are even by chance where they hold few counts
 NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of views
-BRIGHT = 90.0  # percentile of a view's transmission where it is air, or nearest to it
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
 BELOW, OF_VIEWS = (
     0.005,
     0.25,
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
-CUT, SOLID = 0.01, 0.9  # shares: of pixels with such neighbours; of these, that hold the end; clipped noise has half
-QUARTILE = 0.3186  # of the size of normal values, in standard deviations
-SHOT = 1e-3  # of the largest count, which shot noise has at least: of a million electrons
-AS_FLATS = 0.4  # of the noise of flats, which views of less light have: without noise, the sample's edges have 0.2
-WHITE = 0.8  # change from pixel to pixel over that of the next but one: noise has 1, structure a quarter to a half
-OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
 """Limits, each with its reason."""
 
@@ -128,10 +123,9 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     """
     if source.quantity != "counts":
         return
-    groups = groups_taken(source) if accepted else reference_groups(source).good()
+    groups = groups_taken(source) if accepted else reference_groups(source)
     if not (groups.darks and groups.flats):
         return
-    yield from _counts_cut(source, groups, accepted)
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
     if not dark.any() and _change(source, groups) and not counts_photons(source):
@@ -145,7 +139,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     if not lit.any():
         return
     light = float(np.percentile((flat - dark)[lit], BRIGHT))
-    limit = max(LIT * light, BLOCK_SIGMAS * noise_of(dark))
+    limit = max(LIT * light, LIT_SIGMAS * place_noise(dark))
     views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     under = [(dark - view)[lit] for view in cells_of(source, views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
@@ -159,61 +153,6 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         yield Finding("warning" if accepted else "error", "light", sentence)
 
 
-def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> Iterator[Finding]:
-    """Counts do not end in the air of the views, and flats of one number stand for all light.
-
-    Counts end at a number that air has without the noise of the sample, or of the flats. Beside a number that stands
-    for a transmission of 1, half of the air lies below it, or no image has noise.
-    """
-    rows = np.concatenate(groups.darks), np.concatenate(groups.flats)
-    dark, flat = (np.stack(cells_of(source, some)) for some in rows)
-    some = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
-    if not some.size:
-        return
-    views, written = read_known(source, some, _middle(source)).astype(np.float64), not (np.ptp(dark) or np.ptp(flat))
-    end = float(flat.flat[0]) if written else float(np.median(views.max(axis=(1, 2))))
-    air = float(np.percentile(np.mean(cells_of(source, some), axis=0), BRIGHT))
-    noise, least = _white_noise(views, end)
-    if not (noise or written):  # where the sample varies more
-        noise = noise_level(np.where(views < end, views, np.nan).astype(np.float32))
-        noise *= noise > AS_FLATS * _change(source, groups) > 0
-    at = (views == end) & (read_known(source, rows[0][:1], _middle(source)) < end)
-    around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
-    refused = written and not accepted
-    ends = around.size > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID
-    if noise > 0 and ends:
-        sentence = (
-            f"{'Every pixel of the flats, and ' * written}{at.mean():.0%} of the pixels of the views looked at hold "
-            f"{end:g} without the noise of the others ({noise:.3g} from pixel to pixel): counts end there, they are "
-            "saturated, and the light is not known. Shorten the exposure or add a filter."
-        )
-        sentence += " --references accept uses these as they are." if refused else ""
-        yield Finding("error" if refused else "warning", "light", sentence)
-    elif (
-        written
-        and dark.any()
-        and ((ends and least > SHOT * end) or (source.dtype.kind in "ui" and abs(air / end - 1) > NEAR))
-    ):
-        sentence = (
-            f"Every pixel of the darks holds {dark.flat[0]:g} and every pixel of the flats {end:g}, which no camera "
-            f"gives; the views reach {air:.5g}. Right if both numbers are known for all pixels; else the flats are "
-            "saturated or were never exposed: give others with --flats."
-        )
-        yield Finding("warning", "light", sentence)
-
-
-def _white_noise(views: F64, end: float) -> tuple[float, float]:
-    """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more. And
-    that of the smoothest parts.
-    """
-    below = np.where(views < end, views, np.nan)
-    changes = [below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n] for n in (1, 2)]
-    near, far = (median_deviation(change) / 2 for change in changes)
-    known = np.abs(changes[0][np.isfinite(changes[0])])
-    smoothest = float(np.percentile(known, 25)) / 2 / QUARTILE if known.size else 0.0
-    return near if near > WHITE * far else 0.0, smoothest
-
-
 def _middle(source: ScanSource) -> slice:
     """Rows about the middle, in which noise is looked at."""
     middle = source.shape[0] // 2
@@ -223,7 +162,7 @@ def _middle(source: ScanSource) -> slice:
 def _change(source: ScanSource, groups: ReferenceGroups) -> float:
     """Noise of a pixel of the flats: 0 of an image that was written for them all, and where a group is a single one."""
     two = read_known(source, max(groups.flats, key=len)[:2]).astype(np.float64)
-    return median_deviation(np.diff(two - np.median(two, axis=(1, 2), keepdims=True), axis=0)) if len(two) > 1 else 0.0
+    return deviation_between_frames(two) if len(two) > 1 else 0.0
 
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
@@ -235,17 +174,10 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
     sentences = [f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."]
-    multiples = [_multiple(source, rows) for rows in (flats, views)]
-    if multiples[0] != multiples[1] and max(multiples) >= LEAST_SHIFT:
-        name, most = ("flats", multiples[0]) if multiples[0] > multiples[1] else ("views", multiples[1])
-        sentences.append(f"All counts of the {name} are multiples of {most}, others are not: counts shifted by bits.")
-    elif abs(counts[1] - counts[0] - OFFSET) < NEAR * OFFSET or abs(counts[0] - counts[1] - OFFSET) < NEAR * OFFSET:
-        sentences.append(f"They differ by {OFFSET}, as signed numbers do that were stored without a sign.")
-    else:
-        raw = max(counts) / max(min(counts), 1e-30)
-        whole = next((round(each) for each in (raw, factor) if each > 1.5 and abs(each / round(each) - 1) < NEAR), 0)
-        if whole:
-            sentences.append(f"The factor is about {whole}, as of sums of {whole} frames beside single ones.")
+    raw = max(counts) / max(min(counts), 1e-30)
+    whole = next((round(each) for each in (raw, factor) if each > 1.5 and abs(each / round(each) - 1) < NEAR), 0)
+    if whole:
+        sentences.append(f"The factor is about {whole}, as of sums of {whole} frames, or of counts shifted by bits.")
     return " ".join([*sentences, _exposures_in_words(source, flats, views)])
 
 
@@ -272,13 +204,6 @@ def without_air(source: ScanSource, mean: float) -> str:
         f"densities by up to as much; darks higher by {HIGHER:.0%} of the light raise that mean by about "
         f"{HIGHER * math.expm1(mean):.2g}. {_exposures_in_words(source, flats, views)} Compare a density that is known."
     )
-
-
-def _multiple(source: ScanSource, rows: NDArray[np.int64]) -> int:
-    """The largest power of two of which all counts of frames are multiples; 1 of real numbers."""
-    images = read_known(source, spread(rows, VIEWS))
-    common = int(np.gcd.reduce(images.astype(np.int64), axis=None)) if images.dtype.kind in "ui" else 1
-    return common & -common if common else 1
 
 
 def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
@@ -345,4 +270,75 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
             "exposures",
             f"The darks were exposed for {darks[0]:g} s and the projections for {usual:g} s: hot pixels and dark "
             "current are not the same. Take darks with the projections' exposure.",
+        )
+
+
+_IN_A_ROW, _BESIDE = 12, np.radians(20.0)  # views looked at; between them: a wide sample differs from farther sides
+_DRIFT = 0.02  # share of the light by which views may exceed their flats
+_AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
+
+
+def light_one(source: ScanSource) -> Iterator[Finding]:
+    """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
+    flats, views = (np.flatnonzero(source.image_key == kind) for kind in (FrameKind.FLAT, FrameKind.PROJECTION))
+    ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
+    if (
+        source.quantity != "counts"
+        or not flats.size
+        or views.size < _IN_A_ROW
+        or any(np.ptp(part) != _IN_A_ROW - 1 for part in ends)
+    ):
+        return
+    levels = [_light_levels(source, part) for part in ends]
+    n, change, most = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
+    beside = np.median(np.abs(np.diff(source.angles[ends[0]]))) <= _BESIDE
+    if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
+        return
+    yield Finding(
+        "error" if lights_in_turn(_light_levels(source, flats[:_IN_A_ROW])) else "warning",
+        "light",
+        f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
+        f"apart): thresholds, exposures or energies, of which a volume takes one. {_way_of_steps(source, n, most)}",
+    )
+
+
+def _way_of_steps(source: ScanSource, n: int, most: float) -> str:
+    """Which step through the views takes one of so many lights, with its flats."""
+    shares = np.array([_share_of_flats(source, slice(first, None, n), most) for first in range(n)])
+    steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
+    if not steps:
+        return f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
+    return f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
+
+
+def _light_levels(source: ScanSource, rows: I64) -> F64:
+    """Logarithms of the light of frames [frame]."""
+    darks = np.flatnonzero(source.image_key == FrameKind.DARK)
+    dark = mean_cells(source, darks) if darks.size else 0.0
+    light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in cells_of(source, rows)]
+    return np.asarray(np.log(np.maximum(light, 1e-30)), np.float64)
+
+
+def _share_of_flats(source: ScanSource, step: slice, most: float) -> float:
+    """Light of the views of a step over that of its flats; 0 where its flats differ, or are darker."""
+    keys = selected(source, step).image_key
+    flats, views = (
+        _light_levels(source, np.flatnonzero(keys == kind)[:_IN_A_ROW])
+        for kind in (FrameKind.FLAT, FrameKind.PROJECTION)
+    )
+    share = math.exp(np.median(views) - np.median(flats))
+    return share if np.ptp(flats) < most and share <= 1 + _DRIFT else 0.0
+
+
+def one_energy(source: ScanSource) -> Iterator[Finding]:
+    """All views were taken at one energy, as a volume requires."""
+    if (energies := source.energies) is None:
+        return
+    of_views = energies[source.image_key == FrameKind.PROJECTION]
+    if len(parts := of_energies(of_views)) > 1:
+        yield Finding(
+            "error",
+            "energies",
+            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume is of one. Choose it, such "
+            f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
         )

@@ -1,8 +1,8 @@
-"""Darks and flats of a file: their groups, the good groups, and findings on the others."""
+"""Evidence of a file: its darks and flats by groups, how they are exposed, which are good, and what is wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -11,79 +11,37 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.text import spans
-from beamline.monitor.digest import block_means, check_block, is_valid
-from beamline.monitor.flats_with_sample import (
-    brighter_in_places,
-    depth_over_air,
-    flats_like_views,
-    lit_places,
-    mass_missing,
-    nothing_seen,
-)
-from beamline.monitor.odd_references import without_odd
-from beamline.monitor.references import (
-    BY_CHANCE,
-    WORST,
-    Group,
-    GroupVerdict,
-    ReferenceFrame,
-    ReferenceLimits,
-    full_scale,
-    judge,
-)
+from beamline.core.flag import Finding
+from beamline.monitor.digest import block_means, check_block, is_valid, thinned
+from beamline.monitor.evidence import LEAST_NOISE, Evidence, SeenFrame, full_scale, lit_places
+from beamline.monitor.references import ReferenceLimits, judge
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules import Finding
-from beamline.storage.rules.exposures import levelled, usual_exposure, views_differ
 from drivers.base.frame import FrameKind
+from recon.base.arrays import F32, F64, I64
 from recon.base.views import spread
+from recon.prep.references import dark_at
 
-SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
 BRIGHTER = 0.02  # share of the light by which views may exceed flats: the drift of a beam
-_SORTED = 2**20  # pixels, about, whose values are counted
 CELLS = 32  # across the frame, about, by which flats are compared with views
-
-Frames = NDArray[np.int64]
+WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
+EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceGroups:
-    """Darks and flats of a scan, by groups.
+    """Darks and flats that are used, by groups, and the findings on all.
 
     Attributes:
-        darks, flats: rows of each group, in the order of the file. Frames of a group that are none (see
-            `beamline.monitor.odd_references`) are groups of their own.
-        judged: the verdict on each group, the darks first.
-        alike: views differ from good flats and from one another by less than this line integral, by noise alone; None:
-            they show something.
-        brighter: views are brighter than good flats in places, by this line integral; None: nowhere.
+        darks, flats: rows of each group, in the order of the file.
     """
 
-    darks: tuple[Frames, ...]
-    flats: tuple[Frames, ...]
-    judged: tuple[GroupVerdict, ...]
-    alike: float | None = None
-    brighter: float | None = None
-
-    def good(self) -> ReferenceGroups:
-        """The groups without a fault; for a kind without such a group, all groups."""
-        ok = [not group.faults for group in self.judged]
-        dark_ok, flat_ok = ok[: len(self.darks)], ok[len(self.darks) :]
-        return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
-
-    def lacking(self) -> tuple[GroupVerdict, ...]:
-        """The groups of a kind of which all are faulty."""
-        return tuple(
-            group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
-        )
+    darks: tuple[I64, ...]
+    flats: tuple[I64, ...]
+    findings: tuple[Finding, ...] = ()
 
 
-def _kept(groups: tuple[Frames, ...], ok: list[bool]) -> tuple[Frames, ...]:
-    return tuple(group for group, good in zip(groups, ok, strict=True) if good) if any(ok) else groups
-
-
-def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
+def groups_of(source: ScanSource, kind: FrameKind) -> tuple[I64, ...]:
     """Rows of the references of a kind, by groups: references of one part with no projection between them."""
     rows = np.flatnonzero(source.image_key == kind)
     before = np.cumsum(source.image_key == FrameKind.PROJECTION)[rows]
@@ -93,7 +51,7 @@ def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
 
 def groups_taken(source: ScanSource) -> ReferenceGroups:
     """All reference groups of a scan, faulty ones included."""
-    return ReferenceGroups(groups_of(source, FrameKind.DARK), groups_of(source, FrameKind.FLAT), ())
+    return ReferenceGroups(groups_of(source, FrameKind.DARK), groups_of(source, FrameKind.FLAT))
 
 
 # The groups of a scan, which several rules and the correction of its views ask for, and what they depend on.
@@ -101,14 +59,20 @@ _last: WeakKeyDictionary[ScanSource, tuple[tuple[object, ...], ReferenceGroups]]
 
 
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
-    """The reference groups of a scan of counts, checked frame by frame and as groups; flats are compared within their
-    part.
+    """The good references of a scan of counts, or all of a kind that has none, and the findings on all.
 
     They are judged once, until the scan grows or another of its frames turns out to be unreadable.
     """
     last = _last.get(source)
     if last is None or last[0] != _depends_on(source, limits):
-        groups = _judged(source, limits)
+        taken = groups_taken(source)
+        findings = _findings(source, taken, limits)
+        bad = [row for finding in findings if finding.severity != "error" for row in finding.frames]
+        darks, flats = (
+            tuple(left for group in groups if (left := np.setdiff1d(group, bad)).size)
+            for groups in (taken.darks, taken.flats)
+        )
+        groups = ReferenceGroups(darks, flats, findings)
         _last[source] = last = _depends_on(source, limits), groups  # with the unreadable frames that it came across
     return last[1]
 
@@ -118,50 +82,36 @@ def _depends_on(source: ScanSource, limits: ReferenceLimits | None) -> tuple[obj
     return limits, *(values.tobytes() for values in rows), tuple(source.unreadable)
 
 
-def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGroups:
-    taken = groups_taken(source)
-    groups = [_readable(source, group) for group in (*taken.darks, *taken.flats)]
-    left, odd = without_odd(groups, limits, views := _views_beside(source, taken.flats))
-    dark, lit = ([group for group in left if group[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
-    exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
-    groups_judged = [*judge([*dark, *lit], limits)[: len(dark)]]
+def _findings(source: ScanSource, taken: ReferenceGroups, limits: ReferenceLimits | None) -> tuple[Finding, ...]:
+    """Findings on references, flats beside those and the views of their part; errors where none of a kind is good."""
+    darks, found = tuple(_readable(source, group) for group in taken.darks), dict[Finding, None]()
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
-        own, seen = (
-            [group for group in lit if start <= group[0].row < end],
-            exposed[(exposed >= start) & (exposed < end)],
-        )
-        witnesses = _readable(source, spread(seen, SAMPLES)) if seen.size and own else []
-        groups_judged += judge([*dark, *own], limits, witnesses)[len(dark) :]
-    alike, brighter = None, None
-    if lit and not any(group.faults for group in groups_judged[len(dark) :]):
-        depth = depth_over_air(lit, dark, views)
-        alike, fault = nothing_seen(depth), flats_like_views(lit, dark, views, depth) or mass_missing(depth)
-        if fault is not None:
-            groups_judged = [
-                replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in groups_judged
-            ]
-        else:
-            brighter = brighter_in_places(lit, dark, views)
-    groups_judged = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in groups_judged]
-    judged = sorted([*groups_judged, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
-    rows = [np.array(group.rows, np.int64) for group in judged]
-    n = sum(group.kind is FrameKind.DARK for group in judged)
-    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged), alike, brighter)
+        flats = [group for group in taken.flats if start <= group[0] < end]
+        seen = tuple(_readable(source, group) for group in flats)
+        views = start + np.flatnonzero(source.image_key[start:end] == FrameKind.PROJECTION)
+        if flats or not taken.flats:
+            found |= dict.fromkeys(judge(Evidence((*darks, *seen), _views_beside(source, views, flats)), limits))
+    rows = {row for finding in found for row in finding.frames}
+    good = {int(source.image_key[row]) for group in (*taken.darks, *taken.flats) for row in group if row not in rows}
+    return tuple(
+        replace(each, severity="warning") if each.frames and int(source.image_key[each.frames[0]]) in good else each
+        for each in found
+    )
 
 
-def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
-    """Views of the whole scan, those taken next to flats, and those at the angles of flats, with their cells."""
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    if not views.size:
-        return []
+def _views_beside(source: ScanSource, views: I64, flats: list[I64]) -> tuple[SeenFrame, ...]:
+    """Views of the whole part, and next to its flats."""
     chosen = set(spread(views, VIEWS).tolist())
     for group in flats:
         at = int(np.searchsorted(views, group[0]))
         chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
-        angle = source.angles[group[0]]
-        if np.isfinite(angle) and np.isfinite(source.angles[views]).any():
-            chosen.add(int(views[np.nanargmin(np.abs(source.angles[views] - angle))]))
     return _readable(source, np.array(sorted(chosen), np.int64))
+
+
+def _readable(source: ScanSource, rows: I64) -> tuple[SeenFrame, ...]:
+    """Those of some frames that the file gives; all, where it gives none."""
+    read = tuple(seen_frame(source, int(row)) for row in rows)
+    return tuple(frame for frame in read if frame.row not in source.unreadable) or read
 
 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
@@ -172,68 +122,47 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
     Args:
         accepted: all are used as they are, so that a fault is a warning.
     """
-    if source.quantity != "counts":
-        return
-    groups = reference_groups(source)
-    if groups.alike is not None:
-        yield Finding(
-            "warning",
-            "bad-references",
-            f"No view looked at differs from the flats by more than noise (line integrals below {groups.alike:.2g}). "
-            "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
-            "all sides.",
-        )
-    if groups.brighter is not None:
-        yield Finding(
-            "warning",
-            "bad-references",
-            f"In places the views are brighter than the flats by {groups.brighter:.2g} of line integral, though a "
-            "sample only takes light. Was the sample, or something else, in the beam for the flats, or did the beam "
-            "change its shape?",
-        )
-    lacking = groups.lacking()
-    alike: dict[tuple[FrameKind, tuple[str, ...], bool], list[int]] = {}
-    for group in groups.judged:
-        if group.faults:
-            faults = tuple(fault.message for fault in group.faults)
-            alike.setdefault((group.kind, faults, group in lacking), []).extend(group.rows)
-    for (kind, faults, none_good), rows in alike.items():
-        name = f"{kind.name.lower()}s"
-        message = f"The {name} {spans(rows)}: {' '.join(faults)}"
-        if accepted:
-            yield Finding("warning", "bad-references", f"--references accept: {message}")
-        elif none_good:
-            message += (
-                f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
-                "--references accept` uses these as they are."
-            )
-            yield Finding("error", "bad-references", message)
-        else:
-            yield Finding("warning", "bad-references", f"{message} The other {name} are used instead.")
-
-
-def _with_unread(source: ScanSource, judged: GroupVerdict, taken: Sequence[Frames]) -> GroupVerdict:
-    """The group with frames of its own that the file does not give: who reads them leaves them out, and names them."""
-    own = next(group for group in taken if judged.rows[0] in group)
-    return replace(judged, rows=tuple(sorted({*judged.rows, *own.tolist()} & {*judged.rows, *source.unreadable})))
-
-
-def _readable(source: ScanSource, rows: Frames) -> list[ReferenceFrame]:
-    """Those of some frames that the file gives; all, where it gives none."""
-    read = [reference_frame(source, int(row)) for row in rows]
-    return [reference for reference in read if reference.row not in source.unreadable] or read
+    for finding in reference_groups(source).findings if source.quantity == "counts" else ():
+        message = finding.message
+        if finding.frames:
+            name = f"{FrameKind(int(source.image_key[finding.frames[0]])).name.lower()}s"
+            if accepted:
+                message = f"--references accept: {message}"
+            elif finding.severity == "error":
+                message += (
+                    f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
+                    "--references accept` uses these as they are."
+                )
+            else:
+                message += f" The other {name} are used instead."
+        severity = "warning" if accepted else finding.severity
+        yield replace(finding, severity=severity, rule="bad-references", message=message)
 
 
 # What was seen of frames, whose pixels do not change while the scan is open, by their rows.
-_seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDictionary()
+_seen: WeakKeyDictionary[ScanSource, dict[int, SeenFrame]] = WeakKeyDictionary()
 
 
-def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
-    """Statistics of a frame of any kind, with its cells, treated like a dark; the frame is read once."""
-    return levelled(source, _as_it_is(source, row), lambda other: _as_it_is(source, other))
+def seen_frame(source: ScanSource, row: int) -> SeenFrame:
+    """Statistics of a frame of any kind, with its cells, which is read once.
+
+    They are those with the dark of the shortest exposure and, of projections that differ, at the usual exposure.
+    """
+    frame, groups = _as_it_is(source, row), by_exposure(source, np.flatnonzero(source.image_key == FrameKind.DARK))
+    differ = views_differ(source) and groups[0][1].size > 0
+    if not frame.exposure > 0 or not (len(groups) > 1 or differ):
+        return frame
+    usual = usual_exposure(source) if differ and frame.kind is FrameKind.PROJECTION else frame.exposure
+
+    def levelled(part: str) -> F32:
+        darks = [(s, np.mean([getattr(_as_it_is(source, int(at)), part) for at in rows], axis=0)) for s, rows in groups]
+        own = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
+        return np.asarray(darks[0][1] + (getattr(frame, part) - own) * np.float32(usual / frame.exposure), np.float32)
+
+    return replace(frame, blocks=levelled("blocks"), cells=levelled("cells"), exposure=usual)
 
 
-def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
+def _as_it_is(source: ScanSource, row: int) -> SeenFrame:
     seen = _seen.setdefault(source, {})
     if row not in seen:
         seen[row] = look_at(read_known(source, [row])[0], row)
@@ -241,7 +170,60 @@ def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
     return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
 
 
-def exposures_of(source: ScanSource) -> NDArray[np.float64]:
+def look_at(image: NDArray[Any], row: int) -> SeenFrame:
+    """Statistics of an image, with its cells."""
+    counts, block = image.dtype.kind in "ui", check_block(image.shape)
+    saturated = float(np.mean(image >= full_scale(float(image.max())))) if counts else 0.0
+    blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS)))
+    invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
+    return SeenFrame(
+        row,
+        FrameKind.INVALID,
+        np.nan,
+        saturated,
+        np.array(thinned(blocks)),
+        block,
+        LEAST_NOISE * counts,
+        invalid,
+        cells,
+    )
+
+
+def mean_cells(source: ScanSource, rows: I64) -> F32:
+    """Cells of the mean of the readable frames."""
+    cells = dict(zip(rows.tolist(), cells_of(source, rows), strict=True))
+    known = [cells[row] for row in cells if row not in source.unreadable] or list(cells.values())
+    return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
+
+
+def cells_of(source: ScanSource, rows: I64) -> list[F32]:
+    """Cells of some frames, one by one."""
+    return [seen_frame(source, row).places for row in rows.tolist()]
+
+
+def usual_exposure(source: ScanSource) -> float:
+    """The median exposure of the projections in s; NaN if it is unknown."""
+    known = source.exposures[(source.image_key == FrameKind.PROJECTION) & (source.exposures > 0)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def views_differ(source: ScanSource) -> bool:
+    """Whether the exposures of the projections differ, and that of each is known."""
+    views = source.exposures[source.image_key == FrameKind.PROJECTION]
+    return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
+
+
+def by_exposure(source: ScanSource, rows: I64) -> list[tuple[float, I64]]:
+    """The rows of each exposure among these frames; one group, of NaN, if one is unknown or all have one."""
+    seconds = source.exposures[rows]
+    if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
+        return [(np.nan, rows)]
+    order = np.argsort(seconds, kind="stable")
+    edges = np.flatnonzero(np.diff(seconds[order]) > EXPOSURE_TOLERANCE * seconds[order][:-1]) + 1
+    return [(float(np.median(source.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
+
+
+def exposures_of(source: ScanSource) -> F64:
     """Exposure of each frame in s, NaN where unknown.
 
     Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the first
@@ -262,35 +244,3 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
         if each <= (1 + BRIGHTER) * most:
             return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
     return source.exposures
-
-
-def mean_cells(source: ScanSource, rows: Frames) -> NDArray[np.float32]:
-    """Cells of the mean of the readable frames."""
-    cells = dict(zip(rows.tolist(), cells_of(source, rows), strict=True))
-    known = [cells[row] for row in cells if row not in source.unreadable] or list(cells.values())
-    return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
-
-
-def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:
-    """Cells of some frames, one by one."""
-    return [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
-
-
-def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
-    """Statistics of an image, with its cells."""
-    counts = image.dtype.kind in "ui"
-    saturation = full_scale(float(image.max())) if counts else None
-    saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-    block, side = check_block(image.shape), max(1, image.shape[1] // CELLS)
-    frame = ReferenceFrame.seen(row, FrameKind.INVALID, np.nan, saturated, block_means(image, block), block)
-    frame = replace(frame, cells=block_means(image, side))
-    if image.dtype != np.uint16:
-        frame = replace(frame, invalid=1 - float(np.mean(is_valid(image))), rounding=frame.rounding * counts)
-    some = image.ravel()[:: 1 + image.size // _SORTED]
-    values, held = np.unique(some[np.isfinite(some)], return_counts=True)
-    if not held.size:
-        return frame
-    end = int(np.flatnonzero(held > min(BY_CHANCE, held.max() - 1))[-1])
-    last = counts and end == held.size - 1  # counts that thin out towards a few hot pixels do not end
-    shared = max(0, int(held[end]) - max(BY_CHANCE, 0 if last else int(held[end - 1]))) / some.size
-    return replace(frame, largest=float(values[end]), at_largest=shared)

@@ -18,9 +18,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.angles_shown import angles_shown
-from beamline.storage.rules.exposures import one_energy
-from beamline.storage.rules.light import exposures_agree, views_scaled
-from beamline.storage.rules.unlit import light_one
+from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 from recon.base.views import spread

@@ -51,7 +51,7 @@ def test_the_verdict_is_that_of_the_command(run: Path) -> None:
 
 
 def test_limits_of_a_configuration_count(run: Path) -> None:
-    few = api.monitor(run, config=run / "config.resolved.yaml", set={"monitor.dark.light": 1e-9})
+    few = api.monitor(run, config=run / "config.resolved.yaml", set={"monitor.dark.drift": 0})
     assert few.flags != api.monitor(run).flags
 
 

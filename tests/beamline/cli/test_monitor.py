@@ -61,14 +61,7 @@ def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
     result = beamline("monitor", "lit.h5")
     assert result.exit_code == 7
     assert "The darks 32-33: there is light in them" in result.stdout or "darks 0-1: there is light" in result.stdout
-    limits = (
-        "--config",
-        str(config_folder() / "demo.yaml"),
-        "--set",
-        "references.light_in_darks=0.9",
-        "--set",
-        "monitor.dark.light=0.9",
-    )
+    limits = "--config", str(config_folder() / "demo.yaml"), "--set", "references.light_in_darks=0.9"
     assert "there is light" not in beamline("monitor", "lit.h5", *limits).stdout
     assert beamline("monitor", "lit.h5", "--set", "references.light_in_darks=0.9").exit_code == 2
 

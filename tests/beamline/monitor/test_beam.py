@@ -9,12 +9,10 @@ import pytest
 from beamline.monitor.beam import PATIENCE, BeamCheck
 from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, ScanContext
-from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest as frame_digest
 from beamline.monitor.view import grid_of, view_of
-from beamline.monitor.watch import look, start
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.monitor.blobs import BLOCK, STEP, Blobs
+from tests.beamline.monitor.blobs import STEP, Blobs
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -33,35 +31,6 @@ def test_a_drift_against_the_flats_is_said_when_it_reaches_the_limit_and_twice_t
     assert flags[0].frame - 10 == pytest.approx(0.02 / abs(rate), abs=10)
     assert flags[0].score == pytest.approx(-rate * (flags[0].frame - 10), abs=0.003)
     assert f"{'less' if rate < 0 else 'more'} light than in the flats" in flags[0].advice
-
-
-def over_scan(views: int, **more: Any) -> tuple[list[Flag], str]:
-    """All flags, and what is said of the light over the scan."""
-    monitor, found = start(ScanContext(65535, 2048 * BLOCK**2, 0.1), CHECKS), list[Flag]()
-    for frame, digest in Blobs(views, **more).frames():
-        monitor, flags = look(monitor, frame, digest)
-        found += flags
-    return found, monitor.drift()
-
-
-@pytest.mark.parametrize("percent", [-9.0, 3.0])
-def test_the_drift_over_the_scan_is_stated_and_no_other_check_takes_it_for_the_sample(percent: float) -> None:
-    flags, said = over_scan(120, counts=lambda view, image: image * (1 + percent / 100 * view / 119))
-    assert f"The light {'fell' if percent < 0 else 'rose'} by" in said
-    assert float(said.split("by ")[1].split("%")[0]) == pytest.approx(abs(percent), rel=0.1)
-    assert {flag.check for flag in flags} - {"pixels"} == {"beam"}  # the scan has previews and no pixels
-    assert not [flag for flag in flags if "covers all of it" in flag.advice]
-
-
-def test_a_beam_that_is_topped_up_within_the_scan_is_stated_with_its_least_and_most() -> None:
-    _, said = over_scan(120, counts=lambda view, image: image * (1 - 0.06 * (view % 54) / 53))
-    assert "lie between its least and its most" in said
-    assert float(said.split("); ")[1].split("%")[0]) == pytest.approx(6, abs=0.6)
-
-
-def test_light_that_stays_is_not_stated() -> None:
-    assert over_scan(80)[1] == ""
-    assert over_scan(80, depth=lambda view, image: image + 0.5)[1] == ""  # nor where there is no air
 
 
 def test_a_drift_that_went_and_comes_again_is_said_again() -> None:

@@ -142,15 +142,6 @@ def test_triggers_whose_views_are_stored_are_not_missing(fake: Any) -> None:
     assert [f.score for f in fake.of("timing", frames, stored=frozenset({4, 6}))] == [1]
 
 
-def test_an_open_shutter_shows_at_the_first_flat_and_in_darks_at_the_end(fake: Any) -> None:
-    assert [f.frame for f in fake.of("dark", fake.flats() + fake.views(3) + fake.darks(2, light=0.9))] == [8, 9]
-    fake.row = 0
-    flags = fake.of("dark", fake.darks(light=1.0) + fake.flats())
-    assert [(f.frame, f.level) for f in flags] == [(5, Level.ALARM)]
-    assert flags[0].score == pytest.approx(1.0, abs=0.01)
-    assert "shutter" in flags[0].advice
-
-
 @pytest.mark.parametrize(("drift", "found"), [(4, 0), (-4, 0), (6, 2), (-20, 2)])
 def test_drifting_darks(fake: Any, drift: float, found: int) -> None:
     late = [replace(f, counts=(f.counts.astype(int) + drift).astype("uint16")) for f in fake.darks(2)]
@@ -194,19 +185,6 @@ def test_light_on_a_part_of_the_dark_is_still_seen(rng: np.random.Generator, pre
     (flag,) = flags_of(frames, preview_bin)
     assert (flag.frame, flag.level) == (4, Level.WARN)
     assert 5 < flag.score < 40 / 3
-
-
-@pytest.mark.parametrize(("photons", "found"), [(8.0, 0), (0.0, 1)])
-def test_an_offset_under_few_photons_is_no_light(photons: float, found: int) -> None:
-    """8 photons of a count each beside 2 counts of readout are light; none at all is a shutter in the wrong state."""
-    rng = np.random.default_rng(4)
-    frames = [
-        replace(frame, kind=kind, counts=(100 + rng.poisson(light, (32, 48)) + rng.normal(0, 2, (32, 48))).astype("u2"))
-        for frame, kind, light in zip(
-            small_darks(2, rng), (FrameKind.DARK, FrameKind.FLAT), (0.0, photons), strict=True
-        )
-    ]
-    assert len(flags_of(frames, 4)) == len(flags_of(frames[::-1], 4)) == found
 
 
 def lost(scan: Blobs) -> list[Flag]:

@@ -24,7 +24,7 @@ from beamline.core.events import Event, Warned
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
-from beamline.projections.replay import context_of, judged_flags, replay, verdict
+from beamline.projections.replay import context_of, judged_flags, replay
 from beamline.scan.recorder import Consequences, Recorder
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
@@ -32,7 +32,6 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.monitor.conftest import FakeScan
 
 DARK, OPEN, BITS = 100, 3000.0, 12  # counts of a camera whose range ends at 4095
 PERIOD, REFERENCES = 0.1, 3
@@ -169,22 +168,6 @@ def test_the_many_flags_of_the_troubled_scan_do_not_depend_on_the_preview(tmp_pa
     checks = {flag.check for flag in found}
     assert len(checks) >= 5 and {"saturation", "stuck"} <= checks
     assert others == [found, found]
-
-
-def test_a_run_and_its_file_state_the_same_drift_of_the_light(tmp_path: Path) -> None:
-    scan, path = FakeScan(), tmp_path / "scan.h5"
-    frames = scan.references() + [scan.views(1, first=i, light=1 - 0.09 * i / 89)[0] for i in range(90)]
-    shape, events = frames[0].counts.shape, list[Event]()
-    with NXtomoWriter(path, ScanInfo("s", saturation=65535), shape, clock=SystemClock(), preview_bin=8) as writer:
-        monitor, timeline = start(ScanContext(65535, shape[0] * shape[1])), FakeInstrument().timeline()
-        recorder = Recorder(writer, monitor, timeline, preview_bin=8, sink=events.append)
-        for frame in frames:
-            recorder.put(frame)
-        recorder.finish()
-    with open_scan(path) as source:
-        said = verdict(source, list(replay(source))).drift
-    assert recorder.drift == said
-    assert float(said.split("The light fell by ")[1].split("%")[0]) == pytest.approx(9, abs=0.9)
 
 
 @pytest.mark.slow

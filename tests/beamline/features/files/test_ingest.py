@@ -82,7 +82,7 @@ def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.
         assert (source.quantity, source.attributes["sample"]) == ("counts", "rock")
         np.testing.assert_array_equal(source.read(slice(3, None)), pages)
     told = {finding.rule for finding in validate(tmp_path / "out.h5")}
-    assert told == {"stuck-frames", "constant-darks", "light"}  # flats and darks are of one number
+    assert told == {"stuck-frames", "constant-darks"}  # flats and darks are of one number
 
 
 def test_a_scan_of_ours_can_be_ingested_again(

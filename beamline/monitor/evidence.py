@@ -1,0 +1,229 @@
+"""Evidence: what darks, flats and some views show, frame by frame, of a running scan and of a file alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.digest import FrameDigest, thinned
+from drivers.base.frame import FrameKind
+from recon.base.arrays import F32, Mask
+from recon.base.noise import deviation_between_frames, deviation_between_neighbours
+
+LEAST_NOISE = 0.5  # counts: what rounding hides
+BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
+UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
+LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
+ZINGER = 12.0  # times the median change: more is not noise
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """Statistics of a dark, a flat or a view.
+
+    Attributes:
+        row: in the file.
+        exposure: s, NaN where unknown.
+        saturated: fraction of the pixels at or above the saturation value.
+        blocks: float32, means of blocks of pixels; a part of the preview where that is large.
+        block: pixels a side of a block.
+        rounding: noise that the pixels' type may hide; 0 of real numbers.
+        invalid: fraction of the pixels that are not finite.
+        cells: float32, means of larger blocks that cover the frame; None: not needed.
+    """
+
+    row: int
+    kind: FrameKind
+    exposure: float
+    saturated: float
+    blocks: F32
+    block: int
+    rounding: float = LEAST_NOISE
+    invalid: float = 0.0
+    cells: F32 | None = None
+
+    @classmethod
+    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> SeenFrame:
+        """Of the digest of a running scan."""
+        return cls(row, kind, exposure, digest.saturated_fraction, np.array(thinned(digest.preview)), block)
+
+    @property
+    def seconds(self) -> float:
+        """The exposure, or 1 where it is not known."""
+        return self.exposure if self.exposure > 0 else 1.0
+
+    @property
+    def rounded_exposure(self) -> float:
+        """As cameras state one exposure; 0 where it is not known."""
+        return round(self.exposure, 6) if self.exposure > 0 else 0.0
+
+    @property
+    def pixels(self) -> int:
+        """About their number: blocks go beyond the edge."""
+        return self.blocks.size * self.block**2
+
+    @property
+    def blank(self) -> bool:
+        """Whether no pixel holds a number."""
+        return bool(np.isnan(self.blocks).all())
+
+    @property
+    def even(self) -> bool:
+        """Whether all blocks hold one number."""
+        known = self.blocks[np.isfinite(self.blocks)]
+        return not (known.size and np.ptp(known) > 0)
+
+    @property
+    def places(self) -> F32:
+        """The cells, or the blocks where there are none."""
+        return self.blocks if self.cells is None else self.cells
+
+
+Group = Sequence[SeenFrame]
+
+
+class Odd(NamedTuple):
+    """Frames of a group that cannot be used: the figure, the limit that it violates, and both in words, with advice.
+
+    Without frames it is said of all.
+    """
+
+    frames: Group
+    score: float
+    limit: float
+    sentence: str
+
+
+def figures(scores: Iterable[float]) -> str:
+    """The least and the largest in words."""
+    low, high = f"{min(scores):.3g}", f"{max(scores):.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Darks and flats by groups, of one kind each and in the order of the file, and some views."""
+
+    groups: tuple[tuple[SeenFrame, ...], ...] = ()
+    views: tuple[SeenFrame, ...] = ()
+
+    def of_kind(self, kind: FrameKind) -> list[Group]:
+        """The groups of darks, or of flats."""
+        return [group for group in self.groups if group[0].kind is kind]
+
+    def frames(self, kind: FrameKind) -> list[SeenFrame]:
+        """All darks, or all flats."""
+        return [frame for group in self.of_kind(kind) for frame in group]
+
+    @cached_property
+    def darkest(self) -> Group:
+        """The darks with the lowest level; empty without any."""
+        return min(self.of_kind(FrameKind.DARK), key=level, default=())
+
+    @cached_property
+    def brightest(self) -> Group:
+        """The flats with the most light; empty without any."""
+        return max(self.of_kind(FrameKind.FLAT), key=self.light_of, default=())
+
+    def light_of(self, group: Group) -> float:
+        """Counts of the bright part above the darks, a second where the exposure is known."""
+        dark = level(self.darkest) if self.darkest else 0.0
+        return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
+
+    def with_frame(self, frame: SeenFrame, begins: bool) -> Evidence:
+        """With the next frame of the scan; a dark or a flat may begin a group."""
+        if frame.kind is FrameKind.PROJECTION:
+            return replace(self, views=(*self.views, frame))
+        begins = begins or not self.groups or self.groups[-1][0].kind is not frame.kind
+        *before, last = (*self.groups, ()) if begins else self.groups
+        return replace(self, groups=(*before, (*last, frame)))
+
+    def without(self, rows: set[int]) -> Evidence:
+        """Without some frames, and without groups that they leave empty."""
+        groups = (tuple(frame for frame in group if frame.row not in rows) for group in self.groups)
+        views = tuple(view for view in self.views if view.row not in rows)
+        return Evidence(tuple(group for group in groups if group), views)
+
+    @cached_property
+    def base(self) -> F32 | float:
+        """Counts without light at the places of the frames, the mean of all darks; 0 without any."""
+        darks = [frame.places for frame in self.frames(FrameKind.DARK)]
+        return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
+
+    def light(self, frame: SeenFrame) -> F32:
+        """Counts of a frame above the darks, at its places."""
+        return np.asarray(np.nan_to_num(frame.places - self.base), np.float32)
+
+    @cached_property
+    def lit_views(self) -> list[SeenFrame]:
+        """The views with more light than with a closed shutter, and more than one value."""
+        light = [float(np.percentile(self.light(view), BRIGHT)) for view in self.views]
+        least = UNLIT * max(light, default=0.0)
+        return [view for view, bright in zip(self.views, light, strict=True) if bright > least and not view.even]
+
+
+def level(group: Group) -> float:
+    """Counts in the bright part of a frame: a beam may be narrower than the detector."""
+    return float(np.median([np.nanpercentile(frame.blocks, BRIGHT) for frame in group]))
+
+
+def offset(darks: Group | None) -> F32 | float:
+    """Mean counts of the blocks without light."""
+    return np.asarray(np.mean([dark.blocks for dark in darks], axis=0)) if darks else 0.0
+
+
+def pixel_noise(group: Group) -> float:
+    """Standard deviation of a pixel from frame to frame; of a single frame, from place to place."""
+    return deviation_between_frames(np.stack([frame.blocks for frame in group])) * group[0].block
+
+
+def place_noise(values: NDArray[np.floating]) -> float:
+    """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
+    return deviation_between_neighbours(values, 2)
+
+
+def lit_places(light: F32) -> Mask:
+    """Mask of the places where images of the beam have light."""
+    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
+
+
+def photons(flats: Group, darks: Group) -> float | None:
+    """Median number of photons in a lit pixel of the flats: light squared over the variance that it adds.
+
+    Photon transfer (Janesick 2007), of what changes from frame to frame between neighbouring blocks: a beam that
+    flickers or moves is no noise. None where frames or blocks are too few, or the flats have no noise by their light.
+    """
+    light = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
+    lit = light > UNLIT * float(np.nanpercentile(light, BRIGHT))
+    beside = lit[:, 1:] & lit[:, :-1]
+    if len(flats) < 2 or (len(flats) - 1) * beside.sum() < LEAST_BLOCKS:
+        return None
+    levels = np.array([np.median((flat.blocks - offset(darks))[lit]) for flat in flats])
+    even = np.stack([flat.blocks for flat in flats]) * (levels.mean() / levels)[:, None, None].astype(np.float32)
+    change = np.diff(np.diff(even, axis=0), axis=2)[:, beside]
+    squares = change.astype(np.float64) ** 2
+    variance = float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 4 * flats[0].block ** 2
+    brought = variance - pixel_noise(darks) ** 2
+    return float(np.median(light[lit]) * light[lit].mean()) / brought if brought > 0 else None
+
+
+def full_scale(largest: float) -> float:
+    """The saturation count of a detector, estimated from its largest count: the end of its 8, 10, 12, 14 or 16 bits."""
+    return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
+
+
+def lights_in_turn(levels: NDArray[np.floating]) -> int:
+    """How many lights frames in a row [frame] have in turn, 2 or 3; 0: their light does not change so.
+
+    They do where the change to the next frame of the same light is a third at most: of a drift it is more.
+    """
+    for n in range(2, min(3, levels.size // 2) + 1):
+        between = float(np.ptp([np.median(levels[first::n]) for first in range(n)]))
+        if between > 3.0 * float(np.abs(levels[n:] - levels[:-n]).max()):
+            return n
+    return 0

@@ -1,0 +1,227 @@
+"""Flats with the sample in the beam: they look like views, or leave the views without the matter that turns in them.
+
+Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from beamline.monitor.evidence import BRIGHT, Evidence, Odd, lit_places, place_noise
+from drivers.base.frame import FrameKind
+from recon.base.arrays import F32, F64, Mask
+
+SIGMAS = 8.0  # standard deviations of a place
+WORST = 99.0  # percentile of the places that counts, so that zingers do not
+LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
+CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
+BRIGHTER = 0.5  # flats hold the sample where places outshine them by this share of what the views take elsewhere
+LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
+DRIFTS = 0.02  # of the light: a beam may drift by so much (as in the check `beam`), so a weaker sample is not judged
+AIR = 0.1  # line integral at the edges of the field from which they are no air
+EDGE = 16  # one column in so many, at each edge, is taken for air
+FEWEST, SHALLOW = 8, 10.0  # lit views at least, and percent of them that may be taken for the emptiest at a place
+OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further below
+
+
+def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[Odd]]:
+    """The rule that flats differ less from a view than from other flats: each from those of its group, or groups."""
+    return partial(_like_views, single=single)
+
+
+def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[Odd]:
+    views, groups = evidence.lit_views, evidence.of_kind(FrameKind.FLAT)
+    if len(views) < FEWEST:
+        return
+    seen, light = [evidence.light(view) for view in views], [[evidence.light(flat) for flat in each] for each in groups]
+    if single:  # of two flats each is the other one's only witness
+        compared = [
+            ([group[i]], own[i], [np.median(rest, axis=0)])
+            for group, own in zip(groups, light, strict=True)
+            for i in range(len(group))
+            if (rest := own[:i] + own[i + 1 :])
+        ]
+    else:
+        means = [np.mean(own, axis=0) for own in light]
+        compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
+    beside, odd = "others of their group" if single else "other flats", list[Odd]()
+    for frames, image, others in compared:
+        if others and (found := _nearest_view(image, others, seen)) is not None:
+            off, like, nearest = found
+            odd.append(Odd(frames, off, like / LIKER, (
+                f"they differ from the {beside} by {off:.3g} of line integral, and by {like:.2g} only from the view in "
+                f"frame {views[nearest].row}: the sample was in the beam."
+            )))  # fmt: skip
+    if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
+        yield from odd
+
+
+def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tuple[float, float, int] | None:
+    """How much a flat differs from the most similar other flat and from the most similar view, and the number of that
+    view; None if the flat does not show the sample."""
+    lit = lit_places(np.maximum.reduce([image, *others]))
+    off = _beyond_noise(min((log_ratio(image, other, lit) for other in others), key=_spread))
+    like = [_beyond_noise(log_ratio(image, view, lit)) for view in views] if off > 0 else [np.inf]
+    nearest = int(np.argmin(like))
+    return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
+
+
+class Emptiest(NamedTuple):
+    """How much brighter than each group of flats [group] views are where they are emptiest, as line integrals.
+
+    Attributes:
+        tops: in their brightest places; an open beam: 0.
+        edges: at the edge of the field where it is least.
+        unlike: by which each group differs in places from that with the least top, but for a factor.
+        limit: what noise does not reach.
+    """
+
+    tops: F64
+    edges: F64
+    unlike: F64
+    limit: float
+
+
+def _emptiest(evidence: Evidence) -> Emptiest | None:
+    views = [evidence.light(view) for view in evidence.lit_views]
+    light = [
+        np.asarray(np.mean([evidence.light(flat) for flat in group], axis=0), np.float32)
+        for group in evidence.of_kind(FrameKind.FLAT)
+    ]
+    lit = lit_places(np.maximum.reduce(light))
+    if len(views) < FEWEST or not lit.any():
+        return None
+    over = [np.percentile([log_ratio(view, each, lit) for view in views], 100 - SHALLOW, axis=0) for each in light]
+    tops = np.percentile(over, WORST, axis=1)
+    columns, n = np.nonzero(lit)[1], max(1, lit.shape[1] // EDGE)
+    sides = [columns < columns.min() + n, columns > columns.max() - n]
+    edges = np.min([np.median(np.array(over)[:, side], axis=1) for side in sides], axis=0)
+    changes = [log_ratio(each, light[int(np.argmin(tops))], lit) for each in light]
+    unlike = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
+    return Emptiest(tops, edges, unlike, max(AIR, SIGMAS * max(place_noise(change) for change in changes)))
+
+
+def outshone(evidence: Evidence, _: Any) -> Iterator[Odd]:
+    """Groups of flats that are darker than views in places where other flats are not: an object was in the beam.
+
+    Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
+    """
+    groups = evidence.of_kind(FrameKind.FLAT)
+    if len(groups) < 2 or (seen := _emptiest(evidence)) is None:
+        return
+    least = float(seen.tops.min())
+    for group, top, unlike in zip(groups, seen.tops.tolist(), seen.unlike.tolist(), strict=True):
+        if min(top, top - least, unlike) > seen.limit:
+            yield Odd(group, top, seen.limit, (
+                f"in places the views are brighter than they by {top:.3g} of line integral (limit {seen.limit:.2g}), "
+                f"and than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
+                "something else, was in the beam."
+            ))  # fmt: skip
+
+
+def views_brighter(evidence: Evidence, _: Any) -> Iterator[Odd]:
+    """Views are brighter than flats in places, and less at the edges."""
+    if (seen := _emptiest(evidence)) is not None:
+        most = int(np.argmax(seen.tops))
+        top = float(seen.tops[most])
+        if min(top, top - float(seen.edges[most])) > seen.limit:
+            yield Odd((), top, seen.limit, (
+                f"In places the views are brighter than the flats by {top:.2g} of line integral, though a sample only "
+                "takes light. Was the sample, or something else, in the beam for the flats, or did the beam change its "
+                "shape?"
+            ))  # fmt: skip
+
+
+def mass_missing(evidence: Evidence, _: Any) -> Iterator[Odd]:
+    """All flats show the sample, even at an angle of no view or displaced.
+
+    A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
+    as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
+    differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
+    """
+    if (depth := _depth_over_air(evidence)) is None:
+        return
+    flats = evidence.frames(FrameKind.FLAT)
+    mean = depth.mean(axis=0)
+    brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
+    if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
+        yield Odd(flats, brighter, limit, (
+            f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
+            "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
+            "shape between flats and views."
+        ))  # fmt: skip
+        return
+    turning = depth - mean
+    deepest = -np.percentile(turning, SHALLOW, axis=0) - OF_SHALLOW * place_noise(turning)
+    masses, least = depth.mean(axis=(1, 2)), float(deepest.mean())
+    seen = float(masses.mean())
+    if np.percentile(deepest, WORST) > DRIFTS and LIGHTER * least - seen > SIGMAS * float(masses.std()):
+        yield Odd(flats, seen, LIGHTER * least, (
+            f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but "
+            f"against these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
+        ))  # fmt: skip
+
+
+def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[Odd]:
+    """Views differ from flats and from one another by noise alone."""
+    if (depth := _depth_over_air(evidence)) is None:
+        return
+    mean = depth.mean(axis=0)
+    limits = [SIGMAS * place_noise(part) for part in (mean, depth - mean)]
+    shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
+    if all(most < limit for most, limit in zip(shown, limits, strict=True)):
+        yield Odd((), max(shown), max(limits), (
+            f"No view looked at differs from the flats by more than noise (line integrals below {max(shown):.2g}). "
+            "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
+            "all sides."
+        ))  # fmt: skip
+
+
+def _depth_over_air(evidence: Evidence) -> F64 | None:
+    """Line integrals [view, row, col] of places, less the straight line between the edges of each row.
+
+    Only views that have air there; None where they or places are too few.
+    """
+    light = np.mean([evidence.light(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
+    lit = lit_places(light)
+    rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
+    cols = np.flatnonzero(lit[rows].all(axis=0))
+    views = evidence.lit_views
+    if len(views) < FEWEST or not rows.size or cols.size < EDGE:
+        return None
+    part = np.ix_(rows, cols)
+    every = np.ones(light[part].shape, np.bool_)
+    seen = (log_ratio(evidence.light(view)[part], light[part], every).reshape(every.shape) for view in views)
+    depth = -np.stack(list(seen))
+    n = max(1, cols.size // EDGE)
+    left, right = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)
+    air = np.percentile(np.abs(np.concatenate([left, right], axis=1)), WORST, axis=1) < AIR
+    along = (np.arange(cols.size) - (n - 1) / 2) / (cols.size - n)
+    depth = depth - (left[..., None] + (right - left)[..., None] * along)
+    return np.asarray(depth[air], np.float64) if air.sum() >= FEWEST else None
+
+
+def log_ratio(image: F32, other: F32, lit: Mask) -> F32:
+    """Logarithm of the one over the other where there is light; what has none counts as a thousandth."""
+    least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
+    least = max(least, 1e-30)
+    return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+
+
+def _spread(values: F32) -> float:
+    """Standard deviation without the outermost values."""
+    if not values.size:
+        return 0.0
+    low, high = np.percentile(values, (CLIPPED, 100 - CLIPPED))
+    return float(np.clip(values, low, high).std())
+
+
+def _beyond_noise(values: F32) -> float:
+    """Their spread without the noise; 0 where it may all be noise."""
+    spread, noise = _spread(values), place_noise(values)
+    chance = 1 + SIGMAS * (2 / max(values.size, 1)) ** 0.5
+    return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0
