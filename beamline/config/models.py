@@ -236,7 +236,7 @@ class Speed(Section):
 
 
 class SimulationSection(Section):
-    """Only with simulated devices."""
+    """Of simulated devices, and of the rehearsal of a real instrument, which ignores it otherwise."""
 
     scene: str | dict[str, Any] = Field(
         default="scenes/battery.yaml",
@@ -276,8 +276,6 @@ class Config(Section):
             raise ValueError(
                 "devices.camera: simulated devices need a simulation section; `simulation: {}` takes its defaults"
             )
-        if self.simulation is not None and not any(simulated.values()):
-            raise ValueError("simulation: belongs to simulated devices, and every device is real; remove the section")
         return self
 
     @model_validator(mode="after")
