@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from beamline.core.text import safe_name
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
-from beamline.reconstruct.option_rules import OF_ONE_VOLUME
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
@@ -116,14 +115,10 @@ class EnergyScans:
         """Open the first scan."""
         return self.scans[0].open(follow=follow)
 
-    def refuse(self, method: Method, given: Collection[str]) -> None:
-        """Raise ConfigError for a method of one scan, or of other materials, and for options of one volume."""
+    def refuse(self, method: Method) -> None:
+        """Raise ConfigError for a method of one scan, or of other materials."""
         if not method.traits.by_energy:
             raise ConfigError(f"{method.name} takes one scan. Choose another method. Nothing was read.")
-        for name in (name for name in OF_ONE_VOLUME if name in given):
-            raise ConfigError(
-                f"--{name} does not go with several energies: {OF_ONE_VOLUME[name]}. Nothing was computed."
-            )
         if volume_names_of(method) != self.spectra.names:
             raise ConfigError(
                 f"{method.name} is of {', '.join(volume_names_of(method))}, {self.spectra.path} of "

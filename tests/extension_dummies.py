@@ -62,7 +62,7 @@ import recon
 from click.testing import CliRunner
 from beamline.cli.recon import recon as command
 from beamline.features.trials.command import tradeoff
-from beamline.reconstruct.option_rules import RULES, takers
+from recon.methods import taking
 from beamline.reconstruct.outcome import label_of
 from beamline.features.trials.front import pareto_plot
 from beamline.features.trials.tradeoff import plan
@@ -79,7 +79,7 @@ assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers(RULES["iterations"]) and "grey" not in takers(RULES["tv-weight"])
+assert "grey" in taking("iterations") and "grey" not in taking("tv_weight")
 assert label_of("grey") == "Grey"
 """,
 )

@@ -14,9 +14,16 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
-from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, rules_of
-from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
+from beamline.cli.method_options import (
+    SLABS_RESUMED,
+    method_with,
+    preset_of,
+    refuse_other_methods,
+    settings_of,
+    slabs_resumed,
+)
+from beamline.cli.options import declared, json_events, refuse_contradictions, refuse_shared
+from beamline.cli.recipe import Grouped, names_given, recipe_text, typed_line
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
@@ -28,7 +35,6 @@ from beamline.core.process import EndsWithParent
 from beamline.core.sinks import fan_out, sentence, while_it_works
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import printable, safe_name
-from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME, streams
@@ -156,7 +162,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
         "checkpoints": CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
         "enough": None if goal == (None, None) else Goal(*goal), "partial": partial,
         "follow": FollowTiming() if values["follow"] else None, "recipe": recipe_text(context, method),
-        "command": repeating(context, file, path, () if partial is None else ("resume",)),
+        "command": typed_line(context),
     })  # fmt: skip
 
 
@@ -169,18 +175,17 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     Raises:
         UsageError: they do not.
     """
-    asked, rules, values = names_given(context), rules_of(context.command), context.params
+    asked, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
         asked = asked - {"resume"} | {SLABS_RESUMED}
     method = preset_of(values["method"], values["preset"])
     stated = method is not None
     if method is None:
-        of_a_method = {name for name, rule in rules.items() if rule.of_methods}
+        of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.trait}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
         method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
-    if why := of_other_methods(rules, asked, method, stated=stated):
-        raise click.UsageError(why)
+    refuse_other_methods(context.command, asked, method, stated=stated)
     for step in chosen_steps(values) if values["follow"] and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)

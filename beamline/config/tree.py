@@ -189,8 +189,8 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         others = [key for key in _value(data, path[:-1]) if key not in keys]
         if len(others) > 2:
             return (
-                f"{'.'.join(map(str, path[:-1]))}: {', '.join(others)} are no keys of this kind; leave them out. A real "
-                "configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
+                f"{'.'.join(map(str, path[:-1]))}: {', '.join(others)} are no keys of this kind; leave them out. A "
+                "real configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
             )
         return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
     branches = declared_at(schema, path, data)

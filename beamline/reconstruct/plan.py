@@ -276,9 +276,8 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
-    options.refuse_contradictions()
     if isinstance(options.source, SeveralScans):
-        options.source.refuse(options.method, options.given)
+        options.source.refuse(options.method)
     elif options.method.traits.by_energy:
         wanted = "scans at several energies, and spectra of the materials"
         raise ConfigError(f"{options.method.name} takes {wanted}. Choose another method. Nothing was read.")

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.options import (
-    FiniteRange,
     NameChoice,
-    WholeRange,
     dataset_option,
     json_option,
     parsed,
@@ -140,11 +138,11 @@ class ExportRequest:
         help="A film of the slices along an axis, or of the views of a SCAN by angle. An .mp4 needs ffmpeg.",
     )
     fps: float = set_by(
-        "--fps", type=FiniteRange(0.1, 100), default=20.0, show_default=True, needs=("film", "is of --film."),
+        "--fps", type=click.FloatRange(0.1, 100), default=20.0, show_default=True, needs=("film", "is of --film."),
         help="Of a film: images a second. A .gif takes the nearest that it can state: 50, 33.3, 25, 20 ...",
     )  # fmt: skip
     side: int = set_by(
-        "--side", type=WholeRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
+        "--side", type=click.IntRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
         help="Of a film: pixels of an image's longer side, at most; pixels are averaged, never enlarged.",
     )  # fmt: skip
     gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
@@ -154,7 +152,7 @@ class ExportRequest:
         help="Write displacement, roll and tilt of the volume's views as a .csv that --poses reads.",
     )
     at: int | None = set_by(
-        "--at", type=WholeRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
+        "--at", type=click.IntRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)

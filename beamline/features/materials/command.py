@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.options import dry_option, json_option, names_in, option, refuse_shared
-from beamline.cli.recipe import DATA, OUTPUT, RESOURCES, Grouped, heading, repeating
+from beamline.cli.recipe import DATA, OUTPUT, RESOURCES, Grouped, heading, typed_line
 from beamline.cli.recon import dry_run, run_reconstruction
 from beamline.cli.recon_options import memory_option, report_option, unfinished_option
 from beamline.cli.selection_options import chosen, selection_options
@@ -102,7 +102,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, **values: An
         method,
         unfinished=values["unfinished"],
         memory=values["memory"],
-        command=repeating(click.get_current_context(), files, output),
+        command=typed_line(click.get_current_context()),
     )
     if values["dry"]:
         dry_run(options, SystemClock(), values["as_json"])

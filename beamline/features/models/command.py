@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from beamline.cli.options import (
     POSITIVE,
-    FiniteRange,
     NameChoice,
     dataset_option,
     json_option,
@@ -202,7 +201,7 @@ def _mesh_path(text: str) -> Path:
 @volume_argument
 @click.option("-o", "--output", metavar="PATH", callback=parsed(_mesh_path), required=True,
               help=f"Its suffix names the format: {', '.join(MESHES)}.")  # fmt: skip
-@click.option("--level", type=FiniteRange(), help="Value at the surface. Default: half-way between air and matter.")
+@click.option("--level", type=float, help="Value at the surface. Default: half-way between air and matter.")
 @click.option("--from", "source", type=NameChoice(["volume", "gaussians"]), default="volume", show_default=True,
               help="The voxels, or the Gaussians behind them: a fit before its finish.")  # fmt: skip
 @dataset_option

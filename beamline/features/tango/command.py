@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.options import WholeRange, parsed, say
+from beamline.cli.options import parsed, say
 from beamline.core.files import RUNS
 
 
@@ -31,7 +31,7 @@ _NAME: Callable[..., str] = parsed(device_name)
     "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
 )
 @click.option(
-    "--port", default=10100, show_default=True, type=WholeRange(1024, 65535),
+    "--port", default=10100, show_default=True, type=click.IntRange(1024, 65535),
     help="TCP port to listen at.",
 )  # fmt: skip
 @click.option(

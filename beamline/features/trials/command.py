@@ -16,7 +16,6 @@ from beamline.cli.options import (
     POSITIVE,
     MethodChoice,
     NameChoice,
-    WholeRange,
     dry_option,
     json_option,
     names_in,
@@ -30,7 +29,7 @@ from beamline.cli.options import (
     unknown_method,
     with_request,
 )
-from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
+from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, typed_line
 from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
 from beamline.cli.terminal import answering, events_shown
 from beamline.core.errors import ScanStopped
@@ -78,7 +77,7 @@ class TradeoffRequest:
         heading(METHOD),
         "--time",
         excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
-        type=WholeRange(min=2),
+        type=click.IntRange(min=2),
         metavar="N",
         help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
     )
@@ -167,7 +166,7 @@ def tradeoff(request: TradeoffRequest) -> None:
         scan = ComparedScan(
             source, selection, folder, request.methods or (), request.truth,
             light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds,
-            request.max_seconds, request.seed, repeating(context, files, folder),
+            request.max_seconds, request.seed, typed_line(context),
         )  # fmt: skip
         plan = partial(
             planned_tradeoff,
@@ -235,7 +234,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=WholeRange(min=1, max=100),
+        type=click.IntRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",
@@ -277,7 +276,7 @@ def study(request: StudyRequest) -> None:
     scan = ComparedScan(
         source, selection, folder, methods, request.truth,
         light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds, seed=request.seed,
-        command=repeating(context, request.file, folder),
+        command=typed_line(context),
     )  # fmt: skip
     asked = STUDIES[request.which]
     plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)

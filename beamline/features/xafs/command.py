@@ -14,7 +14,6 @@ import click
 from beamline.cli.options import (
     POSITIVE,
     SEED,
-    FiniteRange,
     NameChoice,
     json_events,
     parsed,
@@ -74,7 +73,7 @@ def charges_of(value: str) -> tuple[float, ...]:
 @click.option("--material", metavar="NAME", help="Material of the scene. Default: the one with a state of charge.")
 @click.option(
     "--angle",
-    type=FiniteRange(min=-360, max=360),
+    type=click.FloatRange(min=-360, max=360),
     metavar="DEG",
     help="Angle of the scene's stage. Default: 0.",
 )
@@ -125,7 +124,7 @@ def charges_of(value: str) -> tuple[float, ...]:
 )
 @click.option(
     "--least",
-    type=FiniteRange(min=0, min_open=True),
+    type=click.FloatRange(min=0, min_open=True),
     help="With --volume: lowest sum of fractions that is mapped. Default: 0.5.",
 )
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")

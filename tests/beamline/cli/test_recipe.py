@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from beamline.cli import recon as log
-from beamline.cli.recipe import repeating
-from beamline.features.particles.command import segment
-from beamline.features.trials.command import study, tradeoff
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
 from tests.beamline.scans import write_exchange
@@ -35,19 +32,9 @@ def _same(one: ReconRecord, other: ReconRecord) -> None:
     assert one.parameters["recipe"] == other.parameters["recipe"]
 
 
-def test_the_line_to_repeat_repeats_from_any_folder(
-    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.save("truth.npy", np.ones((1, 40, 40), np.float32) * np.arange(40, dtype=np.float32))
-    first = _made(folder, "recon", "scan.h5", *OPTIONS, "--truth", "truth.npy:0:1", "-o", "v.h5")
-    program, *line = shlex.split(str(first.parameters["command"]))
-    assert program == "beamline"
-    _same(first, _made(folder, *line))
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    monkeypatch.chdir(elsewhere)
-    again = _made(elsewhere, *line)
-    _same(first, again)
-    assert again.metrics["psnr"] == first.metrics["psnr"]
+def test_a_volume_has_its_command_as_it_was_typed(folder: Path) -> None:
+    record = _made(folder, "recon", "scan.h5", *OPTIONS, "-o", "a b.h5")
+    assert shlex.split(str(record.parameters["command"])) == ["beamline", "recon", "scan.h5", *OPTIONS, "-o", "a b.h5"]
 
 
 def test_a_recipe_gives_the_same_from_a_file_and_from_a_volume(folder: Path) -> None:
@@ -62,8 +49,6 @@ def test_a_recipe_gives_the_same_from_a_file_and_from_a_volume(folder: Path) -> 
     _same(first, _made(folder, "recon", "other.h5", "--config", "r.yaml", "-o", "a.h5", "--no-report"))
     from_volume = _made(folder, "recon", "scan.h5", "--config", "v.h5", "-o", "b.h5", "--no-report")
     _same(first, from_volume)
-    _, *line = shlex.split(str(from_volume.parameters["command"]))
-    _same(first, _made(folder, *line))  # the recipe's options are in the line: it needs no recipe
 
 
 def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
@@ -141,24 +126,6 @@ def test_a_log_that_the_disk_does_not_take_is_named_and_does_not_end_the_work(
     assert {"log.txt", "x.h5"} <= left(folder)
 
 
-def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:
-    context = study.make_context("study", ["random", "scan.h5", "--draws", "1", "-m", "fbp", "-m", "sirt", "--json"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("s")))
-    scan = str(folder / "scan.h5")
-    rest = "--method fbp --method sirt --draws 1 --output s_again"
-    assert line == ["beamline", "study", "random", scan, *rest.split()]
-    context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif", "--flats", "60000"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
-    rest = ["--darks", str(folder / "d.tif"), "--flats", "60000", "--full", "--output", "t_again"]
-    assert line == ["beamline", "tradeoff", scan, *rest]
-
-
-def test_an_option_of_two_values_stands_once(folder: Path) -> None:
-    context = segment.make_context("segment", ["scan.h5", "--percentiles", "1", "99"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
-    assert " ".join(line).count("--percentiles 1 99") == 1
-
-
 def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
     short = ("--preset", "published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
     settings = ("--set", "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2]", "--set", "fit.policy.every=50")
@@ -166,8 +133,6 @@ def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> No
     assert first.parameters["method"] == "r2-published" and first.parameters["start"] == "published"
     assert 'set: "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2] fit.policy.every=50"' in str(first.parameters["recipe"])
     _same(first, _made(folder, "recon", "scan.h5", "--config", "v.h5", "--no-report", "-o", "w.h5"))
-    _, *line = shlex.split(str(first.parameters["command"]))
-    _same(first, _made(folder, *line))
     rectified = _made(folder, "recon", "scan.h5", *short, *settings, "-o", "x.h5")
     assert not np.array_equal(first.volume.data, rectified.volume.data)
 
