@@ -246,7 +246,7 @@ STAGE = Extension(
     {
         "drivers/stages/turn/__init__.py": '"""A dummy stage."""\n\nDRIVERS = {"turn": "TurnStage"}\n',
         "drivers/stages/turn/stage.py": '''
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import serial
@@ -254,24 +254,22 @@ import serial
 from drivers.stages.settings import StageFigures, Wiring, key
 
 
-@dataclass(frozen=True)
-class TurnSettings:
+@dataclass(frozen=True, kw_only=True)
+class TurnSettings(Wiring, StageFigures):
     """A dummy."""
 
     pulse_output: ClassVar[None] = None
-    figures: StageFigures
-    wiring: Wiring = field(default=Wiring())
     gear: int = key(2, "Counts a step.", ge=1)
 
     def limits(self):
-        return self.figures.limits(self.figures.acceleration, 0.0)
+        return self.limits_with(self.acceleration, 0.0)
 
 
 class TurnStage:
     name, Settings = "stage", TurnSettings
 
     def __init__(self, url, settings, clock):
-        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
+        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.timeout)
         self._gear = settings.gear
 
     def position(self):

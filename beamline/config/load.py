@@ -301,7 +301,7 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
             expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
             what = f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; {expected}"
             yield ("devices", "camera", key), what
-    width = stage.settings.wiring.pulse_width
+    width = stage.settings.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),

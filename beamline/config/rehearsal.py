@@ -50,7 +50,7 @@ def _scene(config: Config) -> dict[str, Any]:
 
 
 def _devices(real: DeviceSection) -> dict[str, Any]:
-    high = real.stage.settings.wiring.active_high
+    high = real.stage.settings.active_high
     shared = {name: getattr(real.camera, name, None) for name in SimulatedOrca.model_fields}
     camera = {name: value for name, value in shared.items() if value is not None}
     camera |= {"kind": "simulated_orca", "trigger_polarity": "positive" if high else "negative"}

@@ -90,7 +90,7 @@ class PM16CStage(LineStage):
         self._settings = settings
         self._home = None if settings.home is None else self._travel.to_counts(settings.home)
         self._search: HomeSearch | None = None
-        self._channel = PM16CChannel(url, settings.channel, settings.wiring, clock, name)
+        self._channel = PM16CChannel(url, settings.channel, settings, clock, name)
         self._found = self._channel.found
         with self._closed_on_failure():
             self._version = self._channel.open(settings.rate_code)
@@ -99,7 +99,7 @@ class PM16CStage(LineStage):
 
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
-        with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
+        with contextlib.closing(PM16CChannel(url, settings.channel, settings, clock, "stage")) as channel:
             channel.stop(hard=False)
 
     def _counts(self) -> int:

@@ -73,7 +73,7 @@ def test_every_device_has_a_simulated_counterpart(tmp_path: Path, overrides: tup
     real, found = load(INSTRUMENT, overrides, environment={}), _rehearsed(*overrides)
     assert not real.simulated and all(found.devices.simulated_or_not().values())
     assert found.scan == real.scan
-    assert found.devices.stage.settings.figures == real.devices.stage.settings.figures
+    assert found.devices.stage.settings.limits() == real.devices.stage.settings.limits()
     for key in ("roi", "binning", "readout", "model"):
         assert getattr(found.devices.camera, key) == getattr(real.devices.camera, key)
     planned, wanted = (dry_run(each, tmp_path).timeline for each in (found, real))
