@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,16 @@ from beamline.core.sinks import JsonLines, fan_out
 from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
 from recon.methods import METHODS
+
+
+class FiniteRange(click.FloatRange):
+    """A range of finite numbers; click's own range accepts NaN and infinities."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
 
 
 class NameChoice(click.Choice):  # type: ignore[type-arg]
@@ -58,8 +69,8 @@ _ELSEWHERE = {
 }
 """Of methods that make several volumes: what takes them."""
 
-POSITIVE = click.FloatRange(min=0, min_open=True)
-NOT_NEGATIVE = click.FloatRange(min=0)
+POSITIVE = FiniteRange(min=0, min_open=True)
+NOT_NEGATIVE = FiniteRange(min=0)
 SEED = click.IntRange(min=0)
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]

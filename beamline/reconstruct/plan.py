@@ -283,6 +283,12 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
         raise ConfigError(f"{options.method.name} takes {wanted}. Choose another method. Nothing was read.")
     if options.method.traits.several:
         _require_hdf5(options.target)
+        of_one = ("region", "truth", "uncertainty", "cluster", "partial")
+        if wrong := [name for name in of_one if getattr(options, name)]:
+            raise ConfigError(
+                f"{' and '.join(wrong)}: for a method of one volume, and {options.method.name} makes several. Leave it "
+                "out, or choose another method. Nothing was computed."
+            )
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:

@@ -138,7 +138,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(scans: list[Path], ma
             api.reconstruct(given, method, say=None)
     target, method = OutputPaths(tmp_path / "box.h5", None), recon.EnergySeries(held.series.names)
     boxed = ReconOptions(source, target, wanted, method, region=Region((0, 1), (0, 9), (0, 9)))
-    with pytest.raises(api.ConfigError, match="--roi does not go with several energies: a box is of one volume"):
+    with pytest.raises(api.ConfigError, match="region: for a method of one volume"):
         reconstruct_file(boxed, lambda event: None, SystemClock())
 
 
