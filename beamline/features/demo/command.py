@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +14,7 @@ import click
 from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
-from beamline.core.process import ChildProcess
+from beamline.core.events import Event, FrameFlagged, RunDone, Sink, SnapshotWritten, VolumeDone, Warned
 from beamline.core.sinks import fan_out, sentence
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
@@ -47,7 +42,6 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
     The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
     """
-    _keep_bytecode()
     from beamline.config.load import config_folder, load
 
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
@@ -55,30 +49,12 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
         config = load(config_folder() / "demo.yaml", overrides)
         stop = StopRequest()
         last: list[Event] = []
-        with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
+        with stop_signals(stop), Terminal(sys.stderr) as terminal:
             run_demo(config, output, [terminal, last.append, json_sink], stop, shlex.join(["beamline", *sys.argv[1:]]))
     if not as_json:
         done = last[-1]
         assert isinstance(done, VolumeDone)
         click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
-
-
-@contextmanager
-def _compiling() -> Iterator[None]:
-    """A process of low priority that compiles the last kernels of the fit: once on a machine."""
-    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
-        words = [sys.executable, "-c", "from recon.warm_up import warm_up_rest; warm_up_rest()"]
-        with ChildProcess(words, nowhere, lambda line: None, behind=True):
-            yield
-
-
-def _keep_bytecode() -> None:
-    """Write the bytecode of what is imported, also where the environment asks for none: README installs without it.
-
-    Else each later command would compile torch and scipy again, in 4 s.
-    """
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    sys.dont_write_bytecode = False
 
 
 def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:
@@ -113,8 +89,6 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         return [*follow(scan, output), "--no-report"]  # ours replaces it
 
     def all_but_done(event: Event) -> None:
-        if isinstance(event, ScanDone):
-            ahead.start()
         if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
             outside(event)
 
@@ -122,7 +96,6 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         if instrument.truth is None:
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
         truth = instrument.truth
-        ahead = threading.Thread(target=_look_ahead, args=(truth,), name="look ahead", daemon=True)
         result = run_scan(config, runs, [snapshots, all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
@@ -184,16 +157,6 @@ def _compare(
         scan_flags=shown.snapshots.flags, psnr=curve,
     )  # fmt: skip
     write_result(made, prepared, ideal, target, context, sink, clock)
-
-
-def _look_ahead(truth: Callable[[Grid], Volume]) -> None:
-    """Import and compile what the comparison needs, while the live reconstruction ends: the scan's process is idle."""
-    with suppress(Exception):  # the comparison meets it again, and says it
-        from recon.base.volume import Grid
-
-        import_module("beamline.reconstruct.result")
-
-        truth(Grid((2, 2, 2), 1.0))
 
 
 class _Snapshots:
