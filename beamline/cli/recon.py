@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,15 +22,14 @@ from beamline.cli.options import declared, json_events, refuse_contradictions, r
 from beamline.cli.recipe import Grouped, names_given, recipe_text, typed_line
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
-from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
-from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
-from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
-from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
-from beamline.core.installed import version
+from beamline.cli.terminal import events_shown, results
+from beamline.core.errors import DataError, QualityError, ScanStopped
+from beamline.core.events import Done, Event, FitReached, StateEntered
+from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
-from beamline.core.sinks import fan_out, sentence, while_it_works
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
-from beamline.core.text import printable, safe_name
+from beamline.core.text import safe_name
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME, streams
@@ -42,54 +37,6 @@ from recon.methods import DEFAULT, IN_TIME, streams
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
     from beamline.storage.recon_record import ReconRecord
-
-
-class LogLines:
-    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence.
-
-    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
-    """
-
-    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
-        self._stream, self._lock = stream, threading.Lock()
-        self._ignored = closed_terminal_ignored if terminal else nullcontext
-
-    def __call__(self, event: Event) -> None:
-        text = None if isinstance(event, ReconStarted) else sentence(event)
-        if text is None:
-            text = ", ".join(f"{name} {value}" for name, value in event.data.items())
-        at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock, self._ignored():
-            self._stream.write(f"{at}  {event.event}: {printable(' '.join(text.split()))}\n")
-            self._stream.flush()
-
-
-@contextmanager
-def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes the log, if one is requested. An error in the block becomes its last line.
-
-    If its disk is full, `warn` gets a warning, and the work goes on.
-    """
-    if path is None:
-        yield []
-        return
-    refuse_existing(path)
-    with ExitStack() as closing:
-        with named_on_failure(path):
-            file = closing.enter_context(new_log(path))
-        write = LogLines(file)
-
-        def named(event: Event) -> None:
-            with named_on_failure(path):
-                write(event)
-
-        lines = while_it_works(named, warn)
-        lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
-        try:
-            yield [lines]
-        except (Exception, KeyboardInterrupt) as error:
-            lines(Failed(user_message(error), time=SystemClock().now()))
-            raise
 
 
 @click.command(
@@ -108,8 +55,7 @@ def recon(**values: Any) -> None:
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
-    # A log holds the failure of a scan that is not there, and a recipe needs none.
-    there = not values["follow"] and values["write_config"] is None and values["log"] is None
+    there = not values["follow"] and values["write_config"] is None  # a recipe needs no scan
     options = options_of(click.get_current_context(), there=there)
     if values["write_config"] is not None:
         if values["output"] is not None:
@@ -118,8 +64,6 @@ def recon(**values: Any) -> None:
         if values["output"] is None:
             return
     if values["dry"]:
-        if values["log"] is not None:
-            refuse_existing(values["log"])
         dry_run(options, SystemClock(), values["as_json"])
     else:
         run_reconstruction(options, values)
@@ -148,7 +92,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
 
     page = report_beside(path) if values["report"] else None
     files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
-    files |= {"--resume": values["resume"], "--log": values["log"], "--write-config": values["write_config"]}
+    files |= {"--resume": values["resume"], "--write-config": values["write_config"]}
     refuse_shared(files)
     partial, goal = slabs_resumed(values["resume"]), (values["enough_gain"], values["enough_loss"])
     source, selection = chosen(file, values["seed"], values)
@@ -237,12 +181,9 @@ def run_reconstruction(
         if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.several)):
             stop.ready = True
 
-    with events_shown(values["as_json"]) as usual:
-        shown = LogLines(sys.stderr, terminal=True) if values.get("verbose") and not values["as_json"] else usual
-        with logged(values.get("log"), shown) as lines:
-            sink = fan_out(made, *lines, shown)
-            scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
-            record = reconstruct_file(options, sink, SystemClock(), stop_scope=scope)
+    with events_shown(values["as_json"]) as shown:
+        scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
+        record = reconstruct_file(options, fan_out(made, shown), SystemClock(), stop_scope=scope)
     output = " and ".join(map(str, options.target.outputs))
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))

@@ -202,19 +202,6 @@ recon_options = together(
         help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
         "done.",
     ),
-    option(
-        "--log",
-        of_one_call=True,
-        type=click.Path(path_type=Path),
-        help="Write everything that happens to this text file.",
-    ),
-    option(
-        "-v",
-        "--verbose",
-        of_one_call=True,
-        is_flag=True,
-        help="Print everything that happens, with its time, to stderr.",
-    ),
     heading(RESOURCES),
     option(
         "--dry-run",

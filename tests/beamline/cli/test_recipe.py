@@ -1,17 +1,11 @@
-"""Recipes and the lines "to repeat": what they give is what the call gave."""
+"""Recipes: what they give is what the call gave."""
 
-import errno
-import io
-import os
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beamline.cli import recon as log
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
 from tests.beamline.scans import write_exchange
@@ -87,43 +81,6 @@ def test_other_volumes_and_missing_files_hold_no_recipe(folder: Path) -> None:
         result = beamline("recon", "scan.h5", "--config", name)
         assert result.exit_code in (2, 5) and name in result.stderr, result.output
     assert left(folder) == {"scan.h5"}
-
-
-def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
-    succeeds("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "--no-report")
-    lines = (folder / "log.txt").read_text().splitlines()
-    kinds = [line.split()[1] for line in lines]
-    assert kinds[0] == "state:" and kinds[-1] == "done:" and "recon_started:" in kinds
-    assert "residual" in lines[-1]
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5").exit_code == 5
-    assert beamline("recon", "none.h5", "-m", "fbp", "--log", "bad.txt").exit_code == 5
-    assert "none.h5" in (folder / "bad.txt").read_text().splitlines()[-1]
-    said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
-    shown = [line.split()[1] for line in said.splitlines()]
-    steady = [[kind for kind in each if kind != "progress:"] for each in (shown, kinds[1:])]  # that comes by the clock
-    assert steady[0] == steady[1] and "progress:" in shown
-
-
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_a_log_that_the_disk_does_not_take_is_named_and_does_not_end_the_work(
-    number: int, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            if " state: " not in text:
-                raise OSError(number, os.strerror(number))
-            return super().write(text)
-
-    @contextmanager
-    def new_log(path: Path) -> Iterator[Full]:
-        path.touch()
-        yield Full()
-
-    monkeypatch.setattr(log, "new_log", new_log)
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5", "--no-report")
-    assert result.exit_code == 0
-    assert result.stderr.count(f"log.txt could not be written ({os.strerror(number)})") == 1
-    assert {"log.txt", "x.h5"} <= left(folder)
 
 
 def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
