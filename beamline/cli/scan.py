@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.control import recovered_files
-from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
+from beamline.cli.options import json_events, json_option, refuse_contradictions, set_by, set_option, with_request
+from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
-from beamline.core.files import remove
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
@@ -50,9 +50,6 @@ class ScanRequest:
         is_flag=True,
         help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices.",
     )
-    discard: bool = set_by(
-        "--discard", is_flag=True, help="With --rehearse: remove the folder of a run that ended well, and its frames."
-    )
     page: bool = set_by("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
     no_live: bool = set_by("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
     documents: str | None = set_by(
@@ -81,6 +78,11 @@ class ScanRequest:
         "--resume",
         metavar="RUN",
         type=click.Path(path_type=Path, exists=True, file_okay=False),
+        excludes={
+            "output": "the run has its folder",
+            "rehearse": "a rehearsal starts a new run; RUN has its devices",
+            "documents": "they describe complete scans",
+        },
         help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own "
         "configuration.",
     )
@@ -98,7 +100,7 @@ class ScanRequest:
         return *self.overrides, *(NO_LIVE if self.no_live else ())
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
     """Run the scan in CONFIG, or continue one that ended early (--resume RUN).
@@ -170,25 +172,21 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
-    """Duration of the rehearsal and of the scan, as lines. `--discard` removes the folder if all frames are good."""
+    """Duration of the rehearsal and of the scan, as lines."""
     from beamline.plan.timeline import duration_text
     from beamline.scan.preflight import dry_run
 
     planned = duration_text(dry_run(config, request.output).timeline.duration)
-    lines = [
+    return [
         f"{'rehearsed':<10}in {duration_text(result.seconds)}. At the instrument the plan takes {planned}, without "
         "moves of shutter and sample"
     ]
-    if request.discard and not faults_of(result):
-        remove(result.folder)
-        lines.append(f"{'discarded':<10}{result.folder}")
-    return lines
 
 
 def _refuse_contradictions(request: ScanRequest) -> None:
     """Raises UsageError for options that do not go together."""
-    if request.discard and not request.rehearse:
-        raise click.UsageError("--discard removes the files of a rehearsal: it needs --rehearse.")
+    context = click.get_current_context()
+    refuse_contradictions(context.command, names_given(context))
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     several = _are_several_scans(request.files)
@@ -201,16 +199,8 @@ def _refuse_contradictions(request: ScanRequest) -> None:
     ):
         if given and of_several is not several:
             raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
-    if request.run is None:
-        return
-    if request.output is not None or (request.overrides and request.file is None):
-        raise click.UsageError("--resume continues RUN with its own configuration: leave out -o and --set.")
-    if request.rehearse:
-        raise click.UsageError(
-            "--rehearse starts a new run: leave it out with --resume, which uses the devices of RUN."
-        )
-    if request.documents is not None:
-        raise click.UsageError("--documents describes complete scans: leave it out with --resume.")
+    if request.run is not None and request.overrides and request.file is None:
+        raise click.UsageError("--resume continues RUN with its own configuration: leave out --set.")
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
@@ -283,8 +273,6 @@ def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], 
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
 
-    if request.discard:
-        raise click.UsageError("--discard cannot be combined with scan.energies: leave it out.")
     with _shown(request, others, stop) as (sinks, ask):
         return run_energies(
             config, request.output, sinks, stop,
