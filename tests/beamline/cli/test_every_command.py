@@ -20,7 +20,7 @@ TAKES_FILE = {
     "voxelise": "FILE -o out.h5", "xafs": "FILE --from 8.30 --to 8.42",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
-NO_FILE = {"completion", "config", "demo", "ioc", "tango", "pause", "resume", "stop", "abort", "runs"}
+NO_FILE = {"config", "demo", "ioc", "tango", "pause", "resume", "stop", "abort", "runs"}
 OTHERWISE = {("batch", "text"), ("batch", "cut"), ("watch", "cut")}
 """The next scan is made; it may become a scan file."""
 KINDS = {
