@@ -27,7 +27,7 @@ from beamline.core.errors import (
 )
 from beamline.core.installed import version
 from beamline.core.text import printable
-from recon.base.registry import did_you_mean
+from recon.base.registry import ADD_ONS, did_you_mean
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
 """Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
@@ -121,6 +121,8 @@ class LazyGroup(click.Group):
         """As click does, with the nearest name in the sentence on an unknown one."""
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
+            if args[0] in ADD_ONS:
+                ctx.fail(f"`beamline {args[0]}`: install {ADD_ONS[args[0]]}.")
             ctx.fail(f"There is no command {args[0]!r}{did_you_mean(args[0], commands())}.")
         return super().resolve_command(ctx, args)
 

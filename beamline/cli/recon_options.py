@@ -42,12 +42,9 @@ def memory_size(text: str) -> int:
 
 
 def cluster_of(text: str) -> str:
-    """Parse a cluster: number of workers, `local:N`, an address or `slurm:CONFIG`. Raises ValueError for any other
-    text.
-    """
-    from beamline.reconstruct.memory import cluster  # here: help needs none of it
-
-    cluster().check_cluster(text)
+    """`local:N` or `tcp://HOST:PORT`. Raises ValueError for any other text."""
+    if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+", text):
+        raise ValueError(f"{text!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT")
     return text
 
 
@@ -180,10 +177,10 @@ recon_options = together(
         "--cluster",
         excludes=IN_MEMORY,
         of_one_call=True,
-        metavar="local:N|tcp://HOST:PORT|slurm[:CONFIG]",
+        metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
         help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
-        "those of a scheduler, or jobs of Slurm by a YAML file.",
+        "or those of a scheduler. It needs splatline-cluster.",
     ),
     heading(OUTPUT),
     option(

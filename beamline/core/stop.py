@@ -87,21 +87,6 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 
 @contextmanager
-def signals_held() -> Iterator[None]:
-    """A context in which Ctrl-C, SIGTERM and SIGHUP wait, if this is the main thread and has handlers for them: they
-    are delivered at its end, so that what it begins is whole, and its owner can end it.
-    """
-    numbers = [number for number in (signal.SIGINT, *_asking_to_end()) if callable(signal.getsignal(number))]
-    with ExitStack() as later:  # one whose handler raises does not keep the others from theirs
-
-        def hold(number: int, frame: FrameType | None) -> None:
-            later.callback(signal.raise_signal, number)
-
-        with _caught(dict.fromkeys(numbers, hold)):
-            yield
-
-
-@contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
     """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones."""
     with ExitStack() as restore:

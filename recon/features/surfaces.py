@@ -177,16 +177,16 @@ def density_at(gaussians: Gaussians, points: F64) -> tuple[F64, F64]:
     With d from the centre, A = Σ⁻¹ and q = dᵀAd, a Gaussian adds ρ f(q) to σ and 2 ρ f'(q) A d to its gradient.
     """
     from scipy.spatial import cKDTree
-
-    from recon.kernels.reference import rotation_matrices  # loads torch
+    from scipy.spatial.transform import Rotation
 
     kernel, n = gaussians.kernel, len(points)
     density, gradient = np.zeros(n), np.zeros((n, 3))
     means = gaussians.means.detach().double().numpy()
-    scales = gaussians.scales.detach().double()
-    whiten = (rotation_matrices(gaussians.quaternions.detach().double()).transpose(1, 2) / scales[:, :, None]).numpy()
+    scales = gaussians.scales.detach().double().numpy()
+    turn = Rotation.from_quat(gaussians.quaternions.detach().double().numpy(), scalar_first=True).as_matrix()
+    whiten = turn.transpose(0, 2, 1) / scales[:, :, None]
     rho = gaussians.densities.detach().double().numpy()
-    reach = kernel.reach(_SIGMAS) * scales.numpy().max(axis=1)
+    reach = kernel.reach(_SIGMAS) * scales.max(axis=1)
     tree = cKDTree(points)
     for first in range(0, gaussians.n, TOGETHER):
         near = tree.query_ball_point(means[first : first + TOGETHER], reach[first : first + TOGETHER])

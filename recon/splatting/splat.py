@@ -1,27 +1,23 @@
 """project and voxelize: Gaussians to line integrals and to voxels, differentiable.
 
-The implementation follows from the tensors: float32 on the CPU uses the threaded CPU kernels, float32 on a CUDA device
-the GPU kernels. float64 (or `implementation="reference"`) uses the reference implementation, which runs on the CPU.
+Tensors are float32: on the CPU the threaded CPU kernels are used, on a CUDA device the GPU kernels.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
-from recon.splatting.backend import Backend, Cpu
+from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-Implementation = Literal["auto", "cpu", "gpu", "reference"]
 
 
 def project(
@@ -31,57 +27,33 @@ def project(
     *,
     truncation: Truncation | None = None,
     model: RayModel | None = None,
-    implementation: Implementation = "auto",
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
 
     In a cone the footprint is affine, or integrated along the true ray if `model` asks for it. Differentiable in all
-    four parameter tensors. The reference implementation does not truncate.
+    four parameter tensors.
 
     Raises:
-        ValueError: the implementation does not support tensors of this type or on this device.
+        ValueError: tensors that are not float32.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
     check_arguments(project, locals())
-    import torch
-
-    from recon.kernels import reference
     from recon.splatting.autograd import Project
 
-    rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
-    g, which = turned_by_rows(gaussians, chosen, -1), _chosen(gaussians, implementation)
+    g = turned_by_rows(gaussians, chosen, -1)
     chosen = chosen.at_row(0)
-    if which == "reference":
-        parameters = (g.means, g.scales, g.quaternions, g.densities)
-        length = rays.length(chosen)
-        images = []
-        for view in range(chosen.n_views):
-            exact = None
-            if chosen.is_cone and rays.exact_above < math.inf:
-                exact = reference.affine_error(*parameters[:3], chosen, view, g.kernel) > rays.exact_above
-            images.append(reference.project_view(parameters, chosen, view, exact=exact, length=length, kernel=g.kernel))
-        return torch.stack(images)
     cut = truncation or Truncation()
-    return Project.apply(*_raw(g, which), chosen, (_faint(cut, g, chosen), cut.sigmas, rays))
+    return Project.apply(*_raw(g), chosen, (_faint(cut, g, chosen), cut.sigmas, model or RayModel()))
 
 
-def voxelize(
-    gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, implementation: Implementation = "auto"
-) -> Tensor:
+def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None) -> Tensor:
     """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
     check_arguments(voxelize, locals())
-    import torch
-
-    from recon.kernels import reference
     from recon.splatting.autograd import Voxelize
 
-    g, which = gaussians, _chosen(gaussians, implementation)
-    if which == "reference":
-        z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
-        return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
     cut = truncation or Truncation()
-    return Voxelize.apply(*_raw(g, which), grid, (cut.faint * g.density_unit, cut.sigmas))
+    return Voxelize.apply(*_raw(gaussians), grid, (cut.faint * gaussians.density_unit, cut.sigmas))
 
 
 def voxel_means(
@@ -104,34 +76,19 @@ def voxel_means(
     return density.reshape(z, parts, y, parts, x, parts).mean(dim=(1, 3, 5))
 
 
-def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
+def _raw(g: Gaussians) -> tuple[Any, ...]:
     """The first arguments of `Project` and `Voxelize`."""
+    import torch
+
     from recon.splatting.autograd import Renderer
 
-    if implementation == "gpu":
-        Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
-
-        backend: Backend[Any] = Gpu(g.means.device)
-    else:
-        backend = Cpu()
+    if g.means.dtype != torch.float32:
+        raise ValueError(f"Gaussians must be float32, these are {g.means.dtype}: convert their tensors")
+    device = g.means.device
+    backend = backend_for("cpu" if device.type == "cpu" else str(device))
     return g.means, g.log_scales, g.quaternions, g.raw_densities, Renderer(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
     """Line integral below which a footprint is cut off."""
     return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]
-
-
-def _chosen(gaussians: Gaussians, implementation: Implementation) -> Implementation:
-    import torch
-
-    dtype, device = gaussians.means.dtype, gaussians.means.device.type
-    suited: Implementation = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
-    chosen = suited if implementation == "auto" else implementation
-    if chosen != "reference" and dtype != torch.float32:
-        raise ValueError(f"the {chosen} implementation works in float32, the Gaussians are {dtype}")
-    if chosen != "gpu" and device != "cpu":
-        raise ValueError(
-            f"the {chosen} implementation runs on the cpu, the Gaussians are {dtype} on {device}: move them"
-        )
-    return chosen

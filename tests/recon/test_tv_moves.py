@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
 from recon.base.volume import Grid
-from recon.kernels.reference import total_variation
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import in_double
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project, total_variation
 
 VOXEL = 2 / 256  # of the published field, -1 to 1 in 256 voxels
 VIEWS = Geometry.parallel([0.2, 1.1, 2.3], (20, 24), pixel_pitch=VOXEL)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import shutil
@@ -136,8 +135,6 @@ def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = te
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
-        if error.errno == errno.EINVAL:  # a file system without fsync
-            return diagnosis(Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.")
         expected = expected or "a folder in which files can be created"
         advice = "Choose another storage.folder, or correct its permissions or its disk"
         observed = f"{there} cannot be written to ({error.strerror or error})."
@@ -221,60 +218,64 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     yield memory(free_memory(), need)
 
 
+def _read(name: str, expected: str, connect: Callable[[], Any], judge: Callable[[Any], Diagnosis]) -> Diagnosis:
+    """What a device says of itself, or why it says nothing."""
+    try:
+        with closing(connect()) as device:
+            return judge(device)
+    except DeviceError as error:
+        return of_error(name, error, expected)
+
+
 def _monitor(config: BeamMonitorConfig, connected: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
     """The beam monitor, if one is configured: its port, and one reading."""
     name = "beam monitor"
     if not isinstance(config, BeamMonitorSection):
         return
     if (at := getattr(config, "port", None)) is not None:
-        of_port = port(f"{name} port", at, connected)
-        yield of_port
+        yield (of_port := port(f"{name} port", at, connected))
         if of_port.verdict in (Grade.FAILED, Grade.NOT_APPLICABLE):
             return
-    try:
-        with closing(make_beam_monitor(config, clock)) as monitor:
-            reading = monitor.reading()
-    except DeviceError as error:
-        yield of_error(name, error, "a reading")
-        return
-    values = {"value": reading.value, "unit": reading.unit}
-    yield Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+    def judge(monitor: Any) -> Diagnosis:
+        reading = monitor.reading()
+        values = {"value": reading.value, "unit": reading.unit}
+        return Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+    yield _read(name, "a reading", lambda: make_beam_monitor(config, clock), judge)
 
 
 def _filter(config: FilterConfig, connected: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
     """A filter that is not moved by hand: its port, or the place at which it stands."""
-    name, expected = "filter", f"one of its places: {', '.join(config.places)}"
+    expected = f"one of its places: {', '.join(config.places)}"
+
+    def judge(device: Any) -> Diagnosis:
+        if (place := device.place()) is not None:
+            return Diagnosis("filter", Grade.OK, f"{place}.", expected, values={"place": place})
+        advice = "Compare devices.filter.places with the values of status_pv; a scan that names its place moves it"
+        return Diagnosis("filter", Grade.WARNING, "It stands at no place that has a name.", expected, advice)
+
     if isinstance(config, MotorFilter):
-        yield port(f"{name} port", config.stage.port, connected)
-    if not isinstance(config, FoundFilter):
-        return
-    try:
-        with closing(config.connect(clock)) as device:
-            place = device.place()
-    except DeviceError as error:
-        yield of_error(name, error, expected)
-        return
-    advice = "Compare devices.filter.places with the values of status_pv; a scan that names its place moves it"
-    named = Grade.OK, f"{place}.", expected, "", {"place": place}
-    yield Diagnosis(name, *(named if place else (Grade.WARNING, "It stands at no named place.", expected, advice)))
+        yield port("filter port", config.stage.port, connected)
+    if isinstance(config, FoundFilter):
+        yield _read("filter", expected, lambda: config.connect(clock), judge)
 
 
 def _monochromator(config: MonochromatorConfig, clock: Clock) -> Iterator[Diagnosis]:
     """A monochromator with a connection of its own: the energy at which it stands."""
     if not isinstance(config, FoundMonochromator):
         return
-    name, (low, high) = "monochromator", config.range_kev or (0.0, math.inf)
-    expected = f"an energy of {low:g} to {high:g} keV"
-    try:
-        with closing(config.connect(clock)) as connected:
-            energy = connected.energy()
-    except DeviceError as error:
-        yield of_error(name, error, expected)
-        return
-    fits = energy > 0 and low <= energy <= high
-    advice = "" if fits else "Compare devices.monochromator.unit and range_kev with what status_pv shows"
-    grade = Grade.OK if fits else Grade.WARNING
-    yield Diagnosis(name, grade, f"It stands at {energy:.7g} keV.", expected, advice, {"energy_kev": energy})
+    low, high = config.range_kev or (0.0, math.inf)
+
+    def judge(connected: Any) -> Diagnosis:
+        energy = connected.energy()
+        legal, values = f"an energy above 0 and from {low:g} to {high:g} keV", {"energy_kev": energy}
+        if energy > 0 and low <= energy <= high:
+            return Diagnosis("monochromator", Grade.OK, f"{energy:.7g} keV.", legal, values=values)
+        advice = "Compare devices.monochromator.unit and range_kev with what status_pv shows"
+        return Diagnosis("monochromator", Grade.WARNING, f"It stands at {energy:.7g} keV.", legal, advice)
+
+    yield _read("monochromator", "an energy", lambda: config.connect(clock), judge)
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:

@@ -174,6 +174,7 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     kind = get_completion_class(shell)
     assert kind is not None
     completion = kind(module.main, {}, "beamline", "_BEAMLINE_COMPLETE")
+
     def completed(*words: str) -> list[str]:
         return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
 

@@ -38,7 +38,7 @@ def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
 
 @pytest.fixture
 def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A site-packages with our packages and the distribution `motors`, which has brought a package `drivers`."""
+    """A site-packages with our packages and another distribution's package `drivers`."""
     site = tmp_path / "site-packages"
     for name in installed.OWN_PACKAGES:
         (site / name).mkdir(parents=True)
@@ -54,7 +54,7 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_distribution_that_has_overwritten_a_package(environment: Path) -> None:
     told = installed.package_problem(str(environment))
     assert told.startswith(
-        f"{environment / 'drivers/__init__.py'} is not splatline's: another distribution has brought it. Install"
+        f"{environment / 'drivers/__init__.py'} is not splatline's: it belongs to another distribution"
     )
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import quad
 
 from recon.base.kernel import Kernel
-from recon.kernels.reference import density_profile, shadow_profile
+from tests.recon.kernels.reference import density_profile, shadow_profile
 
 
 def f(r: float, kernel: Kernel) -> float:

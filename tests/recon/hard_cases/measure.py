@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel, RayModel, Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project
 
 WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and reference sum the same terms
 STEP = 2.0**-24  # half a float32 step, relative: the error of one rounding
@@ -57,12 +58,12 @@ def compare(
     The kernel is the GPU's where a `device` is given, else the CPU's.
     """
     fast, double = as_leaves(g, device), in_double(g)
-    kernel: Kernel = "cpu" if device is None else "gpu"
+    gpu = device is not None
     if isinstance(where, Grid):
-        found, expected = voxelize(fast, where, truncation=WHOLE, implementation=kernel), voxelize(double, where)
+        found, expected = voxelize(fast, where, truncation=WHOLE, gpu=gpu), voxelize(double, where)
         weight = float(g.densities.max())
     else:
-        found = project(fast, where, truncation=WHOLE, model=model, implementation=kernel)
+        found = project(fast, where, truncation=WHOLE, model=model, gpu=gpu)
         expected = project(double, where, model=model)
         weight = float((g.densities * g.scales.amin(1)).max()) * math.sqrt(2 * math.pi)
     y = torch.from_numpy(np.random.default_rng(seed).normal(size=tuple(expected.shape)))

@@ -14,9 +14,10 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project, voxelize
 from tests.recon.hard_cases.measure import WHOLE, Found, compare
 from tests.recon.helpers import as_leaves
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project
 
 PITCH = 0.5
 EXACT = RayModel(exact_above=0.0)
@@ -56,10 +57,10 @@ class On:
         self, g: Gaussians, where: Geometry | Grid, model: RayModel | None = None, *, whole: bool = False
     ) -> Tensor:
         """A picture or a volume of leaves; `whole`: as `compare` has it, which cuts nothing off."""
-        kernel, cut = "cpu" if self.device is None else "gpu", WHOLE if whole else Truncation()
+        cut, gpu = WHOLE if whole else Truncation(), self.device is not None
         if isinstance(where, Grid):
-            return voxelize(g, where, truncation=cut, implementation=kernel)  # type: ignore[arg-type]
-        return project(g, where, truncation=cut, model=model, implementation=kernel)  # type: ignore[arg-type]
+            return voxelize(g, where, truncation=cut, gpu=gpu)
+        return project(g, where, truncation=cut, model=model, gpu=gpu)
 
     def some(self, shape: Place, n: int = 12, seed: int = 1) -> Gaussians:
         """n Gaussians of one shape, in any orientation; of Triton's 8 at most."""

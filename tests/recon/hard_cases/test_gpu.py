@@ -14,16 +14,15 @@ from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.kernels.cpu.footprints import KV, K, W
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm
-from recon.kernels.reference import projection_loss
 from recon.splatting import optimise as fit
 from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from recon.splatting.splat import project
 from tests.recon.hard_cases.measure import STEP, WHOLE, bound, gradient_bound
 from tests.recon.hard_cases.on import at, gpu
 from tests.recon.helpers import as_leaves, run_steps
 from tests.recon.kernels.gpu.on_gpu import DEVICE
+from tests.recon.kernels.reference import project, projection_loss
 
 engine, images, parameters, tiles, voxels = (
     importlib.import_module(f"recon.kernels.gpu.{name}")
@@ -63,7 +62,7 @@ def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> 
     groups, weight = 200, 1 + 0.9 * 2.0**-17
     one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
     pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)
-    shown = project(pile, Geometry.parallel([0.0], (1, 1), pixel_pitch=1.0), truncation=WHOLE, implementation="gpu")
+    shown = project(pile, Geometry.parallel([0.0], (1, 1), pixel_pitch=1.0), truncation=WHOLE, gpu=True)
     off = abs(float(shown.detach()) / (groups * images._GROUP * weight) - 1)
     assert off < 16 * STEP  # of it the weight's own: a dozen roundings
     one_by_one = np.cumsum(np.full(groups, weight, np.float32), dtype=np.float32)[-1]

@@ -20,10 +20,11 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project, voxelize
 from tests.recon.hard_cases.measure import RECURRENCE, STEP, WHOLE, bound, compare, directional, gradient_bound
 from tests.recon.hard_cases.on import EXACT, On, at, cpu
 from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project
 
 CPU = cpu()
 VIEW, SHAPE = CPU.view, CPU.view.detector_shape

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project
 from tests.recon.hard_cases.measure import RECURRENCE, STEP, bound, compare, directional, gradient_bound
 from tests.recon.hard_cases.on import EXACT, PITCH, On, Place, cpu
 from tests.recon.helpers import gradients, in_double
+from tests.recon.kernels.reference import project
 
 
 @pytest.mark.parametrize(("beam", "aspect"), [("parallel", 1e2), ("parallel", 1e4), ("leaning", 1e4), ("cone", 50.0)])

@@ -16,7 +16,7 @@ from torch import Tensor
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
-from recon.kernels import reference
+from tests.recon.kernels import reference
 
 F64 = NDArray[np.float64]
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]

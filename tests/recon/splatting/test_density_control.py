@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.base.volume import Grid
-from recon.kernels.reference import covariances, rotation_matrices
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import Change, DensityPolicy, control
 from tests.recon.conftest import Make
+from tests.recon.kernels.reference import covariances, rotation_matrices
 
 FIELD = 20.0
 BOX = Grid((20, 20, 20)).edges

@@ -11,14 +11,14 @@ import torch
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
 from recon.base.volume import Grid
-from recon.kernels.reference import projection_loss
-from recon.kernels.reference import total_variation as reference_tv
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, DensityPolicy, FitSettings, growth
-from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double, run_steps
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project, projection_loss
+from tests.recon.kernels.reference import total_variation as reference_tv
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (22, 26), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)

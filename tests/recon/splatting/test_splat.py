@@ -16,10 +16,13 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
+from recon.splatting import splat
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project, voxel_means, voxelize
+from recon.splatting.splat import voxel_means
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.kernels.reference import on_grid as voxelize
+from tests.recon.kernels.reference import project
 
 # Cut off so far out that kernel and reference sum the same terms.
 WHOLE = Truncation(sigmas=9.0, faint=1e-12)
@@ -145,7 +148,7 @@ def test_a_width_and_the_uncorrected_factor_are_refused(random_gaussians: Make) 
 )
 def test_a_ray_model_that_makes_no_sense_is_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RayModel(**options)  # type: ignore[arg-type]
+        RayModel(**options)
 
 
 @pytest.mark.parametrize("kernel", Kernel)
@@ -253,9 +256,9 @@ def test_what_is_faint_is_left_out(above: float, seen: bool) -> None:
     assert bool(voxelize(one, Grid((5, 5, 5), 0.5), truncation=cut).any()) == seen
 
 
-def test_the_cpu_kernel_refuses_doubles(random_gaussians: Make) -> None:
+def test_doubles_are_refused(random_gaussians: Make) -> None:
     with pytest.raises(ValueError, match="float32"):
-        project(in_double(random_gaussians(2)), geometry(), implementation="cpu")
+        splat.project(in_double(random_gaussians(2)), geometry())
 
 
 def test_voxel_means_are_those_of_finer_voxels() -> None:

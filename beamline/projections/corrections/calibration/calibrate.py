@@ -1,4 +1,4 @@
-"""Calibration: what the scan does not state of its geometry and its detector is learnt from the views themselves."""
+"""Calibration: learns geometry and pixel gains from the views."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     GeometryOf = Callable[[Selection, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
-OF_VIEWS = "background", "gains"  # terms that change line integrals
+GAINS = "gains"  # the term that changes line integrals
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
 
@@ -39,7 +39,7 @@ def _terms(text: str) -> tuple[str, ...]:
     names = [name.strip() for name in text.split(",")]
     if names == ["none"]:
         return ()
-    every = *GEOMETRY, *OF_VIEWS
+    every = *GEOMETRY, GAINS
     if others := [name for name in names if name not in every]:
         raise ValueError(unknown("term", others[0], every))
     return tuple(name for name in every if name in names)
@@ -47,7 +47,7 @@ def _terms(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Which terms of geometry, background and gains are calibrated from the views.
+    """Which terms of the geometry, and whether gains of pixels, are learnt from the views.
 
     Attributes:
         terms: names; none: nothing.
@@ -60,8 +60,8 @@ class Calibrate:
         "--calibrate",
         "none",
         "Learn these from the views, separated by commas: axis, roll (lean of the axis in the detector's plane), tilt "
-        "(lean along the beam), shifts (of each view), background (of the beam), gains (of pixels). Views are not "
-        "resampled. What held-out views do not confirm is not changed.",
+        "(lean along the beam), shifts (of each view), gains (of pixels). Views are not resampled. What held-out views "
+        "do not confirm is not changed.",
         parse=_terms,
         metavar="LIST",
     )
@@ -83,23 +83,22 @@ class Calibrate:
     def memory(self, part: ScanPart) -> StepMemory:
         if not self.terms:  # nothing of it is loaded
             return StepMemory()
-        from recon.features.calibration.background import background_memory
         from recon.features.calibration.gains import gains_memory
 
-        need_of = {"background": background_memory, "gains": gains_memory}
-        terms = [need_of[term](part.geometry) for term in self.terms if term in need_of]
-        return StepMemory(alone=max([_search_memory(part, self.geometry), *terms]))
+        gains = gains_memory(part.geometry) if GAINS in self.terms else 0
+        return StepMemory(alone=max(_search_memory(part, self.geometry), gains))
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
         """Raise DataError for terms that need more views, or more binned columns, than the scan has."""
         if not self.terms:
             return
-        from recon.features.calibration import background, gains
+        from recon.features.calibration import gains
         from recon.features.calibration.learn import LEAST_VIEWS
 
-        limits = {"background": (background.LEAST_VIEWS, 1), "gains": (gains.LEAST_VIEWS, gains.LEAST_COLS)}
         for term in self.terms:
-            (least, wide), views = limits.get(term, (LEAST_VIEWS, 1)), used if term in limits else usable
+            least, wide, views = LEAST_VIEWS, 1, usable
+            if term == GAINS:
+                least, wide, views = gains.LEAST_VIEWS, gains.LEAST_COLS, used
             if views < least or cols < wide:
                 raise DataError(
                     f"--calibrate {term}: {views} views of {cols} columns are too few; {least} of {wide} are needed. "
@@ -123,8 +122,8 @@ class Calibrate:
         if not self.terms:
             return StepDone(parameters={})
         done = [views.done[self.name]] if self.name in views.done else []
-        learn = {"background": without_learnt_background, "gains": without_learnt_gains}
-        done += [learn[term](views, progress) for term in OF_VIEWS if term in self.terms]
+        if GAINS in self.terms:
+            done.append(without_learnt_gains(views, progress))
         sentence = " ".join(each.sentence for each in done if each.sentence)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
         return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
@@ -235,37 +234,6 @@ def _band(source: ScanSource, selection: Selection) -> Selection:
     n = min(height, ROWS * binning)
     first = (used.start + used.stop - n) // 2
     return replace(selection, rows=(first, first + n), binning=binning)
-
-
-def without_learnt_background(views: PreparedProjections, progress: Progress) -> StepDone:
-    """Subtract the background of the beam from the views if held-out views confirm it, see `learn_background`."""
-    from recon.features.calibration.background import learn_background
-
-    data, ids = views.projections.data, views.projections.view_ids
-    first, last = int(ids.min()), int(ids.max())
-
-    def times(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
-        return np.clip((numbers - first) / max(last - first, 1), 0.0, 1.0)
-
-    try:
-        learnt = learn_background(data, views.geometry, times(ids), views.measured, progress)
-    except ValueError as error:
-        raise DataError(f"--calibrate background: {error}. Leave it out.") from error
-    judged = f"views held out are left {learnt.without:.3g} without it and {learnt.left:.3g} with it"
-    values = {"learnt_background_held_out_before": learnt.without, "learnt_background_held_out_after": learnt.left}
-    if not (learnt.drift or learnt.mean):
-        sentence = "Background learnt with the volume: views held out confirm none; nothing taken off."
-        return StepDone(sentence, {"learnt_background": sentence, **values})
-    learnt.remove(data, times(ids))
-    if views.held_out is not None and views.held_out_ids is not None:
-        learnt.remove(views.held_out[0], times(views.held_out_ids))
-    what = " and ".join(name for name, there in (("its drift", learnt.drift), ("its mean", learnt.mean)) if there)
-    sentence = (
-        f"Background learnt with the volume: {what}, {learnt.size:.3f} of line integral (root mean square), on average "
-        f"from {learnt.lowest:+.3f} to {learnt.highest:+.3f}; taken off: {judged}. What all views show alike cannot be "
-        "told from density where the volume has no air."
-    )
-    return StepDone(sentence, {"learnt_background": sentence, "learnt_background_terms": learnt.coefficients, **values})
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:

@@ -55,6 +55,7 @@ def test_a_simulated_instrument_has_only_a_computer(tmp_path: Path) -> None:
     # demo.yaml: frames of 144 x 160 with previews of 36 x 40, of which flats and darks come fastest
     per_frame, fastest = 144 * 160 * 2 + 36 * 40 * 4, 0.037 + (72 + 5) * 7.2e-6
     assert speed["values"]["needed_bytes_per_s"] == pytest.approx(per_frame / fastest, rel=1e-3)  # type: ignore[index]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_instrument_s_configuration_away_from_the_instrument(tmp_path: Path) -> None:

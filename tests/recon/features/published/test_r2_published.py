@@ -11,13 +11,13 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
 from recon.features.published.r2_published import R2Published, published_fit
-from recon.kernels.reference import rotation_matrices
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import neighbour_distance, sample_as_published
 from recon.splatting.settings import Change, DensityPolicy, control, in_steps
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import density_unit
 from tests.recon.conftest import Make
+from tests.recon.kernels.reference import rotation_matrices
 
 FIELD = 20.0
 

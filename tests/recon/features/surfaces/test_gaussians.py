@@ -10,8 +10,8 @@ from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.features import surfaces as module
 from recon.features.surfaces import density_at, on_level
-from recon.kernels import reference
 from recon.splatting.gaussians import Gaussians
+from tests.recon.kernels import reference
 
 
 def some(kernel: Kernel, n: int = 30) -> Gaussians:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.kernels.cpu.activation import activate, activation_backward
-from recon.kernels.reference import rotation_matrices
+from tests.recon.kernels.reference import rotation_matrices
 
 
 def test_activation_and_gradients_equal_torch(rng: np.random.Generator) -> None:

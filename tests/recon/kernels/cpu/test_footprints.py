@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.kernels import reference
 from recon.kernels.cpu.engine import Active, Gradients, camera
 from recon.kernels.cpu.footprints import (
     HIDDEN,
@@ -26,6 +25,7 @@ from recon.kernels.cpu.footprints import (
     footprints,
     footprints_backward,
 )
+from tests.recon.kernels import reference
 
 F64 = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import torch
 from skimage.metrics import structural_similarity
 
 from recon.kernels.cpu.losses import L2, POISSON, CpuProjectionLoss, DataTerm, total_variation
-from recon.kernels.reference import data_term, projection_loss, ssim
-from recon.kernels.reference import total_variation as reference_total_variation
+from tests.recon.kernels.reference import data_term, projection_loss, ssim
+from tests.recon.kernels.reference import total_variation as reference_total_variation
 
 
 def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.kernels.cpu.patches import denoise, patch_scratch, scratch_values
-from recon.kernels.reference import sparse_patches
+from tests.recon.kernels.reference import sparse_patches
 
 F32 = NDArray[np.float32]
 SHAPES = [(9, 7, 21), (40, 5, 4), (6, 20, 1), (5, 8, 3), (3, 2, 17), (1, 1, 1)]

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.kernels import reference
 from recon.kernels.cpu.engine import Active, Gradients, camera
 from recon.kernels.cpu.rays import CpuRays
+from tests.recon.kernels import reference
 
 F32 = NDArray[np.float32]
 

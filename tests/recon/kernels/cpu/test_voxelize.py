@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.base.kernel import Kernel
-from recon.kernels import reference
 from recon.kernels.cpu.voxelize import Layout
+from tests.recon.kernels import reference
 
 F32 = NDArray[np.float32]
 Model = tuple[F32, F32, F32, F32]

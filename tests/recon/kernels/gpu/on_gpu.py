@@ -12,10 +12,10 @@ from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
-from recon.kernels import reference
 from recon.splatting.autograd import Project, Renderer, Voxelize
 from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import as_leaves, gradients
+from tests.recon.kernels import reference
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when triton and the kernels are first imported, that is, here

@@ -11,12 +11,12 @@ import torch
 from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel
 from recon.base.volume import Grid
-from recon.kernels import reference
 from recon.kernels.cpu import footprints as footprints_cpu
 from recon.kernels.cpu.engine import Active, view_table
 from recon.splatting.gaussians import Gaussians
 from tests.recon.conftest import Make
 from tests.recon.helpers import gradients, in_double
+from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import (
     AFFINE,
     DEVICE,

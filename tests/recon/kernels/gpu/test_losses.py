@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
-from recon.kernels.reference import projection_loss
-from recon.kernels.reference import total_variation as reference_total_variation
 from recon.splatting.backend import Cpu, backend_for
 from tests.recon.kernels.gpu.on_gpu import DEVICE
+from tests.recon.kernels.reference import projection_loss
+from tests.recon.kernels.reference import total_variation as reference_total_variation
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 

@@ -7,8 +7,8 @@ import importlib
 import numpy as np
 import torch
 
-from recon.kernels import reference
 from recon.splatting.backend import Cpu
+from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import DEVICE, UNIT
 
 engine = importlib.import_module("recon.kernels.gpu.engine")

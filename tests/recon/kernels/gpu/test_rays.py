@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from recon.base.kernel import RayModel, Truncation
-from recon.kernels import reference
-from recon.splatting.splat import project
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, in_double
+from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import (
     DEVICE,
     EXACT,
@@ -22,6 +21,7 @@ from tests.recon.kernels.gpu.on_gpu import (
     project_raw,
     raw_of,
 )
+from tests.recon.kernels.reference import project
 
 
 def test_exact_rays_and_gradients_equal_the_reference(random_gaussians: Make) -> None:

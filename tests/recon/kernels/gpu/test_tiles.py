@@ -9,9 +9,9 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.kernels import reference
 from recon.splatting.gaussians import Gaussians
 from tests.recon.helpers import in_double
+from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, WHOLE, raw_of, reference_view
 
 engine = importlib.import_module("recon.kernels.gpu.engine")

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from recon.base.volume import Grid
-from recon.kernels import reference
 from tests.recon.conftest import Make
 from tests.recon.helpers import in_double
+from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import (
     DEVICE,
     UNIT,
