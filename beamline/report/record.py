@@ -109,14 +109,12 @@ def price_text(made: Reconstruction) -> str:
 
 def quality_against_time(
     history: Mapping[str, NDArray[np.floating]],
-    psnr: Sequence[tuple[float, float]] = (),
     further: NextDecibel | None = None,
 ) -> bytes:
-    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, number of views and Gaussians.
+    """A fit against time: loss and residuals, the residual as dB, number of views and Gaussians.
 
     Args:
         history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
-        psnr: (seconds, dB) of each snapshot; none without a truth.
         further: time that another dB would take; None if it is not known.
     """
     seconds = history["seconds"]
@@ -126,17 +124,11 @@ def quality_against_time(
         if name in history and np.ptp(history[name]) > 0
     ]
     curve = residual_curve(history)
-    panels = 1 + (curve is not None) + bool(psnr) + bool(growing)
-    down, across = (1, panels) if panels < 4 else (2, 2)
-    figure = new_figure((WIDTH, 3.1 * down))
-    left, *others = np.ravel(figure.subplots(down, across))
+    figure = new_figure((WIDTH, 3.1))
+    left, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
     _misfit(left, history)
     if curve is not None:
         _decibels(others.pop(0), *record(curve.seconds, curve.residuals), curve.views, further)
-    if psnr:
-        axes = others.pop(0)
-        axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
-        finish(axes, "time (s)", "PSNR (dB)", "Quality against the truth", grid=True)
     if growing:
         axes = others.pop(0)
         for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):

@@ -14,8 +14,8 @@ import click
 from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, FrameFlagged, RunDone, Sink, SnapshotWritten, VolumeDone, Warned
-from beamline.core.sinks import fan_out, sentence
+from beamline.core.events import Event, RunDone, Sink, VolumeDone
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
 
@@ -80,7 +80,6 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
 
     clock = SystemClock()
     started = clock.now()
-    snapshots = _Snapshots()
     outside = fan_out(*sinks)
 
     follow = follow_command(config)
@@ -96,11 +95,11 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         if instrument.truth is None:
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
         truth = instrument.truth
-        result = run_scan(config, runs, [snapshots, all_but_done], stop, live=without_report, instrument=instrument)
+        result = run_scan(config, runs, [all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
         raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
-    shown = _Shown(command, config.recon.seed, config.recon.method, started, snapshots)
+    shown = _Shown(command, config.recon.seed, config.recon.method, started)
     _compare(result.path, folder / RECON, truth, shown, outside, clock)
 
 
@@ -112,7 +111,6 @@ class _Shown:
     seed: int
     method: str
     started: float
-    snapshots: _Snapshots
 
 
 def _compare(
@@ -128,7 +126,6 @@ def _compare(
     from beamline.report.record import history_from
     from beamline.storage.readers.open import open_scan
     from beamline.storage.writers.recon_file import read_reconstruction
-    from recon.assess.metrics import psnr
     from recon.base.method import Reconstruction
     from recon.base.volume import Grid, Volume
 
@@ -151,31 +148,5 @@ def _compare(
     target = OutputPaths(volume, report_beside(volume), replace=True)
     if target.live_picture.exists():
         facts = replace(facts, live_picture=target.live_picture.name)
-    curve = [(seconds, psnr(ideal.data, grown.data)) for seconds, grown in shown.snapshots.volumes]
-    context = ReportContext(
-        facts, selection, shown.command, shown.seed, warnings, shown.started,
-        scan_flags=shown.snapshots.flags, psnr=curve,
-    )  # fmt: skip
+    context = ReportContext(facts, selection, shown.command, shown.seed, warnings, shown.started)
     write_result(made, prepared, ideal, target, context, sink, clock)
-
-
-class _Snapshots:
-    """A sink that collects snapshots, which are compared with the truth after the scan, and the texts of flags."""
-
-    def __init__(self) -> None:
-        self.volumes: list[tuple[float, Volume]] = []
-        self.flags: list[str] = []
-
-    def __call__(self, event: Event) -> None:
-        from beamline.storage.writers.recon_file import read_reconstruction
-
-        if isinstance(event, SnapshotWritten):
-            try:
-                volume = read_reconstruction(Path(event.path)).volume
-            except DataError:
-                return  # the run is over and it is gone
-            self.volumes.append((event.seconds, volume))
-        elif isinstance(event, FrameFlagged | Warned):
-            text = sentence(event)
-            if text and text not in self.flags:
-                self.flags.append(text)

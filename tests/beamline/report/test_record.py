@@ -104,10 +104,9 @@ def test_while_views_still_come_nothing_is_extrapolated() -> None:
 
 
 @pytest.mark.parametrize("slope", [3.0, 0.0])
-@pytest.mark.parametrize("psnr", [(), ((5.0, 25.0), (30.0, 31.0))])
-def test_the_picture_has_room_for_all_of_it(slope: float, psnr: tuple[tuple[float, float], ...]) -> None:
+def test_the_picture_has_room_for_all_of_it(slope: float) -> None:
     arrays = history_arrays(_record(slope))
     arrays["held_out"] = 1.3 * arrays["residual"]
     arrays["n_gaussians"][30:] *= 2
     further = next_decibel(arrays["seconds"], arrays["held_out"])
-    assert quality_against_time(arrays, psnr, further).startswith(b"\x89PNG")
+    assert quality_against_time(arrays, further).startswith(b"\x89PNG")
