@@ -25,10 +25,7 @@ from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import DEFAULT, METHODS, build, by_name, has_setting, names, taking, with_trait
-
-PRESETS_OF_METHODS = ("published",)
-"""Endings of names of methods that are variants of another method, such as r2-published."""
+from recon.methods import METHODS, build, by_name, has_setting, taking, with_trait
 
 
 def checkpoint_output(path: Path) -> Path:
@@ -88,14 +85,17 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
         if all(has_setting(own, param.setting) for param in asked.values()):
             return  # without a look at the other methods, which load torch
     owners = {name: takers(param) for name, param in asked.items()}
-    for name, methods in owners.items():
-        if method in methods:
-            continue
-        what = f"it does not go with --method {method}." if stated else "give --method with one of these."
-        for other in () if stated else owners:
-            if not set(owners[other]) & set(methods):
-                what = f"--{other} is of {', '.join(owners[other])}. Give one of the two options."
-        raise click.UsageError(f"--{name} is of {', '.join(methods)}; {what}")
+    for name in (name for name, methods in owners.items() if method not in methods):
+        what = f"it does not go with --method {method}." if stated else _instead(name, owners)
+        raise click.UsageError(f"--{name} is of {', '.join(owners[name])}; {what}")
+
+
+def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
+    """What to do about an option where no method was chosen: another option may be of other methods alone."""
+    others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
+    if not others:
+        return "give --method with one of these."
+    return f"--{others[-1]} is of {', '.join(owners[others[-1]])}. Give one of the two options."
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
@@ -133,20 +133,6 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
     return settings
 
 
-def preset_of(method: str | None, preset: str | None) -> str | None:
-    """The method of this name with a preset's settings; without a preset, with its defaults.
-
-    Raises:
-        UsageError: the method has no such preset.
-    """
-    if preset is None:
-        return method
-    name = f"{method or DEFAULT}-{preset}"
-    if name not in names():
-        raise click.UsageError(f"--preset {preset} is of {DEFAULT}; it does not go with --method {method}.")
-    return name
-
-
 def slabs_resumed(path: Path | None) -> Path | None:
     """The file of --resume if it is a partial volume; else None."""
     from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
@@ -173,13 +159,6 @@ RUNNING = ("follow", "is for a scan that still runs: give --follow.")
 IN_MEMORY = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
 FOR_TIME = dict.fromkeys(("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits")
 
-preset_option = option(
-    "--preset",
-    of_one_call=True,  # it is in the name of the method
-    type=NameChoice(PRESETS_OF_METHODS),
-    help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
-    "The same as the method r2-published.",
-)
 _STEPS = option(
     "--steps",
     setting="steps",

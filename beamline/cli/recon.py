@@ -13,7 +13,6 @@ import click
 from beamline.cli.method_options import (
     SLABS_RESUMED,
     method_with,
-    preset_of,
     refuse_other_methods,
     settings_of,
     slabs_resumed,
@@ -122,7 +121,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     asked, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
         asked = asked - {"resume"} | {SLABS_RESUMED}
-    method = preset_of(values["method"], values["preset"])
+    method = values["method"]
     stated = method is not None
     if method is None:
         of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.trait}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.method_options import FOR_TIME, IN_MEMORY, RUNNING, SLABS_RESUMED, method_options, preset_option
+from beamline.cli.method_options import FOR_TIME, IN_MEMORY, RUNNING, SLABS_RESUMED, method_options
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -98,7 +98,6 @@ recon_options = together(
     ),
     selection_options,
     method_options,
-    preset_option,
     heading(METHOD),
     option(
         "--filter",

@@ -277,19 +277,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
-    if isinstance(options.source, SeveralScans):
-        options.source.refuse(options.method)
-    elif options.method.traits.by_energy:
-        wanted = "scans at several energies, and spectra of the materials"
-        raise ConfigError(f"{options.method.name} takes {wanted}. Choose another method. Nothing was read.")
-    if options.method.traits.several:
-        _require_hdf5(options.target)
-        of_one = ("region", "truth", "uncertainty", "cluster", "partial")
-        if wrong := [name for name in of_one if getattr(options, name)]:
-            raise ConfigError(
-                f"{' and '.join(wrong)}: for a method of one volume, and {options.method.name} makes several. Leave it "
-                "out, or choose another method. Nothing was computed."
-            )
+    _refuse_source(options)
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
@@ -305,6 +293,23 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
                 if options.selection.axis_col is not None:
                     check_axis(source, options.selection.axis_col)
     return truth
+
+
+def _refuse_source(options: ReconOptions) -> None:
+    """Raises ConfigError where source, method and target do not fit together."""
+    if isinstance(options.source, SeveralScans):
+        options.source.refuse(options.method)
+    elif options.method.traits.by_energy:
+        wanted = "scans at several energies, and spectra of the materials"
+        raise ConfigError(f"{options.method.name} takes {wanted}. Choose another method. Nothing was read.")
+    if options.method.traits.several:
+        _require_hdf5(options.target)
+        of_one = ("region", "truth", "uncertainty", "cluster", "partial")
+        if wrong := [name for name in of_one if getattr(options, name)]:
+            raise ConfigError(
+                f"{' and '.join(wrong)}: for a method of one volume, and {options.method.name} makes several. Leave it "
+                "out, or choose another method. Nothing was computed."
+            )
 
 
 def _refuse_unfollowed(options: ReconOptions) -> None:

@@ -84,7 +84,7 @@ def test_other_volumes_and_missing_files_hold_no_recipe(folder: Path) -> None:
 
 
 def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
-    short = ("--preset", "published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
+    short = ("-m", "r2-published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
     settings = ("--set", "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2]", "--set", "fit.policy.every=50")
     first = _made(folder, "recon", "scan.h5", *short, *settings, "--plain-splatting", "-o", "v.h5")
     assert first.parameters["method"] == "r2-published" and first.parameters["start"] == "published"
