@@ -116,40 +116,56 @@ def scan(request: ScanRequest) -> None:
     Exit codes: see `beamline --help`. 6 means that darks or flats cannot be used. 7 means that the scan is complete,
     but frames have an alarm of the monitor, or darks or flats a fault.
     """
-    from beamline.config.load import load
-    from beamline.scan.resume import NotJoined, open_for_resume, recover_run
-
-    file, run = request.file, request.run
     _refuse_contradictions(request)
     if _are_several_scans(request.files):
         _queue().take_all(request)
         return
     with json_events(request.as_json) as json_sink, ExitStack() as held:
-        settings = request.settings
-        config = None if file is None else load(file, settings, rehearse=request.rehearse)
-        of_energies = _config_of_energies(config, run, request.documents)
-        if of_energies is not None:
-            if not request.dry:
-                _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
-                return
-            run, config = None, of_energies
-        try:
-            series = None if run is None else held.enter_context(open_for_resume(run, config))
-        except NotJoined:
-            if request.dry or run is None:
-                raise
-            recovered_files(*recover_run(run), json_sink, request.as_json)
-            return
-        config = series.config if series else config
-        assert config is not None
-        for sentence in series.left_out if series else ():
-            click.echo(f"Warning: {sentence}", err=True)
-        _ask_about(config, asked=not (request.dry or request.rehearse or series))
-        if request.dry:
-            _dry_run(config, request.output, series, json_sink, request.as_json)
-            return
-        result = run_one(config, series, request, [json_sink], held)
-        rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
+        _scan_or_series(request, json_sink, held)
+
+
+def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:
+    """Take a scan, or those of its energies; or what a run lacks, which may be no more than to be joined."""
+    from beamline.config.load import load
+    from beamline.scan.resume import NotJoined, open_for_resume, recover_run
+
+    file, run = request.file, request.run
+    config = None if file is None else load(file, request.settings, rehearse=request.rehearse)
+    of_energies = _config_of_energies(config, run, request.documents)
+    if of_energies is not None and not request.dry:
+        _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
+        return
+    if of_energies is not None:
+        run, config = None, of_energies
+    try:
+        series = None if run is None else held.enter_context(open_for_resume(run, config))
+    except NotJoined:
+        if request.dry or run is None:
+            raise
+        recovered_files(*recover_run(run), json_sink, request.as_json)
+        return
+    config = series.config if series else config
+    assert config is not None
+    _one_scan(config, series, request, json_sink, held)
+
+
+def _one_scan(
+    config: Config, series: ResumableRun | None, request: ScanRequest, json_sink: Sink, held: ExitStack
+) -> None:
+    """Take the scan, or print its plan.
+
+    Raises:
+        AlarmError: it is complete, and frames, darks or flats have a fault.
+    """
+    for sentence in series.left_out if series else ():
+        click.echo(f"Warning: {sentence}", err=True)
+    _ask_about(config, asked=not (request.dry or request.rehearse or series))
+    if request.dry:
+        _dry_run(config, request.output, series, json_sink, request.as_json)
+        return
+    result = run_one(config, series, request, [json_sink], held)
+    held.close()  # documents are sent before the result is printed
+    rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
     if not request.as_json:
         click.echo("\n".join([_results(result), *rehearsed]))
     if faults := faults_of(result):
