@@ -207,12 +207,10 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import busy
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:
-        needs = estimate(options, MachineSpeed(), busy())
+        needs = estimate(options)
         sink(Done(needs, time=clock.now()))
     if not as_json:
         click.echo("\n".join(needs.lines()))

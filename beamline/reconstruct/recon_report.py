@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.outcome import ReportContext, as_text, label_of
 from beamline.report import figures
@@ -14,8 +15,6 @@ from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import (
     history_arrays,
-    price_of_decibel,
-    price_text,
     quality_against_time,
     residual_curve,
     views_grew,
@@ -96,8 +95,6 @@ def _summary(
         summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
-    if price := price_text(made):
-        summary += f". {price}"
     return summary + "."
 
 
@@ -162,7 +159,7 @@ def _further(made: Reconstruction, prepared: PreparedProjections, context: Repor
             "Stray mass",
             "The highest density above each other, of voxels that the views show to be empty. All of it is an "
             "artefact: less is better.",
-            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, prepared.kind),
+            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -183,7 +180,7 @@ def _further(made: Reconstruction, prepared: PreparedProjections, context: Repor
 
 def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
     """Slices of all volumes, and in what these differ from the first."""
-    unit, kind = prepared.length_unit, prepared.kind
+    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     shown = {"Truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     yield Picture(
@@ -228,7 +225,7 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
 
 def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None) -> Iterator[Picture]:
     """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
-    unit, kind = prepared.length_unit, prepared.kind
+    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit))
     if made.deviation is not None:
@@ -251,7 +248,7 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
         yield Picture(
             "Quality against time",
             _history_caption(made),
-            quality_against_time(history_arrays(made.history), price_of_decibel(made)),
+            quality_against_time(history_arrays(made.history)),
         )
 
 
@@ -260,7 +257,7 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
     yield Picture(
         "Projection",
-        f"One corrected view: the line integral of the {prepared.kind.value} along each ray. Air is better the "
+        f"One corrected view: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air is better the "
         "nearer to 0 and the more even it is.",
         figures.projection(data, geometry, 0, unit),
     )

@@ -1,7 +1,6 @@
 """A fit's record goes into a file and comes back; the residual that judges it is that of views held out, if any."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,15 +8,11 @@ import pytest
 from beamline.report.record import (
     history_arrays,
     history_from,
-    price_of_decibel,
-    price_text,
     quality_against_time,
     residual_curve,
 )
-from recon.assess.time_model import next_decibel, next_decibel_of_fit
 from recon.base.method import Progress, Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import FitSettings
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
@@ -74,39 +69,9 @@ def test_each_look_at_views_held_out_counts_once() -> None:
     np.testing.assert_array_equal(judged.residuals, [0.5, 0.4, 0.3])
 
 
-def test_a_fit_says_what_longer_fits_gained() -> None:
-    made = _made(_record(3.0), "r2")
-    assert price_of_decibel(made) == next_decibel_of_fit(30.0, 60)
-    assert "as longer fits did on four other scans" in price_text(made)
-    late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
-    followed = replace(
-        _made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace, "decay": WHILE_VIEWS_COME.decay}
-    )
-    assert price_of_decibel(followed) is None and price_text(followed) == ""
-    assert (
-        price_text(_made(late, "r2"))
-        == "A longer reconstruction would hardly bring the volume 1 dB nearer to the sample"
-    )
-
-
-def test_iterations_say_what_another_decibel_would_cost() -> None:
-    made = _made(_record(3.0))
-    price = price_of_decibel(made)
-    assert price is not None and price.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
-    assert price_text(made).startswith("About 11.9 s more would lower the misfit to the views by 1 dB (")
-    assert "would hardly lower the misfit" in price_text(_made(_record(0.0)))
-    assert price_of_decibel(_made(())) is None and price_text(_made(())) == ""
-
-
-def test_while_views_still_come_nothing_is_extrapolated() -> None:
-    grown = (*_record(3.0), *_record(3.0, views=20))
-    assert price_of_decibel(_made(grown)) is None
-
-
 @pytest.mark.parametrize("slope", [3.0, 0.0])
 def test_the_picture_has_room_for_all_of_it(slope: float) -> None:
     arrays = history_arrays(_record(slope))
     arrays["held_out"] = 1.3 * arrays["residual"]
     arrays["n_gaussians"][30:] *= 2
-    further = next_decibel(arrays["seconds"], arrays["held_out"])
-    assert quality_against_time(arrays, further).startswith(b"\x89PNG")
+    assert quality_against_time(arrays).startswith(b"\x89PNG")
