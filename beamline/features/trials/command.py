@@ -90,6 +90,7 @@ class TradeoffRequest:
     first=(
         "methods",
         "quick",
+        "axis",
         "seconds",
         "max_seconds",
         "truth",
@@ -194,7 +195,7 @@ class StudyRequest:
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output"),
+    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output"),
 )
 @with_request(StudyRequest)
 def study(request: StudyRequest) -> None:
