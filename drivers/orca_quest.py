@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from drivers.base.protocols import CameraSettings, CameraTiming
-from drivers.flat import MEGABYTES, CheckedSettings, key
+from drivers.keys import MEGABYTES, CheckedSettings, key
 from recon.base.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)

@@ -62,7 +62,7 @@ import recon
 from click.testing import CliRunner
 from beamline.cli.recon import recon as command
 from beamline.features.trials.command import tradeoff
-from beamline.reconstruct.option_rules import RULES, takers
+from recon.methods import taking
 from beamline.reconstruct.outcome import label_of
 from beamline.features.trials.tradeoff import plan
 from recon import methods
@@ -77,7 +77,7 @@ labels = {t.label for t in trials if t.method == "grey"}
 assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers(RULES["iterations"]) and "grey" not in takers(RULES["tv-weight"])
+assert "grey" in taking("iterations") and "grey" not in taking("tv_weight")
 assert label_of("grey") == "Grey"
 """,
 )
@@ -241,7 +241,7 @@ STAGE = Extension(
     {
         "drivers/stages/turn/__init__.py": '"""A dummy stage."""\n\nDRIVERS = {"turn": "TurnStage"}\n',
         "drivers/stages/turn/stage.py": '''
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import serial
@@ -249,24 +249,22 @@ import serial
 from drivers.stages.settings import StageFigures, Wiring, key
 
 
-@dataclass(frozen=True)
-class TurnSettings:
+@dataclass(frozen=True, kw_only=True)
+class TurnSettings(Wiring, StageFigures):
     """A dummy."""
 
     pulse_output: ClassVar[None] = None
-    figures: StageFigures
-    wiring: Wiring = field(default=Wiring())
     gear: int = key(2, "Counts a step.", ge=1)
 
     def limits(self):
-        return self.figures.limits(self.figures.acceleration, 0.0)
+        return self.limits_with(self.acceleration, 0.0)
 
 
 class TurnStage:
     name, Settings = "stage", TurnSettings
 
     def __init__(self, url, settings, clock):
-        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
+        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.timeout)
         self._gear = settings.gear
 
     def position(self):

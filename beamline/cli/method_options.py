@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,13 +11,11 @@ import click
 
 from beamline.cli.options import (
     POSITIVE,
+    Declared,
     NameChoice,
-    WholeRange,
     declared,
     option,
     parsed,
-    rules_of,
-    run_option,
     together,
 )
 from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
@@ -27,10 +25,7 @@ from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import DEFAULT, build, by_name, has_setting, names, taking
-
-PRESETS_OF_METHODS = ("published",)
-"""Endings of names of methods that are variants of another method, such as r2-published."""
+from recon.methods import METHODS, build, by_name, has_setting, taking, with_trait
 
 
 def checkpoint_output(path: Path) -> Path:
@@ -49,8 +44,9 @@ def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | No
 
 def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any]:
     """Settings of methods by path, removed from the parameter values of a command."""
-    taken = [(param.rule, values.pop(name)) for name, param in declared(command).items() if param.rule.setting]
-    return {rule.setting: not value if rule.inverted else value for rule, value in taken if value is not None}
+    of_methods = [param for param in declared(command).values() if param.setting]
+    taken = [(param, values.pop(str(param.name))) for param in of_methods]
+    return {param.setting: not value if param.inverted else value for param, value in taken if value is not None}
 
 
 def row_settings(command: click.Command, methods: Sequence[str], values: dict[str, Any]) -> dict[str, dict[str, Plain]]:
@@ -59,12 +55,47 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
     Raises:
         UsageError: an option that no method takes.
     """
-    options = {rule.setting: name for name, rule in rules_of(command).items() if rule.setting}
+    options = {param.setting: name for name, param in declared(command).items() if param.setting}
     settings = settings_of(command, values)
     for path in settings:
         if not set(methods) & set(owners := taking(path)):
             raise click.UsageError(f"--{options[path]} is of {', '.join(owners)}; no row is by one of these.")
     return {method: {path: value for path, value in settings.items() if method in taking(path)} for method in methods}
+
+
+def takers(option: Declared) -> tuple[str, ...]:
+    """Names of the methods that have an option."""
+    if option.setting:
+        return taking(option.setting)
+    from recon.auto import Auto  # here, because it loads all methods
+
+    return (*((AUTO,) if getattr(Auto.traits, option.trait) else ()), *with_trait(option.trait))
+
+
+def refuse_other_methods(command: click.Command, given: Collection[str], method: str, *, stated: bool) -> None:
+    """Raise UsageError for a given option that belongs to other methods than this one.
+
+    Args:
+        stated: somebody chose the method; else it is the default.
+    """
+    of_methods = {name: param for name, param in declared(command).items() if param.setting or param.trait}
+    asked = {name: param for name, param in of_methods.items() if name in given}
+    if method in METHODS and all(param.setting for param in asked.values()):
+        own = by_name(method)
+        if all(has_setting(own, param.setting) for param in asked.values()):
+            return  # without a look at the other methods, which load torch
+    owners = {name: takers(param) for name, param in asked.items()}
+    for name in (name for name, methods in owners.items() if method not in methods):
+        what = f"it does not go with --method {method}." if stated else _instead(name, owners)
+        raise click.UsageError(f"--{name} is of {', '.join(owners[name])}; {what}")
+
+
+def _instead(name: str, owners: Mapping[str, Sequence[str]]) -> str:
+    """What to do about an option where no method was chosen: another option may be of other methods alone."""
+    others = [other for other, methods in owners.items() if not set(methods) & set(owners[name])]
+    if not others:
+        return "give --method with one of these."
+    return f"--{others[-1]} is of {', '.join(owners[others[-1]])}. Give one of the two options."
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
@@ -102,20 +133,6 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
     return settings
 
 
-def preset_of(method: str | None, preset: str | None) -> str | None:
-    """The method of this name with a preset's settings; without a preset, with its defaults.
-
-    Raises:
-        UsageError: the method has no such preset.
-    """
-    if preset is None:
-        return method
-    name = f"{method or DEFAULT}-{preset}"
-    if name not in names():
-        raise click.UsageError(f"--preset {preset} is of {DEFAULT}; it does not go with --method {method}.")
-    return name
-
-
 def slabs_resumed(path: Path | None) -> Path | None:
     """The file of --resume if it is a partial volume; else None."""
     from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
@@ -123,63 +140,91 @@ def slabs_resumed(path: Path | None) -> Path | None:
     return path if path is not None and is_partial(path) else None
 
 
-preset_option = option(
-    "--preset",
-    of_one_call=True,  # it is in the name of the method
-    type=NameChoice(PRESETS_OF_METHODS),
-    help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
-    "The same as the method r2-published.",
-)
-_STEPS = run_option(
+SLABS_RESUMED = "resume of slabs"
+"""Stands for `--resume` of a partial volume, which has rules of its own."""
+_OF_ONE_VOLUME = {
+    "roi": "a box is of one volume",
+    "truth": "a truth is compared with one volume",
+    "uncertainty": "error bars are of one volume",
+    **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes are not made in slabs"),
+}
+"""Options that several volumes, in time or of materials, do not go with."""
+
+_FINISHED = {"follow": "it is for a finished scan"}
+_BY_BUDGET = {"budget": "--budget chooses it"}
+_NOT_KEPT = {"budget": "a run within a budget keeps no checkpoints", **_FINISHED}
+_PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
+_BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
+RUNNING = ("follow", "is for a scan that still runs: give --follow.")
+IN_MEMORY = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
+FOR_TIME = dict.fromkeys(("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits")
+
+_STEPS = option(
     "--steps",
-    type=WholeRange(min=1),
+    setting="steps",
+    excludes={"seconds": "give one of them", **_PLANNED},
+    type=click.IntRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
     f"{MODEL_STEPS} where voxels alone predict held-out views as well.",
 )
-_GAUSSIANS = run_option(
+_GAUSSIANS = option(
     "--gaussians",
-    type=WholeRange(min=1),
+    setting="gaussians",
+    excludes=_PLANNED,
+    type=click.IntRange(min=1),
     help="Number of Gaussians at the start.",
 )
-_FINISH = run_option(
+_FINISH = option(
     "--finish",
-    type=WholeRange(min=0),
+    setting="finish",
+    excludes={**_PLANNED, **_FINISHED},
+    type=click.IntRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
     "with sparse patches where these predict held-out views better.",
 )
-_ITERATIONS = run_option(
+_ITERATIONS = option(
     "--iterations",
-    type=WholeRange(min=1),
+    setting="iterations",
+    excludes=_BY_BUDGET,
+    type=click.IntRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
-_TV_WEIGHT = run_option(
+_TV_WEIGHT = option(
     "--tv-weight",
+    setting="tv_weight",
     type=POSITIVE,
     help="Weight of the total variation, relative to the density of the sample.",
 )
-_PATCH_THRESHOLD = run_option(
+_PATCH_THRESHOLD = option(
     "--patch-threshold",
+    setting="patch_threshold",
     type=POSITIVE,
     help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
     "Default: chosen by held-out views.",
 )
-_ALLOW_NEGATIVE = run_option(
+_ALLOW_NEGATIVE = option(
     "--allow-negative",
+    setting="allow_negative",
+    excludes=_FINISHED,
     is_flag=True,
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
 _IN_TIME = together(
-    run_option(
+    option(
         "--time",
         "volumes",
-        type=WholeRange(min=2),
+        setting="volumes",
+        excludes={**_FINISHED, **_OF_ONE_VOLUME},
+        type=click.IntRange(min=2),
         metavar="N",
         help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",
     ),
-    run_option(
+    option(
         "--moves/--no-moves",
+        setting="moves",
+        needs=("time", "is of volumes in time: give --time N with it."),
         default=None,
         help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
@@ -201,68 +246,87 @@ equal_time = option(
 method_options = together(
     heading(METHOD),
     _STEPS,
-    run_option(
+    option(
         "--seconds",
+        setting="seconds",
+        excludes=_PLANNED,
         type=POSITIVE,
         help="Time of the whole call, instead of --steps: the fit gets what reading, correction, report and writing "
         "leave, which it does not shorten. If that is nothing, a warning says when the call will end. With --follow: "
         "most time after the end of the scan.",
     ),
-    run_option(
+    option(
         "--budget",
+        trait="budget",
+        excludes={"quality": "give one of them", **_BY_SECONDS},
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
         help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
     ),
-    run_option(
+    option(
         "--quality",
+        trait="presets",
+        excludes=_BY_SECONDS,
         type=NameChoice(list(PRESETS)),
         help="Preset of steps and Gaussians; of auto, of what is tried.",
     ),
     _GAUSSIANS,
-    run_option(
+    option(
         "--start",
+        setting="start",
+        excludes={**_BY_BUDGET, **_FINISHED},
         type=NameChoice(get_args(Start)),
         help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
         "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
     ),
-    run_option(
+    option(
         "--loss",
+        setting="fit.loss",
+        excludes=_BY_BUDGET,
         type=NameChoice(get_args(Loss)),
         help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
     ),
-    run_option(
+    option(
         "--kernel",
+        setting="fit.kernel",
+        excludes=_BY_BUDGET,
         type=NameChoice([kernel.value for kernel in Kernel]),
         help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
     ),
     heading(RESOURCES),
-    run_option(
+    option(
         "--device",
+        trait="device",
+        excludes={**_BY_BUDGET, **_FINISHED},
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
         help="Device that computes the fit, total variation and patches.",
     ),
     heading(METHOD),
-    run_option(
+    option(
         "--early-stop",
+        setting="early_stop",
+        excludes={**_BY_BUDGET, **_FINISHED},
         is_flag=True,
         help="End the fit when held-out views stop improving; holds out every tenth unless --views does.",
     ),
     _FINISH,
     heading(OUTPUT),
-    run_option(
+    option(
         "--checkpoint",
+        trait="checkpoints",
+        excludes=_NOT_KEPT,
         of_one_call=True,
-        repeated=False,
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
         help="Write the state of the fit to this file: every minute, at the end, and at Ctrl-C.",
     ),
-    run_option(
+    option(
         "--resume",
+        trait="checkpoints",
+        excludes=_NOT_KEPT,
         of_one_call=True,
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),
@@ -275,8 +339,11 @@ method_options = together(
     _PATCH_THRESHOLD,
     _ALLOW_NEGATIVE,
     _IN_TIME,
-    run_option(
+    option(
         "--plain-splatting",
+        setting="fit.rays.rectified",
+        inverted=True,
+        excludes=_BY_BUDGET,
         is_flag=True,
         help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It has a bias that the "
         "corrected projection avoids.",

@@ -21,7 +21,6 @@ from click.exceptions import ClickException, Exit
 from beamline.core.errors import exit_code, user_message
 from beamline.core.events import Event, Failed, Sink
 from beamline.core.sinks import JsonLines, fan_out
-from beamline.reconstruct.option_rules import RULES, OptionRule, contradiction
 from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
 from recon.methods import METHODS
@@ -35,21 +34,6 @@ class FiniteRange(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
-
-    def _describe_range(self) -> str:
-        """In a help page; click's own says `x<=None` without bounds."""
-        return "" if self.min is None and self.max is None else super()._describe_range()
-
-
-class WholeRange(click.IntRange):
-    """A range of integers; for other numbers click's own error names its type, but not the range."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        try:
-            int(value)
-        except ValueError:
-            self.fail(f"{value!r} is no whole number; expected one of {self._describe_range()}.", param, ctx)
-        return super().convert(value, param, ctx)
 
 
 class NameChoice(click.Choice):  # type: ignore[type-arg]
@@ -86,43 +70,42 @@ _ELSEWHERE = {
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
-SEED = WholeRange(min=0)
+SEED = click.IntRange(min=0)
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class Declared(click.Option):
-    """A click option with its rule: what it excludes and requires, and whether recipes contain it.
+    """A click option that says whose it is and what it goes with.
 
     Args:
-        rule: whose it is, and what it goes with; `excludes` and `needs` make one.
+        setting: it is of the methods with this setting, by its path in Python, such as `fit.loss`.
+        trait: it is of the methods with this trait, where it is no setting of theirs.
+        inverted: it is a flag that switches the setting off.
+        excludes: long names of options that do not go with it, and why.
+        needs: another option, without which this one means nothing, and the end of the sentence that says so.
         of_one_call: it is of one scan or call, and never part of a recipe.
-        repeated: the command line that repeats a call has it, too.
     """
 
     def __init__(
         self,
         *args: Any,
-        rule: OptionRule | None = None,
-        excludes: Mapping[str, str] | None = None,
+        setting: str = "",
+        trait: str = "",
+        inverted: bool = False,
+        excludes: Mapping[str, str] = MappingProxyType({}),
         needs: tuple[str, str] | None = None,
         of_one_call: bool = False,
-        repeated: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.rule = rule or OptionRule(excludes=dict(excludes or {}), needs=needs)
-        self.of_one_call, self.repeated = of_one_call, repeated
+        self.setting, self.trait, self.inverted = setting, trait, inverted
+        self.excludes, self.needs, self.of_one_call = excludes, needs, of_one_call
 
 
 def option(*names: str, **facts: Any) -> Decorator:
     """`click.option` for a `Declared` one."""
     return click.option(*names, cls=Declared, **facts)
-
-
-def run_option(name: str, *names: str, **facts: Any) -> Decorator:
-    """An option of a reconstruction with its rule from `beamline.reconstruct.option_rules`."""
-    return option(name, *names, rule=RULES[name.split("/")[0].lstrip("-")], **facts)
 
 
 def name_of(option: click.Option) -> str:
@@ -131,13 +114,8 @@ def name_of(option: click.Option) -> str:
 
 
 def declared(command: click.Command) -> dict[str, Declared]:
-    """The options of a command that declare rules, by parameter name."""
-    return {param.name: param for param in command.params if isinstance(param, Declared) and param.name}
-
-
-def rules_of(command: click.Command) -> dict[str, OptionRule]:
-    """The rules of a command's options, by their long names."""
-    return {name_of(param): param.rule for param in declared(command).values()}
+    """The options of a command that declare rules, by their long names."""
+    return {name_of(param): param for param in command.params if isinstance(param, Declared)}
 
 
 def refuse_contradictions(
@@ -149,8 +127,14 @@ def refuse_contradictions(
         given: long names of the options that the user gave, and of what else options may exclude.
         shown: how messages name the latter.
     """
-    if why := contradiction(rules_of(command), given, shown):
-        raise click.UsageError(why)
+    for name, param in declared(command).items():
+        if name not in given:
+            continue
+        for other in (other for other in param.excludes if other in given):
+            why = f"{shown.get(other, f'--{other}')}: {param.excludes[other]}"
+            raise click.UsageError(f"--{name} does not go with {why}. Nothing was computed.")
+        if param.needs is not None and param.needs[0] not in given:
+            raise click.UsageError(f"--{name} {param.needs[1]}")
 
 
 config_argument = click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
@@ -162,7 +146,7 @@ set_option = click.option(
     help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
 )
 json_option = option(
-    "--json", "as_json", is_flag=True, of_one_call=True, repeated=False,
+    "--json", "as_json", is_flag=True, of_one_call=True,
     help="Print one JSON event per line to stdout.",
 )  # fmt: skip
 seed_option = option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
@@ -176,7 +160,7 @@ def new_folder_option(default: str) -> Decorator:
 
 
 dry_option = option(
-    "--dry-run", "dry", is_flag=True, repeated=False,
+    "--dry-run", "dry", is_flag=True,
     help="Print what would run, the time and memory it will take and what would be written, and end.",
 )  # fmt: skip
 

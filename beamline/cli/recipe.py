@@ -6,9 +6,7 @@ import json
 import os
 import re
 import shlex
-import subprocess
-import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from beamline.cli.options import option as declared_option
 from beamline.core.files import SETTINGS, require_regular, text_in
 from recon.base.registry import unknown
 
-_RAW = "beamline.raw"
+_RAW, _TYPED = "beamline.raw", "beamline.typed"
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
 
 
@@ -29,6 +27,7 @@ class Repeatable(click.Command):
     """A command that records its options as they were typed."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta[_TYPED] = list(args)
         ctx.meta[_RAW] = self.make_parser(ctx).parse_args(args=list(args))[0]
         return super().parse_args(ctx, args)
 
@@ -76,7 +75,7 @@ def _recipe_value(option: click.Option, value: Any) -> Any:
     """The value of an option in a recipe; values of a repeatable option are separated by spaces."""
     if option.multiple:
         return " ".join(value)
-    return _from_anywhere(str(value), option.type) if isinstance(option.type, click.Path) else value
+    return os.path.realpath(value) if isinstance(option.type, click.Path) else value
 
 
 def _scalar(value: Any) -> str:
@@ -84,43 +83,9 @@ def _scalar(value: Any) -> str:
     return text if _PLAIN.fullmatch(text) else json.dumps(text)
 
 
-def repeating(ctx: click.Context, argument: Path | Sequence[Path], output: Path, without: Collection[str] = ()) -> str:
-    """The command line that repeats a call from any folder: with absolute paths and another output.
-
-    Args:
-        argument: the file of the command, or its files.
-        output: of this call; the line names another one, because nothing is overwritten.
-        without: options that will not work again.
-    """
-    again = f"{output.stem}_again{output.suffix}"
-    files = [argument] if isinstance(argument, Path) else argument
-    words = ["beamline", str(ctx.info_name), *_leading(ctx), *(os.path.realpath(file) for file in files)]
-    for option, value in given(ctx).items():
-        if option.name in ("output", *without) or not getattr(option, "repeated", True):
-            continue
-        if option.is_flag:
-            on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")
-            words.append(max(option.opts if on else option.secondary_opts, key=len))
-            continue
-        name, several = max(option.opts, key=len), value if isinstance(value, list | tuple) else [value]
-        values = [_from_anywhere(str(each), option.type) for each in several]
-        words += [name, *values] if option.nargs > 1 else [word for each in values for word in (name, each)]
-    words += ["--output", again]
-    return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)
-
-
-def _leading(ctx: click.Context) -> list[str]:
-    """Arguments before the file, such as the name of a study."""
-    names = [str(param.name) for param in ctx.command.params if isinstance(param, click.Argument)]
-    return [str(ctx.params[name]) for name in names if isinstance(ctx.params[name], str)]
-
-
-def _from_anywhere(value: str, kind: object) -> str:
-    """A path made absolute, also in FILE:first:end; not a number of counts in its place."""
-    if isinstance(kind, click.Path):
-        return value if value.isdecimal() and not os.path.lexists(value) else os.path.realpath(value)
-    head, colon, tail = value.partition(":")
-    return f"{Path(head).resolve()}{colon}{tail}" if "." in head and Path(head).is_file() else value
+def typed_line(ctx: click.Context) -> str:
+    """The command line of this call, as it was typed."""
+    return shlex.join(["beamline", str(ctx.info_name), *ctx.meta[_TYPED]])
 
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -128,7 +93,6 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return declared_option(
         "--config",
         of_one_call=True,
-        repeated=False,
         type=click.Path(path_type=Path),
         is_eager=True,
         expose_value=False,

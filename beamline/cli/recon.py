@@ -2,33 +2,33 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
-from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, rules_of
-from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
+from beamline.cli.method_options import (
+    SLABS_RESUMED,
+    method_with,
+    refuse_other_methods,
+    settings_of,
+    slabs_resumed,
+)
+from beamline.cli.options import declared, json_events, refuse_contradictions, refuse_shared
+from beamline.cli.recipe import Grouped, names_given, recipe_text, typed_line
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import events_shown, results
-from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
-from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
-from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
-from beamline.core.installed import version
+from beamline.core.errors import DataError, QualityError, ScanStopped
+from beamline.core.events import Done, Event, FitReached, StateEntered
+from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
-from beamline.core.sinks import fan_out, sentence, while_it_works
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
-from beamline.core.text import printable, safe_name
-from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods
+from beamline.core.text import safe_name
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME, streams
@@ -36,50 +36,6 @@ from recon.methods import DEFAULT, IN_TIME, streams
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
     from beamline.storage.recon_record import ReconRecord
-
-
-class LogLines:
-    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._lock = stream, threading.Lock()
-
-    def __call__(self, event: Event) -> None:
-        text = None if isinstance(event, ReconStarted) else sentence(event)
-        if text is None:
-            text = ", ".join(f"{name} {value}" for name, value in event.data.items())
-        at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock:
-            self._stream.write(f"{at}  {event.event}: {printable(' '.join(text.split()))}\n")
-            self._stream.flush()
-
-
-@contextmanager
-def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes the log, if one is requested. An error in the block becomes its last line.
-
-    If its disk is full, `warn` gets a warning, and the work goes on.
-    """
-    if path is None:
-        yield []
-        return
-    refuse_existing(path)
-    with ExitStack() as closing:
-        with named_on_failure(path):
-            file = closing.enter_context(new_log(path))
-        write = LogLines(file)
-
-        def named(event: Event) -> None:
-            with named_on_failure(path):
-                write(event)
-
-        lines = while_it_works(named, warn)
-        lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
-        try:
-            yield [lines]
-        except (Exception, KeyboardInterrupt) as error:
-            lines(Failed(user_message(error), time=SystemClock().now()))
-            raise
 
 
 @click.command(
@@ -98,8 +54,7 @@ def recon(**values: Any) -> None:
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
-    # A log holds the failure of a scan that is not there, and a recipe needs none.
-    there = not values["follow"] and values["write_config"] is None and values["log"] is None
+    there = not values["follow"] and values["write_config"] is None  # a recipe needs no scan
     options = options_of(click.get_current_context(), there=there)
     if values["write_config"] is not None:
         if values["output"] is not None:
@@ -108,8 +63,6 @@ def recon(**values: Any) -> None:
         if values["output"] is None:
             return
     if values["dry"]:
-        if values["log"] is not None:
-            refuse_existing(values["log"])
         dry_run(options, SystemClock(), values["as_json"])
     else:
         run_reconstruction(options, values)
@@ -138,7 +91,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
 
     page = report_beside(path) if values["report"] else None
     files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
-    files |= {"--resume": values["resume"], "--log": values["log"], "--write-config": values["write_config"]}
+    files |= {"--resume": values["resume"], "--write-config": values["write_config"]}
     refuse_shared(files)
     partial, goal = slabs_resumed(values["resume"]), (values["enough_gain"], values["enough_loss"])
     source, selection = chosen(file, values["seed"], values)
@@ -152,7 +105,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
         "checkpoints": CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
         "enough": None if goal == (None, None) else Goal(*goal), "partial": partial,
         "follow": FollowTiming() if values["follow"] else None, "recipe": recipe_text(context, method),
-        "command": repeating(context, file, path, () if partial is None else ("resume",)),
+        "command": typed_line(context),
     })  # fmt: skip
 
 
@@ -165,18 +118,17 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     Raises:
         UsageError: they do not.
     """
-    asked, rules, values = names_given(context), rules_of(context.command), context.params
+    asked, values = names_given(context), context.params
     if slabs_resumed(values["resume"]):
         asked = asked - {"resume"} | {SLABS_RESUMED}
-    method = preset_of(values["method"], values["preset"])
+    method = values["method"]
     stated = method is not None
     if method is None:
-        of_a_method = {name for name, rule in rules.items() if rule.of_methods}
+        of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.trait}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
         method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
-    if why := of_other_methods(rules, asked, method, stated=stated):
-        raise click.UsageError(why)
+    refuse_other_methods(context.command, asked, method, stated=stated)
     for step in chosen_steps(values) if values["follow"] and streams(method) else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
@@ -228,12 +180,9 @@ def run_reconstruction(
         if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.several)):
             stop.ready = True
 
-    with events_shown(values["as_json"]) as usual:
-        shown = LogLines(sys.stderr) if values.get("verbose") and not values["as_json"] else usual
-        with logged(values.get("log"), shown) as lines:
-            sink = fan_out(made, *lines, shown)
-            scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
-            record = reconstruct_file(options, sink, SystemClock(), stop_scope=scope)
+    with events_shown(values["as_json"]) as shown:
+        scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
+        record = reconstruct_file(options, fan_out(made, shown), SystemClock(), stop_scope=scope)
     output = " and ".join(map(str, options.target.outputs))
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))

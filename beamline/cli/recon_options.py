@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.method_options import method_options, preset_option
+from beamline.cli.method_options import FOR_TIME, IN_MEMORY, RUNNING, SLABS_RESUMED, method_options
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -17,7 +17,6 @@ from beamline.cli.options import (
     json_option,
     option,
     parsed,
-    run_option,
     scan_argument,
     seed_option,
     together,
@@ -69,14 +68,15 @@ report_option = option(
     show_default=True,
     help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
 )
-unfinished_option = run_option(
+unfinished_option = option(
     "--unfinished",
     of_one_call=True,
     is_flag=True,
     help="Accept an incomplete scan, one that failed or is still running, and use its frames.",
 )
-memory_option = run_option(
+memory_option = option(
     "--memory",
+    excludes=IN_MEMORY,
     metavar="SIZE",
     callback=parsed(memory_size),
     help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
@@ -98,7 +98,6 @@ recon_options = together(
     ),
     selection_options,
     method_options,
-    preset_option,
     heading(METHOD),
     option(
         "--filter",
@@ -117,13 +116,14 @@ recon_options = together(
     heading(METHOD),
     seed_option,
     heading(OUTPUT),
-    run_option(
+    option(
         "--uncertainty",
+        excludes=FOR_TIME,
         is_flag=True,
         help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv "
         "and fbp, into an .h5.",
     ),
-    run_option(
+    option(
         "--truth",
         of_one_call=True,
         metavar="FILE[:A:B]",
@@ -139,28 +139,32 @@ recon_options = together(
     ),
     report_option,
     heading(DATA),
-    run_option(
+    option(
         "--follow",
+        excludes={SLABS_RESUMED: "these slabs are of a finished scan"},
         of_one_call=True,
         is_flag=True,
         help="Follow a running scan: reconstruct while it grows. A method that needs all views waits for its end.",
     ),
-    run_option(
+    option(
         "--earlier",
+        needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts."),
         of_one_call=True,
         type=click.Path(path_type=Path),
         multiple=True,
         metavar="FILE",
         help="With --follow: an earlier part of a resumed run, whose views come first. May be repeated.",
     ),
-    run_option(
+    option(
         "--enough-loss",
+        needs=RUNNING,
         type=POSITIVE,
         metavar="DB",
         help="With --follow: report when all remaining views together would add at most so many dB of PSNR.",
     ),
-    run_option(
+    option(
         "--enough-gain",
+        needs=RUNNING,
         type=POSITIVE,
         metavar="DB",
         help="With --follow: report when ten more views would add at most so many dB.",
@@ -168,8 +172,9 @@ recon_options = together(
     unfinished_option,
     heading(RESOURCES),
     memory_option,
-    run_option(
+    option(
         "--cluster",
+        excludes=IN_MEMORY,
         of_one_call=True,
         metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
@@ -177,9 +182,10 @@ recon_options = together(
         "or those of a scheduler. It needs splatline-cluster.",
     ),
     heading(OUTPUT),
-    run_option(
+    option(
         "--roi",
         "region",
+        excludes={"follow": "it is for a finished scan", "truth": "a truth is compared with the whole volume"},
         metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
         help="Box of voxels to write, of the volume that the same options give without this one. It is made of the "
@@ -188,32 +194,16 @@ recon_options = together(
     option(
         "--write-config",
         of_one_call=True,
-        repeated=False,
         type=click.Path(path_type=Path),
         help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
         "done.",
     ),
-    option(
-        "--log",
-        of_one_call=True,
-        repeated=False,
-        type=click.Path(path_type=Path),
-        help="Write everything that happens to this text file.",
-    ),
-    option(
-        "-v",
-        "--verbose",
-        of_one_call=True,
-        repeated=False,
-        is_flag=True,
-        help="Print everything that happens, with its time, to stderr.",
-    ),
     heading(RESOURCES),
-    run_option(
+    option(
         "--dry-run",
         "dry",
+        excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time"},
         of_one_call=True,
-        repeated=False,
         is_flag=True,
         help="Print the memory, time and disk space that it will take, and end. Nothing is run.",
     ),
@@ -221,7 +211,6 @@ recon_options = together(
         "--beside-scan",
         "beside",
         of_one_call=True,
-        repeated=False,
         is_flag=True,
         hidden=True,
         help="End when stdin does, with the process that started this one.",

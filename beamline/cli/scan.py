@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.control import recovered_files
-from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
+from beamline.cli.options import json_events, json_option, refuse_contradictions, set_by, set_option, with_request
+from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
-from beamline.core.files import remove
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
@@ -50,9 +50,6 @@ class ScanRequest:
         is_flag=True,
         help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices.",
     )
-    discard: bool = set_by(
-        "--discard", is_flag=True, help="With --rehearse: remove the folder of a run that ended well, and its frames."
-    )
     page: bool = set_by("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
     no_live: bool = set_by("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
     documents: str | None = set_by(
@@ -81,6 +78,11 @@ class ScanRequest:
         "--resume",
         metavar="RUN",
         type=click.Path(path_type=Path, exists=True, file_okay=False),
+        excludes={
+            "output": "the run has its folder",
+            "rehearse": "a rehearsal starts a new run; RUN has its devices",
+            "documents": "they describe complete scans",
+        },
         help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own "
         "configuration.",
     )
@@ -98,7 +100,7 @@ class ScanRequest:
         return *self.overrides, *(NO_LIVE if self.no_live else ())
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
     """Run the scan in CONFIG, or continue one that ended early (--resume RUN).
@@ -114,40 +116,56 @@ def scan(request: ScanRequest) -> None:
     Exit codes: see `beamline --help`. 6 means that darks or flats cannot be used. 7 means that the scan is complete,
     but frames have an alarm of the monitor, or darks or flats a fault.
     """
-    from beamline.config.load import load
-    from beamline.scan.resume import NotJoined, open_for_resume, recover_run
-
-    file, run = request.file, request.run
     _refuse_contradictions(request)
     if _are_several_scans(request.files):
         _queue().take_all(request)
         return
     with json_events(request.as_json) as json_sink, ExitStack() as held:
-        settings = request.settings
-        config = None if file is None else load(file, settings, rehearse=request.rehearse)
-        of_energies = _config_of_energies(config, run, request.documents)
-        if of_energies is not None:
-            if not request.dry:
-                _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
-                return
-            run, config = None, of_energies
-        try:
-            series = None if run is None else held.enter_context(open_for_resume(run, config))
-        except NotJoined:
-            if request.dry or run is None:
-                raise
-            recovered_files(*recover_run(run), json_sink, request.as_json)
-            return
-        config = series.config if series else config
-        assert config is not None
-        for sentence in series.left_out if series else ():
-            click.echo(f"Warning: {sentence}", err=True)
-        _ask_about(config, asked=not (request.dry or request.rehearse or series))
-        if request.dry:
-            _dry_run(config, request.output, series, json_sink, request.as_json)
-            return
-        result = run_one(config, series, request, [json_sink], held)
-        rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
+        _scan_or_series(request, json_sink, held)
+
+
+def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:
+    """Take a scan, or those of its energies; or what a run lacks, which may be no more than to be joined."""
+    from beamline.config.load import load
+    from beamline.scan.resume import NotJoined, open_for_resume, recover_run
+
+    file, run = request.file, request.run
+    config = None if file is None else load(file, request.settings, rehearse=request.rehearse)
+    of_energies = _config_of_energies(config, run, request.documents)
+    if of_energies is not None and not request.dry:
+        _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
+        return
+    if of_energies is not None:
+        run, config = None, of_energies
+    try:
+        series = None if run is None else held.enter_context(open_for_resume(run, config))
+    except NotJoined:
+        if request.dry or run is None:
+            raise
+        recovered_files(*recover_run(run), json_sink, request.as_json)
+        return
+    config = series.config if series else config
+    assert config is not None
+    _one_scan(config, series, request, json_sink, held)
+
+
+def _one_scan(
+    config: Config, series: ResumableRun | None, request: ScanRequest, json_sink: Sink, held: ExitStack
+) -> None:
+    """Take the scan, or print its plan.
+
+    Raises:
+        AlarmError: it is complete, and frames, darks or flats have a fault.
+    """
+    for sentence in series.left_out if series else ():
+        click.echo(f"Warning: {sentence}", err=True)
+    _ask_about(config, asked=not (request.dry or request.rehearse or series))
+    if request.dry:
+        _dry_run(config, request.output, series, json_sink, request.as_json)
+        return
+    result = run_one(config, series, request, [json_sink], held)
+    held.close()  # documents are sent before the result is printed
+    rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
     if not request.as_json:
         click.echo("\n".join([_results(result), *rehearsed]))
     if faults := faults_of(result):
@@ -170,25 +188,21 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
-    """Duration of the rehearsal and of the scan, as lines. `--discard` removes the folder if all frames are good."""
+    """Duration of the rehearsal and of the scan, as lines."""
     from beamline.plan.timeline import duration_text
     from beamline.scan.preflight import dry_run
 
     planned = duration_text(dry_run(config, request.output).timeline.duration)
-    lines = [
+    return [
         f"{'rehearsed':<10}in {duration_text(result.seconds)}. At the instrument the plan takes {planned}, without "
         "moves of shutter and sample"
     ]
-    if request.discard and not faults_of(result):
-        remove(result.folder)
-        lines.append(f"{'discarded':<10}{result.folder}")
-    return lines
 
 
 def _refuse_contradictions(request: ScanRequest) -> None:
     """Raises UsageError for options that do not go together."""
-    if request.discard and not request.rehearse:
-        raise click.UsageError("--discard removes the files of a rehearsal: it needs --rehearse.")
+    context = click.get_current_context()
+    refuse_contradictions(context.command, names_given(context))
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     several = _are_several_scans(request.files)
@@ -201,16 +215,8 @@ def _refuse_contradictions(request: ScanRequest) -> None:
     ):
         if given and of_several is not several:
             raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
-    if request.run is None:
-        return
-    if request.output is not None or (request.overrides and request.file is None):
-        raise click.UsageError("--resume continues RUN with its own configuration: leave out -o and --set.")
-    if request.rehearse:
-        raise click.UsageError(
-            "--rehearse starts a new run: leave it out with --resume, which uses the devices of RUN."
-        )
-    if request.documents is not None:
-        raise click.UsageError("--documents describes complete scans: leave it out with --resume.")
+    if request.run is not None and request.overrides and request.file is None:
+        raise click.UsageError("--resume continues RUN with its own configuration: leave out --set.")
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
@@ -283,8 +289,6 @@ def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], 
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
 
-    if request.discard:
-        raise click.UsageError("--discard cannot be combined with scan.energies: leave it out.")
     with _shown(request, others, stop) as (sinks, ask):
         return run_energies(
             config, request.output, sinks, stop,

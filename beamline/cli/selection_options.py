@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import POSITIVE, NameChoice, WholeRange, option, parsed, together
+from beamline.cli.options import POSITIVE, NameChoice, option, parsed, together
 from beamline.cli.recipe import CORRECTIONS, DATA, heading
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
@@ -228,7 +228,7 @@ _BEFORE = (
     option(
         "--bin",
         "binning",
-        type=WholeRange(min=1),
+        type=click.IntRange(min=1),
         default=1,
         show_default=True,
         help="Average blocks of N x N pixels.",
@@ -254,7 +254,7 @@ _AFTER = (
     heading(DATA),
     option(
         "--frames-per-view",
-        type=WholeRange(min=1),
+        type=click.IntRange(min=1),
         metavar="N",
         help="Average N successive projections to one view, such as those that a step scan takes at one angle; 1: "
         "average none. Default: as the plan in the scan file says.",

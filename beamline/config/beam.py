@@ -29,7 +29,7 @@ class MotorSection(Section):
     stage: Annotated[StageConfig, Field(discriminator="kind")]
 
     def refuse_unreachable(self, places: Mapping[str, float]) -> None:
-        figures = self.stage.settings.figures
+        figures = self.stage.settings
         low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
         for name, place in places.items():
             if not low - 1e-9 <= place <= high + 1e-9:
@@ -38,7 +38,7 @@ class MotorSection(Section):
             raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
 
     def _places(self, degrees: Mapping[str, float], failed: str) -> StagePlaces:
-        speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
+        speed = self.stage.settings.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
         return StagePlaces({name: math.radians(place) for name, place in degrees.items()}, speed, failed)
 
     def _connected(self, name: str, places: StagePlaces, clock: Clock, url: str | None) -> PlacedStage:

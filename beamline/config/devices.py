@@ -171,7 +171,7 @@ class DeviceSection(Section):
 
     @model_validator(mode="after")
     def _edges_agree(self) -> Self:
-        camera, high = self.camera, self.stage.settings.wiring.active_high
+        camera, high = self.camera, self.stage.settings.active_high
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
             raise ValueError(
                 f"stage.active_high {str(high).lower()} contradicts camera.trigger_polarity "

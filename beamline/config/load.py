@@ -77,19 +77,8 @@ def load(
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment, takes_text)
-    if not rehearse:
-        return _validated(tree, str(path))
-    simulation = tree.data.pop("simulation", None)
-    try:
-        config = _validated(tree, str(path))
-    except ConfigError as error:
-        if simulation is None:
-            raise
-        try:
-            config = _validated(Tree({**tree.data, "simulation": simulation}, tree.origins), str(path))
-        except ConfigError:
-            raise error from None
-    return _validated(Tree(rehearsal(config, simulation), tree.origins), str(path))
+    config = _validated(tree, str(path))
+    return _validated(Tree(rehearsal(config), tree.origins), str(path)) if rehearse else config
 
 
 def takes_text(keys: Sequence[str]) -> bool:
@@ -281,16 +270,13 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     if isinstance(angles, FileAngles) and not Path(angles.path).is_file():
         yield (
             ("scan", "angles", "path"),
-            f"scan.angles.path: there is no file {angles.path}; expected one angle in degrees a line",
+            f"scan.angles.path: there is no file {angles.path}; expected degrees",
         )
-    if simulation is None or not isinstance(simulation.scene, str):
-        return
-    if not (shipped / simulation.scene).is_file():
+    scene = simulation.scene if simulation is not None else None
+    if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
-        yield (
-            ("simulation", "scene"),
-            f"simulation.scene: there is no file {simulation.scene}; expected one beside this file, or {scenes}",
-        )
+        at = ("simulation", "scene")
+        yield at, f"simulation.scene: there is no file {scene}; expected one beside this file, or {scenes}"
 
 
 def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
@@ -312,12 +298,10 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
         return
     for key, fit in _ONE_FRAME_A_PULSE.items():
         if (value := getattr(camera, key)) not in fit:
-            yield (
-                ("devices", "camera", key),
-                f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; expected "
-                f"{' | '.join(map(str, fit))}, or scan.mode: step",
-            )
-    width = stage.settings.wiring.pulse_width
+            expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
+            what = f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; {expected}"
+            yield ("devices", "camera", key), what
+    width = stage.settings.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),

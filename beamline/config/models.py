@@ -236,7 +236,7 @@ class Speed(Section):
 
 
 class SimulationSection(Section):
-    """Only with simulated devices."""
+    """Of simulated devices, and of the rehearsal of a real instrument, which ignores it otherwise."""
 
     scene: str | dict[str, Any] = Field(
         default="scenes/battery.yaml",
@@ -276,8 +276,6 @@ class Config(Section):
             raise ValueError(
                 "devices.camera: simulated devices need a simulation section; `simulation: {}` takes its defaults"
             )
-        if self.simulation is not None and not any(simulated.values()):
-            raise ValueError("simulation: belongs to simulated devices, and every device is real; remove the section")
         return self
 
     @model_validator(mode="after")
@@ -305,22 +303,25 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _energy_can_be_set(self) -> Self:
-        device, one, several = self.devices.monochromator, self.scan.energy, self.scan.energies
+        one, several = self.scan.energy, self.scan.energies
         if one is not None and several is not None:
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
-        if one is None and several is None:
-            return self
-        name, energies = ("scan.energies", several) if several else ("scan.energy", (one or 0.0,))
-        if isinstance(device, NoMonochromator):
+        if several and self.recon.stop_when is not None:
+            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
+        texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
+        if twice := [text for text in texts if texts.count(text) > 1]:
+            raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+        return self
+
+    @model_validator(mode="after")
+    def _monochromator_reaches_the_energies(self) -> Self:
+        device, name = self.devices.monochromator, "scan.energies" if self.scan.energies else "scan.energy"
+        energies = self.scan.energies or ([] if self.scan.energy is None else [self.scan.energy])
+        if energies and isinstance(device, NoMonochromator):
             raise ValueError(
                 f"{name} needs a monochromator, and devices.monochromator.kind is none; name one, or set {name} to null"
             )
-        texts = [f"{energy:.7g}" for energy in energies]  # as the names of run folders
-        if twice := [text for text in texts if texts.count(text) > 1]:
-            raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
-        if several and self.recon.stop_when is not None:
-            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
-        low, high = device.range_kev or (0.0, math.inf)
+        low, high = getattr(device, "range_kev", None) or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(
                 f"{name}: {beyond[0]:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"

@@ -17,19 +17,18 @@ _ELECTRONS = 5000  # of a sensor pixel in an exposure without a sample: 70 % of 
 _LONGEST = 60  # characters of a sample's name before the mark, which ends the run folder's name
 
 
-def rehearsal(config: Config, simulation: dict[str, Any] | None = None) -> dict[str, Any]:
+def rehearsal(config: Config) -> dict[str, Any]:
     """The plain values of the same scan with simulated devices; a simulated configuration is unchanged.
 
     All that plan, stage and camera settings say stays. The rotation axis is that of the scene, so it is searched.
-
-    Args:
-        simulation: keys of its section. Unless they say otherwise, the scene is a battery that fits the field, and the
-            clock is virtual, so that it waits for each simulated frame.
+    Unless its section `simulation` says otherwise, the scene is a battery that fits the field, and the clock is
+    virtual, so that it waits for each simulated frame.
     """
     data = config.model_dump(mode="json")
     if config.simulated:
         return data
-    data["simulation"] = {"clock": "virtual", "scene": _scene(config), **(simulation or {})}
+    stated = {} if config.simulation is None else config.simulation.model_dump(mode="json", exclude_unset=True)
+    data["simulation"] = {"clock": "virtual", "scene": _scene(config), **stated}
     data["devices"] = _devices(config.devices)
     data["sample"]["name"] = f"{config.sample.name[:_LONGEST]}{_MARK}"
     data["optics"]["axis_col"], data["recon"]["axis"] = None, "auto"
@@ -51,7 +50,7 @@ def _scene(config: Config) -> dict[str, Any]:
 
 
 def _devices(real: DeviceSection) -> dict[str, Any]:
-    high = real.stage.settings.wiring.active_high
+    high = real.stage.settings.active_high
     shared = {name: getattr(real.camera, name, None) for name in SimulatedOrca.model_fields}
     camera = {name: value for name, value in shared.items() if value is not None}
     camera |= {"kind": "simulated_orca", "trigger_polarity": "positive" if high else "negative"}

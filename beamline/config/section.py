@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, fields
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 
-from drivers.flat import FlatField, Key, flat_fields, from_flat
+from drivers.keys import Key
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
@@ -43,62 +44,50 @@ class Section(BaseModel):
         return data
 
 
+def _keys(settings: type[Any]) -> Iterator[tuple[str, Key]]:
+    """The fields of a driver's settings with their keys."""
+    return ((field.name, field.metadata["key"]) for field in fields(settings))
+
+
 def declared(settings: type[Any]) -> dict[str, Any]:
     """Type and default of each key by name, for `section_of`."""
-    return {_name(field): _declared(field) for field in flat_fields(settings)}
+    types = get_type_hints(settings)
+    return {key.name_of(name): _declared(key, types[name]) for name, key in _keys(settings)}
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
     """The driver's settings from a section with the same keys."""
-    return from_flat(
-        settings, {field.name: _inside(field, getattr(section, _name(field))) for field in flat_fields(settings)}
-    )
+    types = get_type_hints(settings)
+    values = {name: (key, getattr(section, key.name_of(name))) for name, key in _keys(settings)}
+    return settings(**{name: _inside(key, types[name], value) for name, (key, value) in values.items()})
 
 
-def _key(field: FlatField) -> Key:
-    declared_key = field.metadata["key"]
-    assert isinstance(declared_key, Key)
-    return declared_key
-
-
-def _name(field: FlatField) -> str:
-    return _key(field).name_of(field.name)
-
-
-def _inside(field: FlatField, value: Any) -> Any:
+def _inside(key: Key, kind: Any, value: Any) -> Any:
     """A key's value for the driver, in the unit and of the type of the field."""
-    if value is None or _key(field).converted:
-        return _key(field).inside(value)
-    return field.plain(value) if _is(field.plain, StrEnum, Path) else value
+    made = next((each for each in (kind, *get_args(kind)) if _is(each, StrEnum, Path)), None)
+    return key.inside(value) if made is None or value is None else made(value)
 
 
-def _is(plain: Any, *kinds: type[Any]) -> bool:
+def _is(kind: Any, *kinds: type[Any]) -> bool:
     """Whether it is a class of one of these kinds, and not a union."""
-    return isinstance(plain, type) and issubclass(plain, kinds)
+    return isinstance(kind, type) and issubclass(kind, kinds)
 
 
-def _declared(field: FlatField) -> tuple[Any, Any]:
+def _declared(key: Key, kind: Any) -> tuple[Any, Any]:
     """Type and default of a field's key, as pydantic takes them."""
-    key, plain = _key(field), field.plain
-    legal: Any = plain
-    if _is(plain, StrEnum):
-        legal = Literal[tuple(choice.value for choice in plain)]
-    elif _is(plain, Path):
+    optional = get_origin(kind) is UnionType and NoneType in get_args(kind)
+    legal: Any = Union[tuple(each for each in get_args(kind) if each is not NoneType)] if optional else kind  # noqa: UP007
+    if _is(legal, StrEnum):
+        legal = Literal[tuple(choice.value for choice in legal)]
+    elif _is(legal, Path):
         legal = str
     if key.problem is not None:
         legal = Annotated[legal, without(key.problem)]
     if key.bounds:
         legal = Annotated[legal, Field(**key.bounds)]
-    if field.optional:
-        legal = legal | None
-    default = field.default
-    if default is MISSING:
-        default = ...
-    elif key.converted:
-        default = key.default
-    elif isinstance(default, StrEnum):
-        default = default.value
-    return legal, Field(default, description=key.doc or None)
+    default = ... if key.default is MISSING else key.default
+    default = default.value if isinstance(default, StrEnum) else default
+    return legal | None if optional else legal, Field(default, description=key.doc or None)
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:

@@ -1,5 +1,4 @@
-"""Configuration of the rotation stage: one section per kind, with the keys that its settings declare; and settings that
-a program changed in a controller, kept on disk until it has restored them.
+"""Configuration of the rotation stage: one section per kind, with the keys that its settings declare.
 
 Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
 folder says.
@@ -7,25 +6,16 @@ folder says.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping
-from contextlib import suppress
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
-from zlib import crc32
 
 from pydantic import Field, model_validator
 
 from beamline.config.section import Section, declared, read_from, section_of
-from beamline.core.errors import DataError
-from beamline.core.files import write_whole
-from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
 from drivers.stages.settings import StageDriver, StageSettings, with_keys
-from drivers.stages.shared import RestoresSettings
 from recon.base.registry import Registry, in_folders
 
 STAGES: Registry[StageDriver] = Registry(
@@ -37,47 +27,6 @@ STAGES: Registry[StageDriver] = Registry(
     with_keys,
 )
 """Kind, as a configuration names it -> the driver."""
-
-
-_IDENTITY = ("model", "serial", "device", "axis", "channel")
-
-
-def keep_found_settings(stage: RotationStage, folder: Path | None = None) -> None:
-    """Store the found settings on disk; settings stored there by an earlier program are restored instead."""
-    if isinstance(stage, RestoresSettings):
-        stage.keep_found_settings(FoundOnDisk(file_of(stage.describe(), folder or state_folder() / "stages")))
-
-
-def file_of(said: Mapping[str, object], folder: Path) -> Path:
-    """File for the settings of the stage with this description: named by its serial number, or by its port if it
-    reports none.
-    """
-    which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
-    name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
-    return folder / f"{name}-{crc32(json.dumps(which).encode()):08x}.json"
-
-
-class FoundOnDisk:
-    """Implements `drivers.stages.shared.SettingsStore`. If the disk refuses, only this protection is lost."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def load(self) -> Mapping[str, str]:
-        with suppress(OSError, ValueError):  # none, or not whole
-            kept_settings = json.loads(self._path.read_text(encoding="utf-8"))
-            if isinstance(kept_settings, dict):
-                return {str(name): str(value) for name, value in kept_settings.items()}
-        return {}
-
-    def save(self, found: Mapping[str, str]) -> None:
-        with suppress(OSError, DataError):
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(self._path, json.dumps(dict(found)), replace=True)
-
-    def clear(self) -> None:
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
 
 
 class StageSection(Section):
@@ -109,16 +58,8 @@ class StageSection(Section):
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
-        """Connect the driver at the port, or at `url`; see `StageDriver`. Settings of a real stage are stored on
-        disk."""
-        stage = STAGES[self.kind](url or self.port, self.settings, clock)
-        try:
-            if not (url or self.port).lower().startswith("sim://"):
-                keep_found_settings(stage)
-        except BaseException:
-            stage.close()
-            raise
-        return stage
+        """Connect the driver at the port, or at `url`; see `StageDriver`."""
+        return STAGES[self.kind](url or self.port, self.settings, clock)
 
     def halt(self, clock: Clock) -> None:
         """Stop the stage; see `StageDriver`."""

@@ -18,7 +18,6 @@ from recon.base.registry import did_you_mean
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
-_MOST_VALUES = 100_000
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
@@ -58,32 +57,25 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
     try:
-        node = yaml.compose(text, yaml.SafeLoader)  # refuses control characters
+        node = yaml.compose(text, yaml.SafeLoader)
         if node is None:
             return None, origins
-        _walk(node, (), name, origins)
+        _locate(node, (), name, origins)
         return yaml.SafeLoader("").construct_document(node), origins
-    except yaml.MarkedYAMLError as error:
-        colon = error.problem is not None and "expected ':'" in error.problem  # which is missed at the next line
-        mark = (error.context_mark if colon else None) or error.problem_mark or error.context_mark
-        line, col = (mark.line, mark.column) if mark else (0, 0)
-        *_, before, here = ["", "", *text.split("\n")][: line + 3]
-        above = line > 0 and "mapping values" in str(error.problem) and ":" not in before + here[:col]
-        where = f"{name}:{line + 1 - above}" if mark and "\n" in text else name
-        what = ", ".join(part for part in (error.context, error.problem) if part)
-        what = "a colon is missing after a key" if colon or above else what
-        raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
-    except (yaml.YAMLError, *YAML_FAULTS) as error:
-        what = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{name}: this is not YAML ({what}). Nothing was started.") from None
     except RecursionError:
         raise ConfigError(f"{name}: a value contains itself or is nested too deeply. Nothing was started.") from None
+    except (yaml.YAMLError, *YAML_FAULTS) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
+        what = getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__
+        if "expected ':'" in what or "mapping values" in what:
+            what = "a colon is missing after a key of this line or the one above"
+        raise ConfigError(f"{place}: this is not YAML ({what}). Nothing was started.") from None
 
 
-def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
+def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
+    """Enter the place of each value below a node."""
     origins.setdefault(path, f"{name}:{node.start_mark.line + 1}")
-    if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
-        raise ConfigError(f"{name} has more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
     of_keys = isinstance(node, yaml.MappingNode)
     for index, item in enumerate([] if isinstance(node, yaml.ScalarNode) else node.value):
         key, child = item if of_keys else (item, item)
@@ -94,7 +86,7 @@ def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]
                 f"{name}:{line}: {full} appears twice (also in line {before}); keep one. Nothing was started."
             )
         origins[at] = f"{name}:{line}"
-        _walk(child, at, name, origins)
+        _locate(child, at, name, origins)
 
 
 def override(
@@ -125,31 +117,15 @@ def override(
         changes.append((key.strip().split("."), value, f"--set {word}"))
     data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
-        _put(data, keys, _override_value(keys, text, origin, is_text))
-        path = tuple(keys)
-        origins = {known: where for known, where in origins.items() if known[: len(path)] != path} | {path: origin}
+        plain = text.strip()[:1] not in ("'", '"') and text.strip() not in _NOTHING and is_text(keys)
+        group, path = data, tuple(keys)
+        for key in keys[:-1]:
+            if not isinstance(group.get(key), dict):
+                group[key] = {}
+            group = group[key]
+        group[keys[-1]] = text.strip() if plain else _parsed(text, origin)[0]
+        origins = {known: place for known, place in origins.items() if known[: len(path)] != path} | {path: origin}
     return Tree(data, origins)
-
-
-def _override_value(keys: list[str], text: str, origin: str, is_text: Callable[[Sequence[str]], bool]) -> Any:
-    try:
-        value = _parsed(text, origin)[0]
-    except ConfigError:
-        if text.lstrip()[:1] in ("'", '"') or not is_text(keys):
-            raise
-        return text.strip()
-    quoted = isinstance(value, str) and text.strip()[:1] in ("'", '"') and text.strip()[-1:] == text.strip()[:1]
-    if quoted or value == text.strip() or text.strip() in _NOTHING or not is_text(keys):
-        return value
-    return text.strip()  # with what YAML takes for a comment, a folded line, a number or a group
-
-
-def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
-    for key in keys[:-1]:
-        if not isinstance(data.get(key), dict):
-            data[key] = {}
-        data = data[key]
-    data[keys[-1]] = value
 
 
 Schema = Mapping[str, Any]
@@ -209,13 +185,12 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         sentence = message.removeprefix(_OF_VALIDATOR)
         return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden":
-        group, keys = _value(data, path[:-1]), _keys_at(schema, path[:-1], data)
-        others = set(_keys_at(schema, path[:-1], None)).difference(keys)
-        if path[-1] in others and str(group.get("kind", "")).startswith("simulated"):
+        keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
+        others = [key for key in _value(data, path[:-1]) if key not in keys]
+        if len(others) > 2:
             return (
-                f"{'.'.join(map(str, path[:-1]))}: {', '.join(key for key in group if key in others)} belong to a real "
-                f"device, and its kind is {group['kind']}; leave them out, or take the real configuration as it is: "
-                "`beamline scan CONFIG --rehearse`"
+                f"{'.'.join(map(str, path[:-1]))}: {', '.join(others)} are no keys of this kind; leave them out. A "
+                "real configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
             )
         return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
     branches = declared_at(schema, path, data)
@@ -240,10 +215,6 @@ def _shown(value: Any) -> str:
     else:
         text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _keys_at(schema: Schema, path: KeyPath, data: Any) -> list[str]:
-    return [key for branch in declared_at(schema, path, data) for key in branch.get("properties", {})]
 
 
 def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
@@ -282,18 +253,14 @@ def _choices(branch: Schema) -> list[Any]:
     return branch.get("enum", [branch["const"]] if "const" in branch else [])
 
 
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
-
-
 def _words(branch: Schema) -> str:
     """The legal values, if they are not a short list of choices."""
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"
         bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
-        limits = [f"{sign} {_number(branch[name])}" for name, sign in bounds if name in branch]
-        return " ".join([text, " and ".join(limits)]).strip()
+        limits = " and ".join(f"{sign} {branch[name]:g}" for name, sign in bounds if name in branch)
+        return f"{text} {limits}".strip()
     if kind == "array" and "items" in branch:
         return f"a list of {branch.get('minItems', 0)} or more: {_words(branch['items'])}"
     if kind == "array":

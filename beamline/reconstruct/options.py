@@ -6,16 +6,14 @@ import math
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
@@ -26,7 +24,7 @@ from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import EarlyStopMethod, Method, PresetMethod
 from recon.base.volume import Grid
-from recon.methods import has_setting, names, streams
+from recon.methods import names, streams
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
@@ -177,25 +175,6 @@ class ReconOptions:
         check_settings(self)
 
     @property
-    def given(self) -> frozenset[str]:
-        """Names of the options, as in `option_rules`, whose values differ from their defaults."""
-        usual = {each.name: each.default for each in fields(self)}
-        run = {name for name, rule in RULES.items() if _at(self, rule.value) not in (None, usual.get(rule.value))}
-        unset = type(self.method)()
-        of_method = {
-            name
-            for name, rule in RULES.items()
-            if rule.setting and has_setting(type(self.method), rule.setting)
-            if _at(self.method, rule.setting) != _at(unset, rule.setting)
-        }
-        return frozenset(run | of_method | ({"time"} if self.method.traits.in_time else set()))
-
-    def refuse_contradictions(self) -> None:
-        """Raise ConfigError for values that contradict each other, or that the method would silently ignore."""
-        given = self.given
-        if why := contradiction(RULES, given, one_method=True) or of_other_methods(RULES, given, self.method.name):
-            raise ConfigError(why)
-
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
         """Bytes on disk for the result, and for temporary files, of a volume of so many bytes."""
         if not in_slabs:
@@ -258,10 +237,3 @@ class ReconOptions:
     def streams(self) -> bool:
         """Whether the volume of the method grows with the views; another one waits for the end of the scan."""
         return isinstance(self.method, FitMethod)
-
-
-def _at(whole: Any, path: str) -> Any:
-    """The value at a path such as `fit.loss`; None where there is none."""
-    for name in path.split("."):
-        whole = getattr(whole, name, None)
-    return whole

@@ -71,9 +71,7 @@ class ReportContext:
     """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
 
     Attributes:
-        scan_flags: sentences of the monitor during the scan, where the reconstruction belongs to its run.
         filter: of FBP, also of the one that the volume is compared with.
-        psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         leaves: whether there is time for so many seconds before the report.
         stray: the map of mass where views show nothing [y, x]; None without any.
     """
@@ -84,14 +82,12 @@ class ReportContext:
     seed: int
     warnings: Sequence[str] = ()
     started: float = 0.0
-    scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
     region: RegionOfRows | None = None
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True
     stray: NDArray[np.float32] | None = None
     filter: Filter = "hann"
-    psnr: Sequence[tuple[float, float]] = ()
 
 
 def label_of(method: str) -> str:

@@ -273,9 +273,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     _check_device(options.device)
-    options.refuse_contradictions()
-    if options.method.traits.several:
-        _require_hdf5(options.target)
+    _refuse_several_volumes(options)
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
@@ -290,6 +288,18 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
             if options.selection.axis_col is not None:
                 check_axis(source, options.selection.axis_col)
     return truth
+
+
+def _refuse_several_volumes(options: ReconOptions) -> None:
+    """Raises ConfigError where options of one volume stand beside a method that makes several."""
+    if options.method.traits.several:
+        _require_hdf5(options.target)
+        of_one = ("region", "truth", "uncertainty", "cluster", "partial")
+        if wrong := [name for name in of_one if getattr(options, name)]:
+            raise ConfigError(
+                f"{' and '.join(wrong)}: for a method of one volume, and {options.method.name} makes several. Leave it "
+                "out, or choose another method. Nothing was computed."
+            )
 
 
 def _refuse_unfollowed(options: ReconOptions) -> None:

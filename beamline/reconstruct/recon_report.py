@@ -53,10 +53,10 @@ def compose(
         settings=settings,
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
-        flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
+        flags=[*context.facts.remarks, *context.warnings],
         pictures=[
             *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
-            *_doubts(made, prepared, unexplained, context.psnr),
+            *_doubts(made, prepared, unexplained),
             *_views(prepared),
             *_further(made, prepared, context),
         ],
@@ -223,12 +223,7 @@ def _several(series: VolumeSeries) -> Iterator[Picture]:
         yield Picture(title, f"{len(some)} of {n} {what}", sheet.png(sheet.labels()))
 
 
-def _doubts(
-    made: Reconstruction,
-    prepared: PreparedProjections,
-    unexplained: Unexplained | None,
-    psnr: Sequence[tuple[float, float]],
-) -> Iterator[Picture]:
+def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None) -> Iterator[Picture]:
     """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
@@ -252,8 +247,8 @@ def _doubts(
     if made.history:
         yield Picture(
             "Quality against time",
-            _history_caption(made, psnr),
-            quality_against_time(history_arrays(made.history), psnr),
+            _history_caption(made),
+            quality_against_time(history_arrays(made.history)),
         )
 
 
@@ -300,13 +295,12 @@ def _of_wedges(unseen: Sequence[Wedge]) -> str:
     )
 
 
-def _history_caption(made: Reconstruction, psnr: Sequence[tuple[float, float]]) -> str:
+def _history_caption(made: Reconstruction) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
     growing = ["views"] * views_grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the views in use"]
     if (judged := residual_curve(history_arrays(made.history))) is not None:
         parts.append(f"the residual of {judged.views} as dB below the data")
-    parts += ["PSNR of its snapshots against the truth"] if psnr else []
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
     since = "the file was found" if views_grew(made) else "the start"
     return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."

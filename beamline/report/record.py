@@ -76,13 +76,11 @@ def views_grew(made: Reconstruction) -> bool:
 
 def quality_against_time(
     history: Mapping[str, NDArray[np.floating]],
-    psnr: Sequence[tuple[float, float]] = (),
 ) -> bytes:
-    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, number of views and Gaussians.
+    """A fit against time: loss and residuals, the residual as dB, number of views and Gaussians.
 
     Args:
         history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
-        psnr: (seconds, dB) of each snapshot; none without a truth.
     """
     seconds = history["seconds"]
     growing = [
@@ -91,19 +89,13 @@ def quality_against_time(
         if name in history and np.ptp(history[name]) > 0
     ]
     curve = residual_curve(history)
-    panels = 1 + (curve is not None) + bool(psnr) + bool(growing)
-    down, across = (1, panels) if panels < 4 else (2, 2)
-    figure = new_figure((WIDTH, 3.1 * down))
-    left, *others = np.ravel(figure.subplots(down, across))
+    figure = new_figure((WIDTH, 3.1))
+    left, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
     _misfit(left, history)
     if curve is not None:
         axes = others.pop(0)
         axes.plot(*record(curve.seconds, curve.residuals), color="tab:green", lw=1.2, marker=".", ms=3)
         finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)
-    if psnr:
-        axes = others.pop(0)
-        axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
-        finish(axes, "time (s)", "PSNR (dB)", "Quality against the truth", grid=True)
     if growing:
         axes = others.pop(0)
         for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):

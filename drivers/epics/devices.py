@@ -10,7 +10,7 @@ from enum import StrEnum
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
-from drivers.flat import CheckedSettings, key
+from drivers.keys import CheckedSettings, key
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"

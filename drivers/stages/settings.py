@@ -7,14 +7,14 @@ writes it: its unit, which ends the key's name, its legal values and its meaning
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.flat import CheckedSettings, Key, flat_fields
-from drivers.flat import key as key
+from drivers.keys import CheckedSettings, Key
+from drivers.keys import key as key
 
 FARTHEST = 1e9  # rad
 MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
@@ -26,15 +26,15 @@ def with_keys(name: str, driver: Any) -> Any:
     Raises:
         ValueError: it cannot.
     """
-    without = [field.name for field in flat_fields(driver.Settings) if not isinstance(field.metadata.get("key"), Key)]
+    without = [field.name for field in fields(driver.Settings) if not isinstance(field.metadata.get("key"), Key)]
     if without:
         raise ValueError(f"{', '.join(without)} of {driver.Settings.__name__} have no key(...)")
     return driver
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StageFigures(CheckedSettings):
-    """The limits of a stage: counts for 2π, rad/s, rad/s², soft limits in rad.
+    """Base of a stage's settings, with its limits: counts for 2π, rad/s, rad/s², soft limits in rad.
 
     Raises:
         ValueError: figures that no stage can have.
@@ -64,7 +64,7 @@ class StageFigures(CheckedSettings):
         """Counts in a radian."""
         return self.counts_per_turn / (2 * math.pi)
 
-    def limits(
+    def limits_with(
         self,
         acceleration: float,
         pulse_spacing: float,
@@ -73,7 +73,7 @@ class StageFigures(CheckedSettings):
         interval_unit: int = 1,
         tolerance: int = 0,
     ) -> StageLimits:
-        """The limits of a stage with these figures and a trigger output; arguments as in `StageLimits`.
+        """The limits with a trigger output; arguments as in `StageLimits`.
 
         Raises:
             ValueError: no pulses can be so far apart.
@@ -94,9 +94,12 @@ class StageFigures(CheckedSettings):
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Wiring(CheckedSettings):
-    """Connection of a stage's controller; times in s. The baud rate is the controller's, nominal over USB and TCP."""
+    """Base of the settings of a stage on a serial line; times in s.
+
+    The baud rate is the controller's, nominal over USB and TCP.
+    """
 
     timeout: float = key(1.0, "For a reply.", unit="s", gt=0)
     baudrate: int = key(115_200, gt=0)
@@ -110,13 +113,22 @@ class Wiring(CheckedSettings):
 
 
 class StageSettings(Protocol):
-    """Settings of a driver, and the limits that follow from them."""
+    """Settings of a driver, and the limits that follow from them: a dataclass on `StageFigures`."""
 
     @property
-    def figures(self) -> StageFigures: ...
+    def max_speed(self) -> float: ...
 
     @property
-    def wiring(self) -> Wiring: ...
+    def low(self) -> float: ...
+
+    @property
+    def high(self) -> float: ...
+
+    @property
+    def pulse_width(self) -> float | None: ...
+
+    @property
+    def active_high(self) -> bool: ...
 
     @property
     def pulse_output(self) -> int | None:

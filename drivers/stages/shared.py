@@ -1,15 +1,11 @@
-"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
-
-Settings that a driver changes in a controller are kept, as they were found, outside the program until they are
-restored: a program that is killed leaves its speed in the controller, and the next one would take it for the original.
-"""
+"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
@@ -17,58 +13,17 @@ from drivers.base.protocols import RotationStage, StageLimits
 from drivers.stages.travel import Travel
 
 
-class SettingsStore(Protocol):
-    """Keeps the settings that a controller was found with, beyond the end of this program."""
-
-    def load(self) -> Mapping[str, str]:
-        """Settings that an earlier program found and did not restore; empty if it did."""
-
-    def save(self, found: Mapping[str, str]) -> None: ...
-
-    def clear(self) -> None:
-        """Forget the settings: all are restored."""
-
-
-@runtime_checkable
-class RestoresSettings(Protocol):
-    """A stage that changes settings of its controller, and restores them when it is closed."""
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        """From now on they are in `store`, too. Those of an earlier program that died are restored at the end instead
-        of what it left, and `describe` says so."""
-
-
 class FoundSettings:
     """The settings that a controller was found with, by their names there, for the driver that changes them."""
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
-        self.notice = ""
-        """What an earlier program left, in words; "" if it restored all."""
-        self._store: SettingsStore | None = None
-
-    def keep_in(self, store: SettingsStore) -> None:
-        """See `RestoresSettings.keep_found_settings`."""
-        earlier = {name: value for name, value in store.load().items() if name in self.values}
-        changed = {name: self.values[name] for name, value in earlier.items() if self.values[name] != value}
-        self.values |= earlier
-        store.save(self.values)
-        self._store = store
-        if changed:
-            values = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in changed.items())
-            self.notice = (
-                f"a program that was killed, or lost this stage, left {values}; "
-                "what stood there before is restored at the end"
-            )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
-        """Write each setting back, once. If one is refused, the store keeps them all."""
+        """Write each setting back, once."""
         values, self.values = self.values, {}
         for name, value in values.items():
             write(name, value)
-        if self._store is not None:
-            self._store.clear()
-            self._store = None
 
 
 class Stops:
@@ -189,9 +144,6 @@ class LineStage(RotationStage):
     no thread takes the move as complete. Closing restores the settings that the driver has changed.
     """
 
-    _found: FoundSettings
-    """What opening and moves change in the controller, as it was found."""
-
     def __init__(self, url: str, settings: Any, clock: Clock, name: str) -> None:
         self.name, self._url, self._clock = name, url, clock
         self._travel, self._stops = Travel(name, settings.limits()), Stops(name, self._send_stop)
@@ -229,10 +181,6 @@ class LineStage(RotationStage):
     @property
     def limits(self) -> StageLimits:
         return self._travel.limits
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        """See `RestoresSettings`."""
-        self._found.keep_in(store)
 
     def close(self) -> None:
         if not self._closed:

@@ -4,23 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
-from functools import cache, partial
-from types import MappingProxyType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    Field,
-    FiniteFloat,
-    StrictBool,
-    StrictStr,
-    TypeAdapter,
-    ValidationError,
-    create_model,
-)
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from recon.base.registry import unknown
 
@@ -29,7 +17,6 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 T = TypeVar("T", bound="DataclassInstance")
-K, V = TypeVar("K"), TypeVar("V")
 
 # Types of fields with bounds; `build` refuses other values.
 Positive = Annotated[float, Field(gt=0)]
@@ -53,9 +40,11 @@ def build(cls: type[T], where: str, mapping: Any) -> T:
         SceneError: an unknown or missing key, or a wrong value; its path begins with `where`.
     """
     try:
-        return _adapter(cls).validate_python(mapping)
+        return _adapter(cls).validate_python(dict(mapping) if isinstance(mapping, Mapping) else mapping)
     except ValidationError as error:
-        raise SceneError(_sentence(where, error.errors(include_url=False)[0])) from None
+        faults = error.errors(include_url=False)
+        first = next((fault for fault in faults if fault["type"] == "unexpected_keyword_argument"), faults[0])
+        raise SceneError(_sentence(cls, where, first)) from None
 
 
 def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[str, Any]]:
@@ -84,63 +73,27 @@ def located(where: str) -> Iterator[None]:
         raise SceneError(f"{where}: {error}") from None
 
 
-def _no_bool(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise ValueError(f"must be a number, got {value}")
-    return value
-
-
-_SCALARS: Mapping[Any, Any] = {
-    float: Annotated[FiniteFloat, BeforeValidator(_no_bool)],
-    int: Annotated[int, BeforeValidator(_no_bool)],
-    bool: StrictBool,
-    str: StrictStr,
-}
-_CONTAINERS: Mapping[Any, Any] = {
-    tuple: tuple,
-    Mapping: Annotated[dict[K, V], AfterValidator(MappingProxyType)],  # type: ignore[valid-type]
-    Union: Union,
-    UnionType: Union,
-}
-
-
 @cache
 def _adapter(cls: type[T]) -> TypeAdapter[T]:
-    return TypeAdapter(_checked(cls))
+    for each in _dataclasses(cls):
+        each.__pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+    return TypeAdapter(cls)
 
 
-def _checked(kind: Any) -> Any:
-    """A field's type with the rules above, for pydantic."""
-    if is_dataclass(kind):
-        return _checked_dataclass(kind)
-    if get_origin(kind) is Annotated:
-        inner, *bounds = get_args(kind)
-        return Annotated[(_checked(inner), *bounds)]
-    if container := _CONTAINERS.get(get_origin(kind)):
-        return container[tuple(_checked(part) for part in get_args(kind))]
-    return _SCALARS.get(kind, kind)
+def _dataclasses(kind: Any) -> Iterator[Any]:
+    """A dataclass and those of its fields; those in a type that is made of others."""
+    parts = get_type_hints(kind).values() if is_dataclass(kind) else get_args(kind)
+    yield from (kind,) if is_dataclass(kind) else ()
+    for part in parts:
+        yield from _dataclasses(part)
 
 
-def _checked_dataclass(cls: Any) -> Any:
-    hints, declared = get_type_hints(cls, include_extras=True), [field for field in fields(cls) if field.init]
-    needed = [field.name for field in declared if field.default is MISSING and field.default_factory is MISSING]
-    kinds: dict[str, Any] = {field.name: (_checked(hints[field.name]), None) for field in declared}
-
-    def instance(read: BaseModel) -> Any:
-        return cls(**{name: getattr(read, name) for name in read.model_fields_set})
-
-    check = BeforeValidator(partial(_check_keys, list(kinds), needed))
-    return Annotated[create_model(cls.__name__, **kinds), check, AfterValidator(instance)]
-
-
-def _check_keys(legal: Sequence[str], needed: Sequence[str], mapping: Any) -> Mapping[str, Any]:
-    if not isinstance(mapping, Mapping):
-        raise ValueError(f"must be a mapping with the keys {', '.join(legal)}; got {mapping!r}")
-    if others := [key for key in mapping if key not in legal]:
-        raise ValueError(unknown("key", others[0], legal))
-    if missing := [key for key in needed if key not in mapping]:
-        raise ValueError(f"key {missing[0]!r} is missing; needed: {', '.join(needed)}")
-    return mapping
+def _declared_at(cls: Any, loc: Sequence[str | int]) -> Any:
+    """The dataclass at a place of the mapping; the outer one where that is in a list."""
+    for part in loc:
+        inner = [*_dataclasses(get_type_hints(cls)[part])] if isinstance(part, str) else []
+        cls = inner[0] if inner else cls
+    return cls
 
 
 _EXPECTED = {
@@ -155,15 +108,26 @@ _EXPECTED = {
 """By the first word of the type of pydantic's error."""
 
 
-def _sentence(where: str, error: ErrorDetails) -> str:
+def _sentence(cls: Any, where: str, error: ErrorDetails) -> str:
     """A sentence from pydantic's error: the path, the expected kind of value, and the value."""
     kind, loc, value = error["type"], error["loc"], error["input"]
     path = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if part != "[key]")
     if kind == "value_error":
         message = str(error["ctx"]["error"])
         return f"{path} {message}" if message.startswith("must ") else f"{path}: {message}"
-    if kind == "missing":  # an entry of a tuple; keys are checked before
-        return f"{path} is missing, got {value!r}"
+    if kind == "dataclass_type":
+        legal = ", ".join(field.name for field in fields(_declared_at(cls, loc)))
+        return f"{path} must be a mapping with the keys {legal}; got {value!r}"
+    if kind == "unexpected_keyword_argument":
+        declared = _declared_at(cls, loc[:-1])
+        return f"{path.rpartition('.')[0]}: {unknown('key', loc[-1], [field.name for field in fields(declared)])}"
+    if kind == "missing":
+        *_, last = loc
+        return (
+            f"{path.removesuffix(f'.{last}')}: key {last!r} is missing"
+            if isinstance(last, str)
+            else (f"{path} is missing, got {value!r}")
+        )
     if kind == "too_long":
         return f"{path} must be a list of {error['ctx']['max_length']}, got {value!r}"
     by_kind = _EXPECTED.get(kind.split("_")[0], error["msg"].removeprefix("Input should be "))

@@ -8,16 +8,8 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from drivers.flat import flat_fields
 from recon.base.registry import Registry, in_folders
 from simulators.wires.wire import Build
-
-
-def _fitting(name: str, found: type[Build]) -> type[Build]:
-    """The class, if an option of it can be read."""
-    _ = flat_fields(found), found.matching
-    return found
-
 
 WIRES: Registry[type[Build]] = Registry(
     "wire",
@@ -25,6 +17,5 @@ WIRES: Registry[type[Build]] = Registry(
         kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name)
         for kind, name in in_folders("simulators.wires", "CONTROLLERS").items()
     },
-    _fitting,
 )
 """Kind -> how its simulated controller is built."""

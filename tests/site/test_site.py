@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from beamline.storage.readers import open as readers
 from beamline.testing import ReaderConformance
 from drivers.base.protocols import CameraSettings, TriggerSource
-from drivers.flat import from_flat
 from drivers.testing.camera import CameraBench, CameraConformance
 from drivers.testing.stages import Build, StageBench, StageConformance, StageKind
 from recon.testing import MethodConformance
@@ -82,7 +81,7 @@ class TestSiteStage(StageConformance):
     def build(self, kind: StageKind) -> Iterator[Build]:
         def build(**changes: Any) -> StageBench:
             clock = VirtualClock()
-            line, settings = TriggerLine(clock), from_flat(SiteStageSettings, FIGURES | changes)
+            line, settings = TriggerLine(clock), SiteStageSettings(**FIGURES | changes)
             url = register(next(NAMES), SiteBuild.matching(settings).controller(clock, line))
             return StageBench(SiteStage(url, settings, clock), clock, line)
 

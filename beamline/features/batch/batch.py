@@ -208,8 +208,6 @@ def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
         *recipe,
         "--output",
         str(work / RECON),
-        "--log",
-        str(work / "log.txt"),
         "--beside-scan",
         "--json",
     ]

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +14,8 @@ import click
 from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
-from beamline.core.sinks import fan_out, sentence
+from beamline.core.events import Event, RunDone, Sink, VolumeDone
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
 
@@ -46,7 +42,6 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
     The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
     """
-    _keep_bytecode()
     from beamline.config.load import config_folder, load
 
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
@@ -60,15 +55,6 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
         done = last[-1]
         assert isinstance(done, VolumeDone)
         click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
-
-
-def _keep_bytecode() -> None:
-    """Write the bytecode of what is imported, also where the environment asks for none: README installs without it.
-
-    Else each later command would compile torch and scipy again, in 4 s.
-    """
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-    sys.dont_write_bytecode = False
 
 
 def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:
@@ -94,7 +80,6 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
 
     clock = SystemClock()
     started = clock.now()
-    snapshots = _Snapshots()
     outside = fan_out(*sinks)
 
     follow = follow_command(config)
@@ -103,8 +88,6 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         return [*follow(scan, output), "--no-report"]  # ours replaces it
 
     def all_but_done(event: Event) -> None:
-        if isinstance(event, ScanDone):
-            ahead.start()
         if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
             outside(event)
 
@@ -112,12 +95,11 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         if instrument.truth is None:
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
         truth = instrument.truth
-        ahead = threading.Thread(target=_look_ahead, args=(truth,), name="look ahead", daemon=True)
-        result = run_scan(config, runs, [snapshots, all_but_done], stop, live=without_report, instrument=instrument)
+        result = run_scan(config, runs, [all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
         raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
-    shown = _Shown(command, config.recon.seed, config.recon.method, started, snapshots)
+    shown = _Shown(command, config.recon.seed, config.recon.method, started)
     _compare(result.path, folder / RECON, truth, shown, outside, clock)
 
 
@@ -129,7 +111,6 @@ class _Shown:
     seed: int
     method: str
     started: float
-    snapshots: _Snapshots
 
 
 def _compare(
@@ -145,7 +126,6 @@ def _compare(
     from beamline.report.record import history_from
     from beamline.storage.readers.open import open_scan
     from beamline.storage.writers.recon_file import read_reconstruction
-    from recon.assess.metrics import psnr
     from recon.base.method import Reconstruction
     from recon.base.volume import Grid, Volume
 
@@ -168,41 +148,5 @@ def _compare(
     target = OutputPaths(volume, report_beside(volume), replace=True)
     if target.live_picture.exists():
         facts = replace(facts, live_picture=target.live_picture.name)
-    curve = [(seconds, psnr(ideal.data, grown.data)) for seconds, grown in shown.snapshots.volumes]
-    context = ReportContext(
-        facts, selection, shown.command, shown.seed, warnings, shown.started,
-        scan_flags=shown.snapshots.flags, psnr=curve,
-    )  # fmt: skip
+    context = ReportContext(facts, selection, shown.command, shown.seed, warnings, shown.started)
     write_result(made, prepared, ideal, target, context, sink, clock)
-
-
-def _look_ahead(truth: Callable[[Grid], Volume]) -> None:
-    """Import and compile what the comparison needs, while the live reconstruction ends: the scan's process is idle."""
-    with suppress(Exception):  # the comparison meets it again, and says it
-        from recon.base.volume import Grid
-
-        import_module("beamline.reconstruct.result")
-
-        truth(Grid((2, 2, 2), 1.0))
-
-
-class _Snapshots:
-    """A sink that collects snapshots, which are compared with the truth after the scan, and the texts of flags."""
-
-    def __init__(self) -> None:
-        self.volumes: list[tuple[float, Volume]] = []
-        self.flags: list[str] = []
-
-    def __call__(self, event: Event) -> None:
-        from beamline.storage.writers.recon_file import read_reconstruction
-
-        if isinstance(event, SnapshotWritten):
-            try:
-                volume = read_reconstruction(Path(event.path)).volume
-            except DataError:
-                return  # the run is over and it is gone
-            self.volumes.append((event.seconds, volume))
-        elif isinstance(event, FrameFlagged | Warned):
-            text = sentence(event)
-            if text and text not in self.flags:
-                self.flags.append(text)

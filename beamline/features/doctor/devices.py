@@ -4,7 +4,6 @@ no byte is sent."""
 from __future__ import annotations
 
 import os
-import re
 import socket
 import sys
 from collections.abc import Sequence
@@ -14,8 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
-
-import psutil
 
 from beamline.config.devices import DcamOrca
 from beamline.features.doctor.check import Diagnosis, Grade, of_error
@@ -151,7 +148,7 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Diagnosis:
 
 
 def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
-    """The DCAM-API library and its version; with `session`, also the cameras that it finds.
+    """The DCAM-API library; with `session`, also the cameras that it finds, and the version that they report.
 
     Args:
         session: open the camera, which takes seconds and fails while another program uses it.
@@ -164,10 +161,8 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
         loaded = Dcam(path, "camera")
     except DeviceError as error:
         return of_error(LIBRARY, error, expected, Grade.WARNING if camera is None else Grade.FAILED)
-    file = _loaded_file(path)
-    version = version_of(file)
-    values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
-    observed = f"{file or path or 'the installed library'}, version {version or 'not known'}."
+    values: dict[str, Any] = {"library": None if path is None else str(path)}
+    observed = f"{path or 'The installed library'} can be loaded."
     if not session:
         return Diagnosis(LIBRARY, Grade.OK, observed, expected, values=values)
     index = 0 if camera is None else camera.index
@@ -185,12 +180,6 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
     return Diagnosis(LIBRARY, Grade.OK, f"{observed} {listed}.", expected, values=values)
 
 
-def version_of(file: Path | None) -> str:
-    """The version in the name of a library's file (after .so on Linux); "" if there is none."""
-    match = None if file is None else re.search(r"\.so\.(\d[\d.]*)$", file.resolve().name)
-    return match[1] if match else ""
-
-
 def _cameras(dcam: Dcam) -> list[dict[str, str]]:
     """The description that each camera reports; the session of the library is ended afterwards."""
     from drivers.dcam.codes import Text
@@ -206,15 +195,3 @@ def _cameras(dcam: Dcam) -> list[dict[str, str]]:
     finally:
         with suppress(DeviceError):  # a session that did not start must be ended, too; its error is already reported
             dcam.api_uninit()
-
-
-def _loaded_file(path: Path | None) -> Path | None:
-    """The file of the library that this process has loaded; None if the system does not report it."""
-    if path is not None:
-        return path.resolve()
-    if sys.platform == "darwin":
-        return None
-    with suppress(OSError, psutil.Error):
-        loaded = (Path(file.path) for file in psutil.Process().memory_maps())
-        return next((file for file in loaded if file.name.lower().startswith(("libdcamapi.", "dcamapi.dll"))), None)
-    return None

@@ -289,9 +289,6 @@ def take_all(request: ScanRequest) -> None:
     with json_events(request.as_json) as json_sink:
         settings = request.settings
         queue = load_queue(request.files, settings, rehearse=request.rehearse)
-        if request.discard and (series := [scan.name for scan in queue if scan.config.scan.energies is not None]):
-            names = ", ".join(series)
-            raise click.UsageError(f"--discard does not go with scan.energies, of {names}: leave it out.")
         needs = queue_needs(queue, request.output)
         if request.dry:
             if not request.as_json:

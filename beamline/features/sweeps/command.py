@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
 
 _OF_A_VOLUME = frozenset(
-    ("output", "report", "write-config", "log", "verbose", "json", "dry-run", "max-residual", "truth", "uncertainty",
+    ("output", "report", "write-config", "json", "dry-run", "max-residual", "truth", "uncertainty",
      "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
      "time", "moves", "beside-scan")
 )  # fmt: skip

@@ -16,7 +16,6 @@ from beamline.cli.options import (
     POSITIVE,
     MethodChoice,
     NameChoice,
-    WholeRange,
     json_option,
     new_folder_option,
     others,
@@ -28,7 +27,7 @@ from beamline.cli.options import (
     unknown_method,
     with_request,
 )
-from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
+from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, typed_line
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
@@ -90,6 +89,7 @@ class TradeoffRequest:
     first=(
         "methods",
         "quick",
+        "axis",
         "seconds",
         "max_seconds",
         "truth",
@@ -130,7 +130,7 @@ def _compared(
     return ComparedScan(
         source, selection, output, methods, request.truth,
         request.seconds, max_seconds, request.seed,
-        repeating(context, request.file, output),
+        typed_line(context),
     )  # fmt: skip
 
 
@@ -182,7 +182,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=WholeRange(min=1, max=100),
+        type=click.IntRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",
@@ -194,7 +194,7 @@ class StudyRequest:
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output"),
+    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output"),
 )
 @with_request(StudyRequest)
 def study(request: StudyRequest) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import click
 
-from beamline.cli.options import FiniteRange, config_argument, json_events, json_option, set_option
+from beamline.cli.options import config_argument, json_events, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
 from beamline.core.events import Done, Sink
@@ -33,7 +33,7 @@ Found = TypeVar("Found", bound=Evaluated)
 
 @click.command()
 @config_argument
-@click.option("--angle", type=FiniteRange(), help="Angle of the view, degrees. Default: the first one of the scan.")
+@click.option("--angle", type=float, help="Angle of the view, degrees. Default: the first one of the scan.")
 @set_option
 @json_option
 def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
@@ -81,9 +81,7 @@ def evaluated(
 
 @click.command()
 @config_argument
-@click.option(
-    "--angle", type=FiniteRange(), help="Angle of the first view, degrees. Default: the first one of the scan."
-)
+@click.option("--angle", type=float, help="Angle of the first view, degrees. Default: the first one of the scan.")
 @set_option
 @json_option
 def align(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:

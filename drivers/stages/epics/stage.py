@@ -18,9 +18,8 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
-from drivers.flat import CheckedSettings
-from drivers.stages.settings import StageFigures, Wiring, key
-from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
+from drivers.stages.settings import StageFigures, key
+from drivers.stages.shared import FoundSettings, LineStage, until_standing, while_it_moves
 
 
 class Search(StrEnum):
@@ -36,8 +35,8 @@ class Search(StrEnum):
         return {"none": "", "forward": ".HOMF", "reverse": ".HOMR"}[self]
 
 
-@dataclass(frozen=True)
-class EpicsSettings(CheckedSettings):
+@dataclass(frozen=True, kw_only=True)
+class EpicsSettings(StageFigures):
     """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
 
     `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key
@@ -46,9 +45,9 @@ class EpicsSettings(CheckedSettings):
 
     pulse_output: ClassVar[None] = None
     """A motor record sets no output."""
-    wiring: ClassVar[Wiring] = Wiring()
+    pulse_width: ClassVar[None] = None
+    active_high: ClassVar[bool] = True
     """No cable: only checks of trigger pulses ask for it."""
-    figures: StageFigures
     unit: str = key("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
     search: Search = key(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
     tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
@@ -56,13 +55,12 @@ class EpicsSettings(CheckedSettings):
 
     def limits(self) -> StageLimits:
         """See `StageSettings`."""
-        figures = self.figures
         return StageLimits(
-            figures.counts_per_turn,
-            figures.max_speed,
-            figures.acceleration,
-            figures.low,
-            figures.high,
+            self.counts_per_turn,
+            self.max_speed,
+            self.acceleration,
+            self.low,
+            self.high,
             False,
             tolerance=self.tolerance,
         )
@@ -223,7 +221,6 @@ class EpicsStage(LineStage):
             "model": self._model,
             "port": self._url,
             "trigger_output": "none",
-            **found_at_opening(self._found.notice),
             **self._travel.described(),
         }
 

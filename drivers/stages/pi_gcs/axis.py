@@ -46,7 +46,7 @@ class PiGcsAxis:
 
     def __init__(self, line: GcsLine, settings: PiGcsSettings, name: str) -> None:
         self._line, self._name, self._axis, self._output = line, name, settings.axis, settings.trigger_line
-        self._counts_per_turn = settings.figures.counts_per_turn
+        self._counts_per_turn = settings.counts_per_turn
         self._bit = 0
         self.last_move = ""
         """The command of the last move or search, for errors."""

@@ -9,12 +9,11 @@ the start threshold, from memory, see `PiFirstPulse`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import CheckedSettings
 from drivers.stages.settings import StageFigures, Wiring, key
 
 PULLED_APART = Fraction(1, 10)
@@ -95,8 +94,8 @@ class Reference(StrEnum):
         return {"switch": "FRF", "negative_limit": "FNL", "positive_limit": "FPL"}[self]
 
 
-@dataclass(frozen=True)
-class PiGcsSettings(CheckedSettings):
+@dataclass(frozen=True, kw_only=True)
+class PiGcsSettings(Wiring, StageFigures):
     """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
 
     The axis is named as SAI? lists it. `firmware_pulse` is from memory; trains need equal pauses between pulses. A
@@ -106,8 +105,6 @@ class PiGcsSettings(CheckedSettings):
         ValueError: a speed or acceleration that cannot be written, or a pulse width, which the firmware fixes.
     """
 
-    figures: StageFigures
-    wiring: Wiring = field(default=Wiring())
     axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
     serial: str | None = key(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
     trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
@@ -124,7 +121,7 @@ class PiGcsSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.wiring.pulse_width is not None:
+        if self.pulse_width is not None:
             raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
         self.limits()
 
@@ -136,9 +133,8 @@ class PiGcsSettings(CheckedSettings):
         """See `StageSettings`. If the first pulse comes a step after the threshold, the stage must stand more than a
         step before it. The pause between pulses is as long as a pulse.
         """
-        figures = self.figures
-        if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
+        if min(math.degrees(self.max_speed), math.degrees(self.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
         run_up = 1 if self.first_pulse is PiFirstPulse.STEP_AFTER else 0
         spacing = 2 * self.firmware_pulse
-        return figures.limits(figures.acceleration, spacing, run_up=run_up, tolerance=self.tolerance)
+        return self.limits_with(self.acceleration, spacing, run_up=run_up, tolerance=self.tolerance)

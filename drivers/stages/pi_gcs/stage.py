@@ -35,21 +35,20 @@ class PiGcsStage(LineStage):
     def __init__(self, url: str, settings: PiGcsSettings, clock: Clock, name: str = "stage") -> None:
         super().__init__(url, settings, clock, name)
         self._settings = settings
-        self._per_radian = Fraction(settings.figures.counts_per_turn) / Fraction(2 * math.pi)
+        self._per_radian = Fraction(settings.counts_per_turn) / Fraction(2 * math.pi)
         self._train: TriggerTrain | None = None
         self._told = 0  # the code of the error register that an error has told
-        self._line = GcsLine(url, settings.axis, settings.wiring, clock, name)
+        self._line = GcsLine(url, settings.axis, settings, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
-        self._found = self._axis.found
         with self._closed_on_failure():
-            self._identity = self._axis.open(Fraction(settings.figures.acceleration) * self._per_radian)
+            self._identity = self._axis.open(Fraction(settings.acceleration) * self._per_radian)
             self._serial = self._identity.split(",")[2].strip() if self._identity.count(",") >= 2 else ""
             refuse_another(name, settings.serial, self._serial)
             self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
 
     @staticmethod
     def halt(url: str, settings: PiGcsSettings, clock: Clock) -> None:
-        with closing(GcsLine(url, settings.axis, settings.wiring, clock, "stage")) as line:
+        with closing(GcsLine(url, settings.axis, settings, clock, "stage")) as line:
             line.stop(STOP_ALL)
 
     def _counts(self) -> int:
@@ -110,7 +109,7 @@ class PiGcsStage(LineStage):
         self._axis.standing("arming")
         self._travel.refuse_late_arming(train, self._axis.counts(), window.start)
         self._train = None
-        self._axis.arm(window, self._settings.wiring.active_high)
+        self._axis.arm(window, self._settings.active_high)
         self._train = train
 
     def disarm(self) -> None:
@@ -125,11 +124,11 @@ class PiGcsStage(LineStage):
             "port": self._url,
             "axis": self._settings.axis,
             "trigger_output": f"digital output {self._settings.trigger_line}",
-            "trigger_polarity": "active high" if self._settings.wiring.active_high else "active low",
+            "trigger_polarity": "active high" if self._settings.active_high else "active low",
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **({"serial": self._serial} if self._serial else {}),
-            **found_at_opening(meaning(self._axis.error_at_opening), self._found.notice),
+            **found_at_opening(meaning(self._axis.error_at_opening)),
             **self._travel.described(),
         }
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import CheckedSettings
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.travel import counts_in
 
@@ -96,8 +95,8 @@ def steepest_code(acceleration: float) -> int:
     return codes[-1]
 
 
-@dataclass(frozen=True)
-class PM16CSettings(CheckedSettings):
+@dataclass(frozen=True, kw_only=True)
+class PM16CSettings(Wiring, StageFigures):
     """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
 
     Raises:
@@ -107,8 +106,7 @@ class PM16CSettings(CheckedSettings):
 
     pulse_output: ClassVar[None] = None
     """Pulses come from TP0; no output can be set."""
-    figures: StageFigures
-    wiring: Wiring = field(default=Wiring(baudrate=9600))
+    baudrate: int = key(9600, gt=0)
     channel: int = key(0, ge=0, le=15)
     first_pulse: Pm16cFirstPulse = key(
         Pm16cFirstPulse.AT_START,
@@ -119,9 +117,9 @@ class PM16CSettings(CheckedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.wiring.active_high:
+        if not self.active_high:
             raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
-        if self.home is not None and not abs(self.home) * self.figures.per_radian <= MAX_COUNT:
+        if self.home is not None and not abs(self.home) * self.per_radian <= MAX_COUNT:
             raise ValueError(f"the home switch cannot be at {math.degrees(self.home):g} deg")
         self.limits()
         if not 1 <= self.search_rate <= self.fastest:
@@ -130,38 +128,37 @@ class PM16CSettings(CheckedSettings):
     @property
     def widths(self) -> PulseWidths:
         """Pulse widths that a train may use."""
-        return PulseWidths(self.wiring.pulse_width)
+        return PulseWidths(self.pulse_width)
 
     @property
     def fastest(self) -> int:
         """Full speed in pulses/s."""
-        return round(self.figures.max_speed * self.figures.counts_per_turn / (2 * math.pi))
+        return round(self.max_speed * self.counts_per_turn / (2 * math.pi))
 
     @property
     def search_rate(self) -> int:
         """Speed of the search for the home switch in pulses/s."""
-        most, speed = 2 * self.figures.max_speed, self.home_speed
-        speed = self.figures.max_speed / 10 if speed is None else speed
-        return round(speed * self.figures.counts_per_turn / (2 * math.pi)) if 0 < speed < most else 0
+        most, speed = 2 * self.max_speed, self.home_speed
+        speed = self.max_speed / 10 if speed is None else speed
+        return round(speed * self.counts_per_turn / (2 * math.pi)) if 0 < speed < most else 0
 
     @property
     def rate_code(self) -> int:
         """RTE code of the acceleration."""
-        return steepest_code(self.figures.acceleration / (2 * math.pi / self.figures.counts_per_turn))
+        return steepest_code(self.acceleration / (2 * math.pi / self.counts_per_turn))
 
     def limits(self) -> StageLimits:
         """See `StageSettings`. The acceleration is the controller's steepest one up to the configured one. If the first
         pulse comes an interval after the start point, the stage must stand more than that before it. The pause between
         pulses is as long as a pulse.
         """
-        figures = self.figures
-        radians = 2 * math.pi / figures.counts_per_turn
-        if max(abs(figures.low), abs(figures.high)) > MAX_COUNT * radians:
+        radians = 2 * math.pi / self.counts_per_turn
+        if max(abs(self.low), abs(self.high)) > MAX_COUNT * radians:
             most = math.degrees(MAX_COUNT * radians)
             raise ValueError(f"the controller counts to {MAX_COUNT}, which is {most:g} deg")
         if not 1 <= self.fastest <= MAX_SPEED:
-            speed = math.degrees(figures.max_speed)
+            speed = math.degrees(self.max_speed)
             raise ValueError(f"{speed:g} deg/s are {self.fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
         acceleration = 1e6 / RATES[self.rate_code] * radians
         run_up = 1 if self.first_pulse is Pm16cFirstPulse.INTERVAL_AFTER else 0
-        return figures.limits(acceleration, self.widths.spacing, run_up=run_up)
+        return self.limits_with(acceleration, self.widths.spacing, run_up=run_up)

@@ -90,8 +90,7 @@ class PM16CStage(LineStage):
         self._settings = settings
         self._home = None if settings.home is None else self._travel.to_counts(settings.home)
         self._search: HomeSearch | None = None
-        self._channel = PM16CChannel(url, settings.channel, settings.wiring, clock, name)
-        self._found = self._channel.found
+        self._channel = PM16CChannel(url, settings.channel, settings, clock, name)
         with self._closed_on_failure():
             self._version = self._channel.open(settings.rate_code)
             if (own := self._channel.own_limits()) is not None:
@@ -99,7 +98,7 @@ class PM16CStage(LineStage):
 
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
-        with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
+        with contextlib.closing(PM16CChannel(url, settings.channel, settings, clock, "stage")) as channel:
             channel.stop(hard=False)
 
     def _counts(self) -> int:
@@ -170,7 +169,7 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
-            **found_at_opening(self._channel.error_at_opening, self._found.notice),
+            **found_at_opening(self._channel.error_at_opening),
             **self._travel.described(),
         }
 

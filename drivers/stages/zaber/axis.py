@@ -78,7 +78,7 @@ class ZaberAxis:
     """
 
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str) -> None:
-        device, wiring = settings.device, settings.wiring
+        device = settings.device
         self.number = settings.axis
         self._name, self._device, self._axis, self._clock = name, device, settings.axis, clock
         self._ids = itertools.cycle(range(IDS))
@@ -90,7 +90,7 @@ class ZaberAxis:
         self.flags_at_opening: tuple[str, ...] = ()
         """Without that of a stop, which says nothing of where the stage is."""
         self._line = line_to(
-            wiring,
+            settings,
             url,
             name,
             clock,

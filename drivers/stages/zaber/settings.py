@@ -13,13 +13,13 @@ import math
 from dataclasses import dataclass, field
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import CheckedSettings, key
+from drivers.keys import CheckedSettings, key
 from drivers.stages.settings import StageFigures, Wiring
 
 SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TriggerUse(CheckedSettings):
     """Use of the device's triggers. Defaults are its firmware's behaviour from memory; so is the encoder's unit,
     microsteps.
@@ -174,8 +174,8 @@ def _state(shown: str, number: int) -> str:
 SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²
 
 
-@dataclass(frozen=True)
-class ZaberSettings(CheckedSettings):
+@dataclass(frozen=True, kw_only=True)
+class ZaberSettings(TriggerUse, Wiring, StageFigures):
     """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output.
 
     counts_per_turn must be the device's own limit.cycle.dist. The pulse width is whole milliseconds; None is 1 ms, or
@@ -186,8 +186,6 @@ class ZaberSettings(CheckedSettings):
             output can give.
     """
 
-    figures: StageFigures
-    wiring: Wiring = field(default=Wiring())
     device: int = key(1, ge=1, le=99)
     axis: int = key(1, ge=1, le=9)
     serial: str | None = key(None, "Its serial number (system.serial): another device is refused; null: any is taken.")
@@ -197,7 +195,6 @@ class ZaberSettings(CheckedSettings):
         "Each fire toggles the output (firmware without `schedule`): every second one is a pulse, intervals are even.",
     )
     speed_unit: float = key(SPEED_UNIT, "Native speed per microstep/s; the vendor's convention, from memory.", gt=0)
-    triggers: TriggerUse = field(default=TriggerUse())
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -210,11 +207,11 @@ class ZaberSettings(CheckedSettings):
     @property
     def pulses(self) -> PulseSettings:
         """Settings of the pulses: 1 ms wide unless a width is chosen, or half an interval if fires toggle."""
-        width = self.wiring.pulse_width
+        width = self.pulse_width
         if self.toggle and width is not None:
             raise ValueError("a toggled output has no pulse width of its own; choose a width or toggle, not both")
         chosen = None if self.toggle else PulseSettings.width if width is None else width
-        return PulseSettings(self.output, chosen, self.wiring.active_high, self.triggers)
+        return PulseSettings(self.output, chosen, self.active_high, self)
 
     @property
     def native_limits(self) -> tuple[int, int]:
@@ -223,13 +220,12 @@ class ZaberSettings(CheckedSettings):
         Raises:
             ValueError: less than one native unit.
         """
-        figures = self.figures
-        per_radian = figures.counts_per_turn / (2 * math.pi) * self.speed_unit
-        speed = round(figures.max_speed * per_radian)
-        steepest = math.floor(figures.acceleration * per_radian / 1e4 * (1 + 1e-9))
+        per_radian = self.counts_per_turn / (2 * math.pi) * self.speed_unit
+        speed = round(self.max_speed * per_radian)
+        steepest = math.floor(self.acceleration * per_radian / 1e4 * (1 + 1e-9))
         if speed < 1 or steepest < 1:
             raise ValueError(
-                f"{math.degrees(figures.max_speed):g} deg/s and {math.degrees(figures.acceleration):g} deg/s² are "
+                f"{math.degrees(self.max_speed):g} deg/s and {math.degrees(self.acceleration):g} deg/s² are "
                 f"native values of {speed} and {steepest}; the controller's gentlest are 1, "
                 f"{math.degrees(1e4 / per_radian):g} deg/s² for the latter"
             )
@@ -239,7 +235,7 @@ class ZaberSettings(CheckedSettings):
         """See `StageSettings`, with firmware that has triggers. The acceleration is the controller's steepest one up to
         the configured one.
         """
-        pulses, figures = self.pulses, self.figures
+        pulses = self.pulses
         _, steepest = self.native_limits
-        acceleration = steepest * 1e4 / self.speed_unit * 2 * math.pi / figures.counts_per_turn
-        return figures.limits(acceleration, pulses.spacing, interval_unit=2 if pulses.width is None else 1)
+        acceleration = steepest * 1e4 / self.speed_unit * 2 * math.pi / self.counts_per_turn
+        return self.limits_with(acceleration, pulses.spacing, interval_unit=2 if pulses.width is None else 1)

@@ -50,7 +50,7 @@ class EpicsBuild:
 
     @classmethod
     def matching(cls, settings: EpicsSettings) -> Self:
-        return cls(settings.figures.counts_per_turn, settings.unit)
+        return cls(settings.counts_per_turn, settings.unit)
 
     def controller(self, clock: Clock, line: TriggerLine) -> MotorRecord:
         return MotorRecord(clock, line, self)

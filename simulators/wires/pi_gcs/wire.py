@@ -53,21 +53,20 @@ class PiGcsBuild:
 
     @classmethod
     def matching(cls, settings: PiGcsSettings) -> Self:
-        figures = settings.figures
         if settings.trigger_line > OUTPUTS:
             raise ValueError(
                 f"trigger_line: the simulated controller has no digital output {settings.trigger_line}; it has 1 to "
                 f"{OUTPUTS}"
             )
         specimen = PiAxisBuild(
-            counts_per_turn=figures.counts_per_turn,
-            low=_degrees(figures.low) - 1,
-            high=_degrees(figures.high) + 1,
+            counts_per_turn=settings.counts_per_turn,
+            low=_degrees(settings.low) - 1,
+            high=_degrees(settings.high) + 1,
             first_pulse=FirstPulse(settings.first_pulse),
             pulse_width=settings.firmware_pulse,
-            rising=settings.wiring.active_high,
-            max_velocity=_degrees(figures.max_speed),
-            max_acceleration=_degrees(figures.acceleration),
+            rising=settings.active_high,
+            max_velocity=_degrees(settings.max_speed),
+            max_acceleration=_degrees(settings.acceleration),
         )
         return cls(settings.axis, settings.trigger_line, specimen=specimen)
 

@@ -112,7 +112,7 @@ class PM16CBuild:
     @classmethod
     def matching(cls, settings: PM16CSettings) -> Self:
         at_start = settings.first_pulse is Pm16cFirstPulse.AT_START
-        return cls(BoxBuild(settings.channel, settings.figures.counts_per_turn, fires_at_start=at_start))
+        return cls(BoxBuild(settings.channel, settings.counts_per_turn, fires_at_start=at_start))
 
     def controller(self, clock: Clock, line: TriggerLine) -> PM16CController:
         return PM16CController(clock, line, self)

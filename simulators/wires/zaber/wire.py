@@ -136,11 +136,11 @@ class ZaberBuild:
             )
         device = DeviceBuild(
             output=settings.output,
-            active_high=settings.wiring.active_high,
+            active_high=settings.active_high,
             can_schedule=not settings.toggle,
-            can_chain=settings.triggers.chained,
-            fires_when_enabled=settings.triggers.fires_when_enabled,
-            axis=ZaberAxisBuild(settings.figures.counts_per_turn),
+            can_chain=settings.chained,
+            fires_when_enabled=settings.fires_when_enabled,
+            axis=ZaberAxisBuild(settings.counts_per_turn),
         )
         return cls(settings.device, device=device)
 

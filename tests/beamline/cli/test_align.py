@@ -26,9 +26,7 @@ def test_json_and_views_that_show_no_axis() -> None:
     assert empty.exit_code == 6 and "two views" in empty.stderr
 
 
-@pytest.mark.parametrize(
-    ("angle", "told"), [("400", "at 400° and 220°; the stage goes"), ("nan", "not a finite number")]
-)
+@pytest.mark.parametrize(("angle", "told"), [("400", "at 400° and 220°; the stage goes")])
 def test_an_angle_that_the_stage_does_not_reach_is_refused_before_anything_moves(angle: str, told: str) -> None:
     result = beamline("align", *DEMO, "--angle", angle)
     assert result.exit_code == 2 and told in result.stderr

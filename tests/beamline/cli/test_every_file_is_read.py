@@ -143,7 +143,6 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "sheet.png": ("monitor", "simulated.h5", "--sheet"),
     "histogram.png": ("info", "simulated.h5", "--statistics", "-o"),
     "checkpoint.h5": ("recon", "simulated.h5", "-m", "r2", "--steps", "9", "-o", "v.h5", "--no-report", "--checkpoint"),
-    "log.txt": ("recon", "simulated.h5", "-m", "fbp", "-o", "v.h5", "--no-report", "--log"),
     "sweep.png": ("sweep", "simulated.h5", "axis=14:17:1", "-o"),
     "study": ("study", "fixed-views", "simulated.h5", "-o"),
     "tradeoff": ("tradeoff", "simulated.h5", "-o"),

@@ -39,7 +39,6 @@ FOLDERS = {  # of results, which keep those of the trials that were done: so man
     "tradeoff scan.h5 --methods fbp,sirt -o out/o": 5,
     "study fixed-views views.h5 -m fbp -m sirt -o out/o": 2,
 }
-LOG = "recon scan.h5 -m fbp --no-report --log out/o.txt -o out/o.h5"
 FORKS = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}  # it outlives a fork
 POINTS = 4  # writes of each fault; there are up to 315
 
@@ -110,14 +109,3 @@ def test_a_folder_of_results_holds_whole_files_and_the_trials_done(inputs: Path)
             said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
             assert (run["code"], len(said), run["hidden"]) == (5, 1, 0) and "could not be written" in said[0], run
             assert run["outputs"] or f"1/{trials} " not in run["stderr"], run
-
-
-def test_a_volume_is_right_where_its_log_is_lost(inputs: Path) -> None:
-    ((clean, runs),) = _swept(inputs, [LOG], "/out/o.txt")
-    for run in runs:
-        if run["fault"] == "kill":
-            assert run["code"] == -9, run
-            continue
-        said = [line for line in run["stderr"].splitlines() if "o.txt could not be written" in line]
-        assert run["code"] == 0 and len(said) == 1, run
-        assert run["outputs"]["o.h5"] == clean["outputs"]["o.h5"], run

@@ -107,8 +107,3 @@ def test_no_color_is_respected(monkeypatch: pytest.MonkeyPatch, no_color: str, c
     with Terminal(stream) as terminal:
         terminal(FitReached("recon", 5, 9, 1.0, 0.1, 0.1, 2, 4, None, "", None, None))
     assert bool(re.search(r"\x1b\[[\d;]*(?:3\d|9\d|38;5;\d+)m", stream.getvalue())) == coloured
-
-
-@pytest.mark.parametrize("name", ["surface", "align", "tune"])
-def test_a_number_without_bounds_shows_none(name: str) -> None:
-    assert "None]" not in CliRunner().invoke(main, [name, "--help"]).output

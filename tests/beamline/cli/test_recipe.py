@@ -1,20 +1,11 @@
-"""Recipes and the lines "to repeat": what they give is what the call gave."""
+"""Recipes: what they give is what the call gave."""
 
-import errno
-import io
-import os
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beamline.cli import recon as log
-from beamline.cli.recipe import repeating
-from beamline.features.particles.command import segment
-from beamline.features.trials.command import study, tradeoff
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
 from tests.beamline.scans import write_exchange
@@ -35,19 +26,9 @@ def _same(one: ReconRecord, other: ReconRecord) -> None:
     assert one.parameters["recipe"] == other.parameters["recipe"]
 
 
-def test_the_line_to_repeat_repeats_from_any_folder(
-    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    np.save("truth.npy", np.ones((1, 40, 40), np.float32) * np.arange(40, dtype=np.float32))
-    first = _made(folder, "recon", "scan.h5", *OPTIONS, "--truth", "truth.npy:0:1", "-o", "v.h5")
-    program, *line = shlex.split(str(first.parameters["command"]))
-    assert program == "beamline"
-    _same(first, _made(folder, *line))
-    elsewhere = tmp_path_factory.mktemp("elsewhere")
-    monkeypatch.chdir(elsewhere)
-    again = _made(elsewhere, *line)
-    _same(first, again)
-    assert again.metrics["psnr"] == first.metrics["psnr"]
+def test_a_volume_has_its_command_as_it_was_typed(folder: Path) -> None:
+    record = _made(folder, "recon", "scan.h5", *OPTIONS, "-o", "a b.h5")
+    assert shlex.split(str(record.parameters["command"])) == ["beamline", "recon", "scan.h5", *OPTIONS, "-o", "a b.h5"]
 
 
 def test_a_recipe_gives_the_same_from_a_file_and_from_a_volume(folder: Path) -> None:
@@ -62,8 +43,6 @@ def test_a_recipe_gives_the_same_from_a_file_and_from_a_volume(folder: Path) -> 
     _same(first, _made(folder, "recon", "other.h5", "--config", "r.yaml", "-o", "a.h5", "--no-report"))
     from_volume = _made(folder, "recon", "scan.h5", "--config", "v.h5", "-o", "b.h5", "--no-report")
     _same(first, from_volume)
-    _, *line = shlex.split(str(from_volume.parameters["command"]))
-    _same(first, _made(folder, *line))  # the recipe's options are in the line: it needs no recipe
 
 
 def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
@@ -104,70 +83,13 @@ def test_other_volumes_and_missing_files_hold_no_recipe(folder: Path) -> None:
     assert left(folder) == {"scan.h5"}
 
 
-def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
-    succeeds("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "--no-report")
-    lines = (folder / "log.txt").read_text().splitlines()
-    kinds = [line.split()[1] for line in lines]
-    assert kinds[0] == "state:" and kinds[-1] == "done:" and "recon_started:" in kinds
-    assert "residual" in lines[-1]
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5").exit_code == 5
-    assert beamline("recon", "none.h5", "-m", "fbp", "--log", "bad.txt").exit_code == 5
-    assert "none.h5" in (folder / "bad.txt").read_text().splitlines()[-1]
-    said = beamline("recon", "scan.h5", "-m", "fbp", "-v", "-o", "y.h5", "--no-report").stderr
-    shown = [line.split()[1] for line in said.splitlines()]
-    steady = [[kind for kind in each if kind != "progress:"] for each in (shown, kinds[1:])]  # that comes by the clock
-    assert steady[0] == steady[1] and "progress:" in shown
-
-
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
-def test_a_log_that_the_disk_does_not_take_is_named_and_does_not_end_the_work(
-    number: int, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Full(io.StringIO):
-        def write(self, text: str) -> int:
-            if " state: " not in text:
-                raise OSError(number, os.strerror(number))
-            return super().write(text)
-
-    @contextmanager
-    def new_log(path: Path) -> Iterator[Full]:
-        path.touch()
-        yield Full()
-
-    monkeypatch.setattr(log, "new_log", new_log)
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5", "--no-report")
-    assert result.exit_code == 0
-    assert result.stderr.count(f"log.txt could not be written ({os.strerror(number)})") == 1
-    assert {"log.txt", "x.h5"} <= left(folder)
-
-
-def test_lines_of_commands_with_arguments_and_flags(folder: Path) -> None:
-    context = study.make_context("study", ["random", "scan.h5", "--draws", "1", "-m", "fbp", "-m", "sirt", "--json"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("s")))
-    scan = str(folder / "scan.h5")
-    rest = "--method fbp --method sirt --draws 1 --output s_again"
-    assert line == ["beamline", "study", "random", scan, *rest.split()]
-    context = tradeoff.make_context("tradeoff", ["scan.h5", "--full", "--darks", "d.tif", "--flats", "60000"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
-    rest = ["--darks", str(folder / "d.tif"), "--flats", "60000", "--full", "--output", "t_again"]
-    assert line == ["beamline", "tradeoff", scan, *rest]
-
-
-def test_an_option_of_two_values_stands_once(folder: Path) -> None:
-    context = segment.make_context("segment", ["scan.h5", "--percentiles", "1", "99"])
-    line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
-    assert " ".join(line).count("--percentiles 1 99") == 1
-
-
 def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
-    short = ("--preset", "published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
+    short = ("-m", "r2-published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
     settings = ("--set", "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2]", "--set", "fit.policy.every=50")
     first = _made(folder, "recon", "scan.h5", *short, *settings, "--plain-splatting", "-o", "v.h5")
     assert first.parameters["method"] == "r2-published" and first.parameters["start"] == "published"
     assert 'set: "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2] fit.policy.every=50"' in str(first.parameters["recipe"])
     _same(first, _made(folder, "recon", "scan.h5", "--config", "v.h5", "--no-report", "-o", "w.h5"))
-    _, *line = shlex.split(str(first.parameters["command"]))
-    _same(first, _made(folder, *line))
     rectified = _made(folder, "recon", "scan.h5", *short, *settings, "-o", "x.h5")
     assert not np.array_equal(first.volume.data, rectified.volume.data)
 

@@ -62,7 +62,6 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     ),
     "a setting out of range": ({}, ["-m", "r2", "--set", "fit.decay=-1"], 2, "decay must be a number above 0"),
     "a part of settings": ({}, ["-m", "r2", "--set", "fit=3"], 2, "fit must be a FitSettings, got 3"),
-    "a preset of another method": ({}, ["-m", "fbp", "--preset", "published"], 2, "--preset published is of r2"),
     "iterations of fbp": (
         {},
         ["--iterations", "5"],

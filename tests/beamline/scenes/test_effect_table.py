@@ -2,34 +2,18 @@
 
 from dataclasses import fields
 
-import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.scenes.request import effects_text, parameters
 from simulators.effects.catalogue import CATALOGUE, load_effect
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
-def test_every_parameter_has_its_meaning(name: str) -> None:
-    effect = load_effect(name)
-    found = {key: (default, meaning) for key, default, meaning in parameters(effect)}
-    assert [*found] == [field.name for field in fields(effect) if field.init]
-    assert all(meaning for _, meaning in found.values())
-
-
-def test_defaults_and_parameters_that_must_be_given() -> None:
-    found = {key: default for key, default, _ in parameters(load_effect("zingers"))}
-    assert found == {"rate": "", "charge": "3000", "tracks": "0", "length": "20", "radius": "0"}
-
-
-def test_a_docstring_may_describe_two_parameters_at_once_and_go_on_in_the_next_line() -> None:
-    found = {key: meaning for key, _, meaning in parameters(load_effect("motion_blur"))}
-    assert found["tolerance_px"].endswith("it crosses the middle of the frame.")
-    assert found["max_samples"] == "largest number of moments; each costs a frame's line integrals."
-
-
-def test_the_command_prints_all_of_them_without_a_scene() -> None:
+def test_the_command_prints_each_effect_with_its_parameters_their_defaults_and_meaning() -> None:
     done = CliRunner().invoke(main, ["simulate", "--effects"])
-    assert done.exit_code == 0 and done.stdout.strip() == effects_text()
-    assert all(f"{name}  ({row.domain.words}): {row.summary}" in done.stdout for name, row in CATALOGUE.items())
+    assert done.exit_code == 0
+    for name, row in CATALOGUE.items():
+        line, _, rest = done.stdout.partition(f"  {row.domain.words}: {row.summary}\n")
+        assert line.rpartition("\n")[2].startswith(f"{name}("), name
+        for field in (field for field in fields(load_effect(name)) if field.init):
+            assert field.name in line.rpartition("\n")[2] and field.name in rest, (name, field.name)
+    assert "zingers(rate, charge=3000.0, tracks=0.0" in done.stdout

@@ -17,7 +17,6 @@ from drivers.dcam.camera import DcamCamera
 from drivers.orca_quest import DcamOptions
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
-from drivers.stages.settings import StageFigures
 from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.box import BoxBuild
@@ -39,8 +38,8 @@ class FlyRig:
         world.plug(self.line)
         build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS))
         box = build.controller(self.clock, self.line)
-        figures = StageFigures(COUNTS, math.radians(30), math.radians(60))
-        self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
+        settings = PM16CSettings(counts_per_turn=COUNTS, max_speed=math.radians(30), acceleration=math.radians(60))
+        self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), settings, self.clock)
         self.camera: DcamCamera = world.connect(options)
 
     def connected(self) -> ConnectedDevices:

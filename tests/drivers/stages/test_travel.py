@@ -69,4 +69,6 @@ def test_no_pulse_no_way_between_them_and_a_place_beyond_the_limits_are_refused(
 @pytest.mark.parametrize("spacing", [-1e-6, math.nan, math.inf, 1e300])
 def test_a_spacing_that_no_pulses_can_have_is_refused(spacing: float) -> None:
     with pytest.raises(ValueError, match="apart"):
-        StageFigures(360_000, 0.5, 1.0, 0.0, 1.0).limits(1.0, spacing)
+        StageFigures(counts_per_turn=360_000, max_speed=0.5, acceleration=1.0, low=0.0, high=1.0).limits_with(
+            1.0, spacing
+        )

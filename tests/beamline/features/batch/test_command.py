@@ -66,7 +66,7 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
     }  # fmt: skip
     assert "cut.h5" in table["cut"]["message"]
     assert left(folder / "out") == {"batch.csv", "recipe.yaml", "a_scan", f"{folder.name}_scan"}
-    assert left(folder / "out" / "a_scan") == {"recon.h5", "report.html", "log.txt"}
+    assert left(folder / "out" / "a_scan") == {"recon.h5", "report.html"}
     beamline("recon", "scan.h5", "--config", "recipe.yaml", "-o", "alone.h5", "--no-report")
     alone, found = (read_reconstruction(Path(name)) for name in ("alone.h5", "out/a_scan/recon.h5"))
     np.testing.assert_array_equal(found.volume.data, alone.volume.data)
@@ -279,7 +279,7 @@ def test_a_folder_that_somebody_put_in_the_place_of_a_result_fails_this_scan_alo
     table = _table(folder / "out")
     assert (table["scan"]["state"], table["second"]["state"]) == ("failed", "done")
     assert "exists and results are never overwritten" in table["scan"]["message"]
-    assert left(folder / "out" / "scan") == {"report.html", "log.txt"}
+    assert left(folder / "out" / "scan") == {"report.html"}
 
 
 def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_at_once(
@@ -288,7 +288,7 @@ def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_
     """It would go on in the folder of the next call."""
     Path("recipe.yaml").write_text("method: sirt\niterations: 10000000\naxis: 19.5\n")
     process = psutil.Popen([*COMMAND, "batch", "scan.h5", "--config", "recipe.yaml", "-o", "out"])
-    wait_until(lambda: any(Path("out").glob(".*.partial/log.txt")))
+    wait_until(lambda: any(Path("out").glob(".*.partial/stderr.txt")))
     children = process.children(recursive=True)
     process.kill()
     process.wait()

@@ -101,15 +101,8 @@ def test_another_library_is_not_taken_for_it() -> None:
 
 def test_a_library_is_found_without_a_session(tmp_path: Path) -> None:
     library = build(tmp_path)
-    versioned = tmp_path / "libdcamapi.so.4.24.7"
-    library.rename(versioned)
-    link = tmp_path / "libdcamapi.so"
-    link.symlink_to(versioned)
-    check = devices.library(DcamOrca(kind="dcam", library=str(link)))
-    assert check.verdict is Grade.OK
-    assert check.values == {"library": str(versioned), "version": "4.24.7"}
-    assert "version 4.24.7" in check.observed
-    assert devices.version_of(library.with_name("libfake.so")) == ""
+    check = devices.library(DcamOrca(kind="dcam", library=str(library)))
+    assert (check.verdict, check.values) == (Grade.OK, {"library": str(library)})
 
 
 def test_with_a_session_the_camera_is_asked(tmp_path: Path) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import RotationStage
-from drivers.stages.settings import StageFigures
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.wire import register
@@ -95,9 +95,9 @@ def test_another_device_in_the_chain_and_an_axis_that_is_not_there(rig: Rig) -> 
 
 def test_native_units_are_speed_times_a_factor_and_acceleration_ten_thousand_times_less() -> None:
     """384 000 microsteps a turn, 10 deg/s and 100 deg/s²: 10 666.7/s and 106 667/s² times 1.6384."""
-    figures = StageFigures(384_000, math.radians(10), math.radians(100))
-    assert ZaberSettings(figures).native_limits == (17_476, 17)
-    assert ZaberSettings(figures, speed_unit=1.0).native_limits == (10_667, 10)
+    usual = ZaberSettings(counts_per_turn=384_000, max_speed=math.radians(10), acceleration=math.radians(100))
+    assert usual.native_limits == (17_476, 17)
+    assert replace(usual, speed_unit=1.0).native_limits == (10_667, 10)
 
 
 # references and faults

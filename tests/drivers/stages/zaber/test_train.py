@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.settings import StageFigures, Wiring
 from drivers.stages.zaber.settings import PulseSettings, TriggerUse, ZaberSettings, remaining, set_up
 from drivers.testing.stages.bench import LONG, SPEED, StageBench
 from tests.drivers.stages.flat_settings import flat
@@ -110,14 +109,14 @@ def test_trains_that_would_run_together_are_refused(made: dict[str, Any], neares
 
 def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
     triggers = TriggerUse(chained=False, shortest=2e-3)
-    usual = ZaberSettings(StageFigures(360_000, 1.0, 1.0), triggers=triggers)
-    falling = replace(usual, output=3, wiring=Wiring(active_high=False))
-    assert falling.pulses == PulseSettings(3, 1e-3, False, triggers)
-    assert replace(usual, wiring=Wiring(pulse_width=4e-3)).pulses.spacing == 8e-3
+    usual = ZaberSettings(counts_per_turn=360_000, max_speed=1.0, acceleration=1.0, chained=False, shortest=2e-3)
+    falling = replace(usual, output=3, active_high=False)
+    assert replace(falling.pulses, triggers=triggers) == PulseSettings(3, 1e-3, False, triggers)
+    assert replace(usual, pulse_width=4e-3).pulses.spacing == 8e-3
     toggled = replace(usual, toggle=True).pulses
     assert (toggled.width, toggled.spacing) == (None, 4e-3)
     with pytest.raises(ValueError, match="no pulse width"):
-        replace(usual, toggle=True, wiring=Wiring(pulse_width=4e-3))
+        replace(usual, toggle=True, pulse_width=4e-3)
 
 
 # what comes of it
