@@ -1,7 +1,7 @@
 """Registry: entries of one kind by name: ours, and those that other installed packages add by entry points.
 
 Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check,
-effect, command or workers; the entry point's name is the name of the addition.
+effect or command; the entry point's name is the name of the addition.
 """
 
 from __future__ import annotations
