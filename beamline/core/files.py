@@ -203,11 +203,21 @@ def no_file(path: Path) -> str:
     return broken_link(path) or f"{path} {kind if path.exists() else 'does not exist'}."
 
 
+_BESIDE = 44  # bytes that names of temporary files, and of what is written beside an output, add to its name
+
+
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
+    longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
+    if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
+        raise DataError(
+            f"{path}: the name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} are possible, as "
+            "names of temporary files, and of what is written beside it, are longer. Name another output. Nothing was "
+            "written."
+        )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
     if path.exists():

@@ -103,7 +103,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         head = superblock(path)
         if head is None:
             raise DataError(f"{path} is not an HDF5 file written by this program. Nothing was changed.")
-        if not (head.open_for_writing or head.missing):
+        if not head.open_for_writing and head.end == head.size:
             with suppress(*hdf5.ALTERED):  # its writer may have been killed when it added the view
                 return _with_view(path, head)
         if head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
