@@ -174,7 +174,6 @@ class ReconOptions:
     def __post_init__(self) -> None:
         check_settings(self)
 
-    @property
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
         """Bytes on disk for the result, and for temporary files, of a volume of so many bytes."""
         if not in_slabs:
