@@ -296,7 +296,6 @@ def results(record: ReconRecord) -> str:
         lines.append(f"{'volumes' if several else 'volume':<10}{several}{shape} in {record.unit or 'volume fractions'}")
     lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
     lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
-    lines += [f"{'longer':<10}{record.next_decibel_text}"] if record.next_decibel_text else []
     columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
     if record.compared is not None:
         columns[BASELINE] = {**record.compared}

@@ -14,8 +14,6 @@ from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import (
     history_arrays,
-    price_of_decibel,
-    price_text,
     quality_against_time,
     residual_curve,
     views_grew,
@@ -96,8 +94,6 @@ def _summary(
         summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
-    if price := price_text(made):
-        summary += f". {price}"
     return summary + "."
 
 
@@ -256,7 +252,7 @@ def _doubts(
         yield Picture(
             "Quality against time",
             _history_caption(made, psnr),
-            quality_against_time(history_arrays(made.history), psnr, price_of_decibel(made)),
+            quality_against_time(history_arrays(made.history), psnr),
         )
 
 

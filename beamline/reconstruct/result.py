@@ -20,7 +20,7 @@ from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.outcome import ReportContext, label_of, partly_seen
-from beamline.report.record import history_arrays, price_of_decibel, price_text
+from beamline.report.record import history_arrays
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
 from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
@@ -158,8 +158,6 @@ def _record(
         warnings=tuple(judged.warnings),
         hiding=judged.hiding,
         chosen=made.chosen,
-        next_decibel=price_of_decibel(made),
-        next_decibel_text=price_text(made),
         output=target.outputs[0],
         outputs=dict(zip(target.names, target.outputs, strict=True)) if target.names else {},
         report=target.report,

@@ -1,8 +1,7 @@
-"""The history of a fit as arrays, its residual curve and the price of a decibel, and the pictures of these."""
+"""The history of a fit as arrays, its residual curve, and the pictures of these."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -11,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.report.figures import WIDTH, finish, new_figure, png
-from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit, record
 from recon.base.method import Progress, Reconstruction
-from recon.splatting.settings import FitSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,6 +55,12 @@ class ResidualCurve:
     seconds: NDArray[np.float64]
     residuals: NDArray[np.float64]
 
+    @property
+    def decibels(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(s, -20 log10 of the residual) of the measurements above 0."""
+        known = (self.seconds > 0) & (self.residuals > 0)
+        return self.seconds[known], -20 * np.log10(self.residuals[known])
+
 
 def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve | None:
     """The residual of the views held out, if there are any, else of the views used; None if neither was recorded."""
@@ -76,48 +79,15 @@ def views_grew(made: Reconstruction) -> bool:
     return len({progress.n_views for progress in made.history}) > 1
 
 
-def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
-    """The cost of another dB: for a fit from fits of other lengths, for iterations from their own record.
-
-    None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
-    also for other rates than those of the fits that were measured, as after following a scan.
-    """
-    judged, settings = residual_curve(history_arrays(made.history)), made.settings
-    if judged is None or views_grew(made) or made.ending.resumed_from:
-        return None
-    if "pace" in settings:  # of a fit
-        usual, steps = FitSettings(), made.history[-1].step
-        slower = settings["pace"] < usual.pace and steps > usual.paced_for  # as in every longer fit
-        if not (slower or settings["pace"] == usual.pace) or settings.get("decay", usual.decay) != usual.decay:
-            return None
-        return next_decibel_of_fit(made.history[-1].seconds, steps)
-    return next_decibel(judged.seconds, judged.residuals)
-
-
-def price_text(made: Reconstruction) -> str:
-    """What a longer reconstruction would gain, as a sentence without its end; empty if unknown."""
-    if (price := price_of_decibel(made)) is None:
-        return ""
-    by_others = price.of == "volume"
-    gain = "bring the volume 1 dB nearer to the sample" if by_others else "lower the misfit to the views by 1 dB"
-    if not price.measurable:
-        return f"A longer reconstruction would hardly {gain}"
-    high = f"to {duration_text(price.high)}" if math.isfinite(price.high) else "or far more"
-    source = ", as longer fits did on four other scans" if by_others else ""
-    return f"About {duration_text(price.seconds)} more would {gain} ({duration_text(price.low)} {high}){source}"
-
-
 def quality_against_time(
     history: Mapping[str, NDArray[np.floating]],
     psnr: Sequence[tuple[float, float]] = (),
-    further: NextDecibel | None = None,
 ) -> bytes:
     """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, number of views and Gaussians.
 
     Args:
         history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
         psnr: (seconds, dB) of each snapshot; none without a truth.
-        further: time that another dB would take; None if it is not known.
     """
     seconds = history["seconds"]
     growing = [
@@ -132,7 +102,7 @@ def quality_against_time(
     left, *others = np.ravel(figure.subplots(down, across))
     _misfit(left, history)
     if curve is not None:
-        _decibels(others.pop(0), *record(curve.seconds, curve.residuals), curve.views, further)
+        _decibels(others.pop(0), curve)
     if psnr:
         axes = others.pop(0)
         axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
@@ -171,23 +141,7 @@ def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
     finish(axes, "time (s)", "", "Misfit", grid=True)
 
 
-def _decibels(
-    axes: Axes, seconds: NDArray[np.float64], quality: NDArray[np.float64], views: str, further: NextDecibel | None
-) -> None:
-    """The residual as dB below the data, and the time at which the next dB is expected."""
-    axes.plot(seconds, quality, color="tab:green", lw=1.2, marker=".", ms=3)
-    finish(axes, "time (s)", "dB below the data", f"Residual, {views}", grid=True)
-    if further is None or seconds.size == 0:
-        return
-    if not further.measurable:
-        axes.text(0.97, 0.05, "longer: no further dB", ha="right", fontsize=8, transform=axes.transAxes)
-        return
-    note = f"next dB of the {further.of}: about {duration_text(further.seconds)} more"
-    axes.text(0.97, 0.05, note, ha="right", fontsize=8, transform=axes.transAxes)
-    if further.of == "volume":
-        return  # this curve is the residual, not the quality of the volume
-    end, top = float(seconds[-1]), float(quality[-1])
-    axes.plot([end, end + further.seconds], [top, top + 1], color="tab:green", lw=1, ls=":")
-    high = further.high if math.isfinite(further.high) else 3 * further.seconds
-    axes.plot([end + further.low, end + high], [top + 1, top + 1], color="0.4", lw=1)
-    axes.plot([end + further.seconds], [top + 1], color="0.4", marker="|", ms=8)
+def _decibels(axes: Axes, curve: ResidualCurve) -> None:
+    """The residual as dB below the data."""
+    axes.plot(*curve.decibels, color="tab:green", lw=1.2, marker=".", ms=3)
+    finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)

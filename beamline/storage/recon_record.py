@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.quantities import VoxelKind
-from recon.assess.time_model import NextDecibel
 from recon.base.method import Ending
 from recon.base.volume import Grid, Volume, VolumeSeries
 
@@ -80,7 +79,6 @@ class ReconRecord:
         warnings: sentences.
         hiding: the warning of what the volume may hide; empty without.
         chosen: how `auto`, a budget or a preset came to its settings; empty where they were given.
-        next_decibel, next_decibel_text: what one more decibel costs; None, and empty, where that is not known.
         output, report: files of the volume and of its report; None: not written.
         outputs: the file of each of several materials, by name; empty of others.
         elapsed, times: s in all, and of each phase.
@@ -104,8 +102,6 @@ class ReconRecord:
     warnings: Sequence[str] = ()
     hiding: str = ""
     chosen: str = ""
-    next_decibel: NextDecibel | None = None
-    next_decibel_text: str = ""
     output: Path | None = None
     outputs: Mapping[str, Path] = field(default_factory=dict)
     report: Path | None = None
@@ -186,8 +182,6 @@ class ReconRecord:
             "times_s": self.seconds_of_volumes or None,
             "hiding": self.hiding or None,
             "chosen": self.chosen or None,
-            "next_db": self.next_decibel,
-            "next_db_said": None if self.next_decibel is None else self.next_decibel_text,
             "fbp": self.compared,
         }
         return {

@@ -33,7 +33,6 @@ from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import binned, run_on
 from beamline.report.record import history_arrays, residual_curve
 from recon.assess import metrics
-from recon.assess.time_model import record
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
@@ -96,7 +95,7 @@ def run(
         "metrics": {name: float(value) for name, value in figures.items()},
         "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
         "squared_residuals": squared,
-        "curve": [] if judged is None else np.transpose(record(judged.seconds, judged.residuals)).tolist(),
+        "curve": [] if judged is None else np.transpose(judged.decibels).tolist(),
         "curve_of": "" if judged is None else judged.views,
         "reached": "" if result is None else reached(result),
         "message": "; ".join(dict.fromkeys(str(one.message) for one in warned)),

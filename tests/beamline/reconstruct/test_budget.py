@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -314,9 +314,8 @@ def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert metrics["psnr"] > 15
     done = events[-1].data
     assert "binned 2 x 2" in done["chosen"]
-    assert {"seconds", "low", "high", "of"} == set(asdict(done["next_db"]))
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
-    assert done["chosen"] in page and done["next_db_said"] in page
+    assert done["chosen"] in page
 
 
 @pytest.mark.slow
