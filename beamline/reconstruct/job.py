@@ -20,9 +20,9 @@ from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.region import RegionOfRows
 from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on, without_outside
+from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop

@@ -28,7 +28,7 @@ from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.scan_statistics import Light, LightAsked, light_in
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
-from beamline.reconstruct.outcome import facts_of
+from beamline.reconstruct.scan_facts import facts_of
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import ONE_IN

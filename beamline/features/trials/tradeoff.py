@@ -25,8 +25,8 @@ from beamline.features.trials.layout import Planned
 from beamline.features.trials.runner import Expected, expected_seconds
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.projections.prepared import with_views_held_out
-from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.plan import times_of
+from beamline.reconstruct.scan_facts import facts_of
 from recon.base.empirical import ONE_IN
 from recon.base.kernel import Kernel
 from recon.base.method import Plain

@@ -31,7 +31,7 @@ from beamline.features.trials.trial import Trial
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import binned, run_on
-from beamline.report.record import history_arrays, residual_curve
+from beamline.report.history import history_arrays, residual_curve
 from recon.assess import metrics
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry

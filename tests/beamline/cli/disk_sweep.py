@@ -40,7 +40,7 @@ _MODULES = {
     "export": "features.export.command",
     "ingest": "features.files.command features.files.ingest",
     "archive": "features.archive.command",
-    "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
+    "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.report report.figures",
     "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",
     "study": "features.trials.command features.trials.study",

@@ -48,7 +48,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_exchange(folder / "scan.h5", scan, {"data": counts.astype(np.uint16)})
     (folder / ".whole.partial.h5.structure").write_bytes(bytes(100))
     with contextlib.chdir(folder), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("beamline.reconstruct.result.write_volume", None)
+        patch.setattr("beamline.reconstruct.record.write_volume", None)
         assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
     assert left(folder) == {"scan.h5", "whole.h5"}
     return folder

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from beamline.report.record import (
+from beamline.report.history import (
     history_arrays,
     history_from,
     quality_against_time,
