@@ -220,7 +220,7 @@ OPERATIONS: Mapping[str, Callable[[str], tuple[SizedRun, ...]]] = {
     ),  # a dual step of total variation, or the end of some: lines, voxels
     "slope": lambda which: _on_volume(_sloped),  # of total variation: lines, voxels
     "patches": lambda which: _on_volume(_patched),  # lines, voxels
-    "fbp": _filtered,  # rays, s on the machine of docs/notes/performance.md; by rays or by gridding
+    "fbp": _filtered,  # rays, s on the machine of docs/performance.md; by rays or by gridding
     "back-projection": _back_projected,  # lines x views, voxels x views; of a cone or of views in any pose
     "views": lambda which: (_views_of_fit(16, 96), _views_of_fit(64, 160)),  # the data of a fit: views, rays
     "view": lambda beam: (

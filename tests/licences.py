@@ -18,25 +18,20 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 
 FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "txrm", "cluster", "tango")
-FOR_DEVELOPERS = ("dev", "docs", "oracle", "league", "browser")
 
 # Where the metadata name no licence, or only a family: read in the licence file of the package.
 READ = {
-    "algotom": "Apache-2.0",
     "bluesky": "BSD-3-Clause",
     "dask-jobqueue": "BSD-3-Clause",
-    "dicttoxml": "GPL-2.0",
     "hdf5plugin": "MIT",  # its plug-ins: BSD, MIT, Apache-2.0, Zlib and that of bzip2
     "historydict": "BSD-3-Clause",
     "mongoquery": "Unlicense",
-    "pytest-timeout": "MIT",
     "pyusb": "BSD-3-Clause",
 }
 
 # Brought on other systems, or by other builds, than the one where the page is written.
 ELSEWHERE = {
-    "colorama": ("BSD-3-Clause", "Windows: click, pytest"),
-    "pywin32": ("PSF-2.0", "Windows: packages of the tests"),
+    "colorama": ("BSD-3-Clause", "Windows: click"),
     "nvidia-*": ("NVIDIA's own", "CUDA builds of torch; never needed"),
     "cuda-*": ("NVIDIA's own", "CUDA builds of torch; never needed"),
 }
@@ -132,13 +127,13 @@ def page() -> str:
     """The page as Markdown."""
     users = {extra: brought(wanted(extra)) for extra in FOR_USERS}
     base = brought(wanted(None))
-    developers = {extra: brought(wanted(extra)) for extra in FOR_DEVELOPERS}
     parts = [
         "# Licences",
         "splatline is BSD-3-Clause. Its wheel holds one file of another project: uPlot 1.6.32, MIT, with its licence\n"
         "beside it. `python -m tests.licences` writes this page from the metadata of what is installed, with what\n"
         "packages bring in turn. A test fails where an installed package has no row, and where one that users install\n"
-        "is under the GPL. What each direct dependency is for: [dependencies](decisions/dependencies.md).",
+        "is under the GPL. Packages of tests and docs, which no user needs, are not listed. What each direct\n"
+        "dependency is for: [dependencies](decisions/dependencies.md).",
         "Wheels of numpy and scipy hold libgfortran, and those of torch libgomp: GPL with the exception that lets any\n"
         "program use them. pyusb loads the system's libusb (LGPL), a driver for DCAM cameras the vendor's library;\n"
         "neither is shipped.",
@@ -146,10 +141,6 @@ def page() -> str:
         _table(dict.fromkeys(base, ""), base),
         "## Extras for users",
         _section(users, set(base)),
-        "## Tests and docs",
-        "No user needs these. The one under the GPL, dicttoxml, is brought by nabu (tomoscan), which reads our scans\n"
-        "in the tests.",
-        _section(developers, set(base).union(*users.values())),
         "## On other systems, and with other builds of torch",
         _lines((name, words, why) for name, (words, why) in ELSEWHERE.items()),
     ]

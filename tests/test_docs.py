@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(path for path in DOCS.rglob("*.md") if path.relative_to(DOCS).parts[0] != "notes")
+PAGES = sorted(DOCS.rglob("*.md"))
 ENTRANCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
@@ -17,21 +17,13 @@ def test_every_page_is_in_the_navigation() -> None:
     assert sorted(listed) == names
 
 
-@pytest.mark.parametrize("room", sorted((DOCS / "decisions").glob("*.md")), ids=lambda path: path.stem)
-def test_the_index_of_decisions_has_the_headings_of_each_room(room: Path) -> None:
-    index = (DOCS / "decisions" / "index.md").read_text(encoding="utf-8")
-    headings = re.findall(r"^## (.*)$", room.read_text(encoding="utf-8"), flags=re.M)
-    row = "; ".join(headings).replace("|", r"\|")
-    assert not headings or f"]({room.name}) | {row} |" in index
-
-
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as mkdocs makes them."""
     titles = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), flags=re.M)
     return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles}
 
 
-@pytest.mark.parametrize("page", [*PAGES, *ENTRANCES, *(DOCS / "notes").glob("*.md")], ids=lambda path: path.name)
+@pytest.mark.parametrize("page", [*PAGES, *ENTRANCES], ids=lambda path: path.name)
 def test_links_lead_somewhere(page: Path) -> None:
     text = re.sub(r"(?s)```.*?```", "", page.read_text(encoding="utf-8"))
     for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):

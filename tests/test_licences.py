@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.licences import ELSEWHERE, FOR_DEVELOPERS, FOR_USERS, brought, gpl, key, licence, row_of, rows, wanted
+from tests.licences import ELSEWHERE, FOR_USERS, brought, gpl, key, licence, row_of, rows, wanted
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def test_all_that_users_install_has_a_row_and_is_not_under_the_gpl(extra: str | 
     assert not {name: words for name, package in packages.items() if gpl(words := licence(package))}
 
 
-@pytest.mark.parametrize("extra", [None, *FOR_USERS, *FOR_DEVELOPERS])
+@pytest.mark.parametrize("extra", [None, *FOR_USERS])
 def test_each_package_that_the_project_names_has_a_row_with_a_licence(extra: str | None, table: dict[str, str]) -> None:
     """Also where it is not installed here."""
     missing = [name for name in map(key, (each.name for each in wanted(extra))) if name not in table]
@@ -27,7 +27,7 @@ def test_each_package_that_the_project_names_has_a_row_with_a_licence(extra: str
 
 
 def test_every_row_states_a_licence(table: dict[str, str]) -> None:
-    assert {"numpy", "selenium", *ELSEWHERE} <= table.keys()
+    assert {"numpy", *ELSEWHERE} <= table.keys()
     assert not [name for name, words in table.items() if words in ("", "UNKNOWN")]
 
 

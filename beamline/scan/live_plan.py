@@ -15,7 +15,7 @@ _FEWEST = 90  # views
 _SHARE = 0.5  # share of the free memory
 _PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
 _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
-"""dB of the live volume after a quarter, half and three quarters: 90 views of particles (docs/notes/performance.md)."""
+"""dB of the live volume after a quarter, half and three quarters: 90 views of particles."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
 
 FEW_PHOTONS = 100
-"""Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""
+"""Photons in a pixel of the open beam; with fewer, counts are better than logarithms."""
 
 
 def refuse_unknown_device(device: str) -> None:

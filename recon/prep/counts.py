@@ -17,7 +17,7 @@ from recon.base.declared_types import check_arguments, check_settings
 from recon.base.geometry import Geometry, require_views
 
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
-# of the expansion on three samples at 10 to 10 000 photons (docs/notes/exploration.md). So are the other two.
+# of the expansion on three samples at 10 to 10 000 photons. So are the other two.
 _SIGMA, _SPREAD = 1.5, 2.0
 _DETAIL = 1.5  # variance over that of counting; places with more have detail
 _FEWEST = 0.25  # photons: least expectation of a ray

@@ -3,7 +3,7 @@
 The rates fall as 1 / (1 + t / 60) with the steps t, and the model is the mean of the parameters over the last quarter
 of them. A step uses one or two views, so at a high rate the parameters wander about the optimum of all views. Their
 mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit whose rates
-were planned to end there (docs/notes/performance.md, "Streaming").
+were planned to end there.
 """
 
 from __future__ import annotations

@@ -196,7 +196,7 @@ class FitSettings:
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
             Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
-            higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
+            higher last rate gives in 400 steps and a finish as much as 20 in 500.
         paced_for: steps of the longest fit that `pace` holds for, see `in_steps`.
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.

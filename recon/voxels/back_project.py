@@ -302,7 +302,7 @@ def compile_gridding() -> None:
 
 
 def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]) -> bool:
-    """Whether gridding takes less time than going ray by ray, by measured times (docs/notes/performance.md)."""
+    """Whether gridding takes less time than going ray by ray, by measured times."""
     rays, gridded = nanoseconds(views, cols, voxels, slices, response)
     return rays > gridded
 

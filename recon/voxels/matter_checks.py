@@ -146,7 +146,7 @@ def _empty_and_seen(
 
 UNEXPLAINED_LIMIT = 0.007
 """Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
-edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md).
+edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes.
 """
 
 _SIGNIFICANT = 4.0  # standard deviations of the noise, above which noise has a share below 1e-3

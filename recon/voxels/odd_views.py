@@ -16,7 +16,7 @@ from recon.base.volume import Grid, Volume, part_of
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
 LIMIT = 12.0
-"""Limit, in usual differences (standard deviations): clean real scans stay below 9.4 (docs/notes/exploration.md)."""
+"""Limit, in usual differences (standard deviations): clean real scans stay below 9.4."""
 
 _CELLS = 128  # least columns of cells, if the detector has so many pixels
 _BLUR = 4  # pixels: reach of a blur by one pixel

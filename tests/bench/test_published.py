@@ -1,4 +1,4 @@
-"""The published R²-Gaussian beside ours, and what each departure from it gains; pytest -m bench -s tests/bench.
+"""The published R²-Gaussian beside ours, and what each setting of ours costs; pytest -m bench -s tests/bench.
 
 CURVE_SECONDS=15,60 CURVE_STEPS=3000,30000 pytest -m bench -s tests/bench/test_published.py -k "against_time and shell"
 """
@@ -18,7 +18,7 @@ import recon
 from recon.assess.metrics import psnr, ssim3d
 from recon.base.kernel import Kernel
 from recon.base.method import RunControl
-from recon.features.published.r2_published import R2Published, published_fit
+from recon.features.published.r2_published import R2Published
 from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import Case, cone, seen_by_simulator
@@ -26,22 +26,7 @@ from tests.bench.quality_cases import Case, cone, seen_by_simulator
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(0)]
 VIEWS, SIZE = 50, int(os.environ.get("TABLE_SIZE", "128"))
 COUNT = max(2000, round(50_000 * (SIZE / 256) ** 3))  # as many Gaussians a voxel as published
-PUBLISHED, FIT, OURS = R2Published(gaussians=COUNT), published_fit(), FitSettings()
-DEPARTURES = {
-    "as published": PUBLISHED,
-    "10 000 steps": replace(PUBLISHED, steps=10_000),
-    "not rectified": replace(PUBLISHED, fit=replace(FIT, rays=replace(FIT.rays, rectified=False))),
-    "our start": replace(PUBLISHED, start="fbp"),
-    "our split and clone": replace(PUBLISHED, fit=replace(FIT, policy=DensityPolicy())),
-    "7645 Gaussians at the start": replace(PUBLISHED, gaussians=7645),
-    "compact kernel": replace(PUBLISHED, fit=replace(FIT, kernel=Kernel.COMPACT)),
-    "least width of 0.3 pixels": replace(PUBLISHED, fit=replace(FIT, smallest=0.3)),
-    "total variation moves centres": replace(PUBLISHED, fit=replace(FIT, tv_moves=True)),
-    "total variation by noise, larger box": replace(PUBLISHED, fit=replace(FIT, tv_weight=None, tv_size=None)),
-    "finish on voxels": replace(PUBLISHED, finish=None),
-    "400 steps, 26 times the rates": replace(PUBLISHED, steps=400, fit=replace(FIT, pace=26.0, views_per_step=2)),
-}
-"""One change each of the published settings."""
+PUBLISHED, OURS = R2Published(gaussians=COUNT), FitSettings()
 
 
 def ours(steps: int | None = None, finish: int | None = None, count: int | None = None, **fit: Any) -> recon.R2:
@@ -77,7 +62,7 @@ TOWARDS = {
     "ours, 25 000 Gaussians, 1000 steps, no finish": ours(1000, 0, 25_000),
     "ours, 40 000 Gaussians, 1600 steps, no finish": ours(1600, 0, 40_000),
 }
-"""The reverse: from ours towards the published settings, and what joins them."""
+"""From ours towards the published settings."""
 
 
 def line(case: Case, label: str, method: recon.R2) -> str:
@@ -106,13 +91,11 @@ def test_accuracy_against_time(shared_data: Path, name: str) -> None:
         print(line(case, f"as published, {steps} steps", replace(PUBLISHED, steps=steps)), flush=True)
 
 
-@pytest.mark.parametrize("label", [*DEPARTURES, *TOWARDS])
+@pytest.mark.parametrize("label", TOWARDS)
 @pytest.mark.parametrize("name", ["teapot", "shell", "thorax"])
-def test_what_a_departure_gains(shared_data: Path, name: str, label: str) -> None:
-    """A row; in the environment, PUBLISHED_STEPS=N replaces 30 000 steps, TABLE_SIZE=N the 128 voxels of a side."""
-    method = (DEPARTURES | TOWARDS)[label]
-    if (steps := os.environ.get("PUBLISHED_STEPS")) and method.steps == PUBLISHED.steps:
-        method = replace(method, steps=int(steps))
+def test_what_a_setting_costs(shared_data: Path, name: str, label: str) -> None:
+    """A row; in the environment TABLE_SIZE=N replaces the 128 voxels of a side."""
+    method = TOWARDS[label]
     case = cone(shared_data, name, VIEWS, SIZE, seen_by_simulator)
     warm_up(method, case.geometry, weighted=False)
     print("\n" + line(case, label, method), flush=True)

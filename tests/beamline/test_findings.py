@@ -1,0 +1,190 @@
+"""Every finding on right scans, on attacked ones and on real ones, against those that were recorded: of the monitor, of
+`validate` and of the preparation of a reconstruction.
+
+After a change that must not change what users are told, none may differ. Where one was meant to, say so in CHANGELOG.md
+and record: `python -m tests.beamline.test_findings [CASE ...]`. Numbers within sentences may differ by 2 %.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import pytest
+
+from beamline.core.errors import BeamlineError
+from beamline.core.text import spans
+from beamline.features.files.validate import source_findings, validate, views_lit
+from beamline.monitor.check import Flag
+from beamline.projections.replay import by_kind, replay, verdict
+from beamline.projections.selection import Selection
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import open_scan
+from tests.beamline.attacked_scans import SCANS
+from tests.beamline.prepared_views import prepare
+from tests.bench.clean_scans import clean_scan
+from tests.bench.monitor_scenes import CLEAN, base_scene
+from tests.bench.test_monitor_roc import STRENGTHS, anomalous_event, flags_of
+from tests.conftest import SHARED_DATA
+
+Row = list[str]
+"""Who finds it, rule, severity, frames, and the sentence (of the worst frame, where each has one)."""
+RECORD = Path(__file__).parent / "findings.json"
+SHARED_CASES = SHARED_DATA.parent / "cases"
+REAL = {
+    "diamond": "diamond_24737_parallel_91x135x160.h5",
+    "tooth": "aps2bm_tooth_181x2x640.h5",
+    "walnut": "walnut_parallel_rebinned_240x96x256.h5",
+}
+MADE = ("21", "31", "32", "34", "44", "45", "54", "57", "77", "78", "83", "91", "101", "102", "103", "107", "108",
+        "111", "116", "121", "123", "132", "136", "138", "140", "152")  # fmt: skip
+QUICK_EACH = 6  # of the small scans
+
+
+def by_the_monitor(flags: Iterable[Flag]) -> list[Row]:
+    return [
+        ["monitor", kind.check, str(kind.level), spans(list(kind.frames)), kind.worst.advice] for kind in by_kind(flags)
+    ]
+
+
+def of_source(source: ScanSource, axis: float | None = None) -> list[Row]:
+    """What the monitor, `validate` and the preparation find in a scan."""
+    judged = list(replay(source))
+    rows = by_the_monitor(flag for each in judged for flag in each.flags)
+    whole = verdict(source, judged)
+    rows += [["monitor", "references", "", "", sentence] for sentence in whole.references]
+    rows += [["monitor", "left out", "", "", sentence] for sentence in whole.aside]
+    rows += [["monitor", "drift", "", "", whole.drift]] if whole.drift else []
+    found = dict.fromkeys([*source_findings(source), *views_lit(source, every=True)])
+    rows += [["validate", each.rule, each.severity, "", each.message] for each in found]
+    return rows + prepared(source, axis)
+
+
+def prepared(source: ScanSource, axis: float | None) -> list[Row]:
+    try:
+        sentences = prepare(source, Selection(axis_col=axis))[1]
+    except BeamlineError as error:
+        return [["prepare", "refused", "error", "", str(error)]]
+    return [["prepare", "", "", "", str(sentence)] for sentence in sentences]
+
+
+def of_file(path: Path) -> list[Row]:
+    """What is found in a file or folder, with what it is opened with by default."""
+    try:
+        with open_scan(path) as source:
+            rows = of_source(source)
+    except BeamlineError as error:
+        rows = [["open", "refused", "error", "", str(error)]]
+    of_scan = {(row[1], row[2], row[4]) for row in rows if row[0] == "validate"}
+    others = [each for each in validate(path) if (each.rule, each.severity, each.message) not in of_scan]
+    rows += [["file", each.rule, each.severity, "", each.message] for each in others]
+    return [[word.replace(f"{path.parent}/", "") for word in row] for row in rows]
+
+
+def of_anomaly(name: str) -> list[Row]:
+    return by_the_monitor(anomalous_event(name, 0).flags)
+
+
+def of_clean_scene(name: str) -> list[Row]:
+    return by_the_monitor(flags_of(base_scene(name, 30), 8000, range(0, 150))[1])
+
+
+def of_clean_scan(seed: int) -> list[Row]:
+    source, _ = clean_scan(seed)
+    return of_source(cast(ScanSource, source), source.axis_col)
+
+
+def of_shared_case(name: str) -> list[Row]:
+    """What is found in the files that the case makes."""
+    with TemporaryDirectory() as folder:
+        made = Path(folder).resolve() / name
+        shutil.copytree(SHARED_CASES / name, made)
+        made.chmod(0o755)
+        shutil.copy(SHARED_CASES / "common.py", made.parent)
+        before = set(made.iterdir())
+        subprocess.run([sys.executable, "make.py"], cwd=made, check=True, capture_output=True)
+        rows: list[Row] = []
+        for path in sorted(set(made.iterdir()) - before):
+            rows += [[f"{path.name}: {who}", *row] for who, *row in of_file(path)]
+        return rows
+
+
+def cases() -> Mapping[str, Callable[[], list[Row]]]:
+    """All cases by name; the first are the small scans."""
+    small = {name: lambda make=make: of_source(cast(ScanSource, make().source()), 31.2) for name, make in SCANS.items()}
+    return {
+        **small,
+        **{f"clean scan {seed}": lambda seed=seed: of_clean_scan(seed) for seed in range(60)},
+        **{f"scene: {name}": lambda name=name: of_anomaly(name) for name in STRENGTHS},
+        **{f"clean scene: {name}": lambda name=name: of_clean_scene(name) for name in CLEAN},
+        **{f"real: {name}": lambda name=name: of_file(SHARED_DATA / REAL[name]) for name in REAL},
+        **{f"shared: {name}": lambda name=name: of_shared_case(name) for name in MADE},
+    }
+
+
+CASES = cases()
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+
+
+def alike(now: Sequence[Row], then: Sequence[Row]) -> bool:
+    """Whether the same is found, in the same words; numbers may differ a little."""
+
+    def without_numbers(rows: Sequence[Row]) -> list[Row]:
+        return [[*row[:-1], _NUMBER.sub("#", row[-1])] for row in rows]
+
+    if without_numbers(now) != without_numbers(then):
+        return False
+    numbers = ([float(found) for row in rows for found in _NUMBER.findall(row[-1])] for rows in (now, then))
+    return all(math.isclose(a, b, rel_tol=0.02, abs_tol=0.0101) for a, b in zip(*numbers, strict=True))
+
+
+def recorded() -> dict[str, list[Row]]:
+    return cast(dict[str, list[Row]], json.loads(RECORD.read_text(encoding="utf-8")))
+
+
+def marked() -> list[Any]:
+    return [
+        name if name in SCANS and n % QUICK_EACH == 0 else pytest.param(name, marks=pytest.mark.slow)
+        for n, name in enumerate(CASES)
+    ]
+
+
+@pytest.mark.parametrize("case", marked())
+def test_findings_are_those_that_were_recorded(case: str) -> None:
+    if case.startswith("real: ") and not (SHARED_DATA / REAL[case[6:]]).is_file():
+        pytest.skip(f"{REAL[case[6:]]} is not beside this checkout (../shared/data)")
+    if case.startswith("shared: ") and not (SHARED_CASES / case[8:]).is_dir():
+        pytest.skip(f"case {case[8:]} is not beside this checkout (../shared/cases)")
+    now, then = CASES[case](), recorded()[case]
+    assert alike(now, then), "\n".join(
+        [*(f"- {row}" for row in then if row not in now), *(f"+ {row}" for row in now if row not in then)]
+    )
+
+
+def record(wanted: Sequence[str]) -> None:
+    """Write what these cases find, or all; those that are not here stay."""
+    known = recorded() if RECORD.is_file() else {}
+    for name in wanted or CASES:
+        try:
+            known[name] = CASES[name]()
+        except FileNotFoundError as error:
+            print(name, error, file=sys.stderr)
+    ordered = {name: known[name] for name in CASES if name in known}
+    lines = (
+        f"{json.dumps(name)}: [\n" + ",\n".join(f"  {json.dumps(row)}" for row in rows) + "\n]" if rows
+        else f"{json.dumps(name)}: []"
+        for name, rows in ordered.items()
+    )  # fmt: skip
+    RECORD.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    record(sys.argv[1:])
