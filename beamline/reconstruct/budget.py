@@ -13,10 +13,11 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import binned, run_on
 from recon.assess.time_model import Choice, Speeds, duration_text, plans
 from recon.auto import LEFT, ROWS, part_of, predicts_best
-from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
+from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.base.work import Rates
 from recon.methods import with_settings
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import speeds_of
 from recon.splatting.initialise import default_count
 from recon.voxels.direct import has_direct_method
@@ -183,7 +184,7 @@ def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
     """The volume of a method by `end`."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
-    if isinstance(method, TimedMethod):
+    if isinstance(method, FitMethod):
         method = method.in_time(data, geometry, seed, lambda: end - now())
     trials = control.stop.by(now() + _OF_TRIALS * (end - now()), now)
     return run_on(method, prepared, Grid.matching(geometry), seed, replace(control.by(end), stop_trials=trials))

@@ -30,7 +30,7 @@ from beamline.storage.writers.partial_volume import can_become
 from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.method import EarlyStopMethod, Method, PresetMethod
+from recon.base.method import Method, PresetMethod, setting
 from recon.methods import has_setting
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
@@ -294,7 +294,7 @@ class ReconOptions:
     @property
     def stops_early(self) -> bool:
         """Whether held-out views may end the method early."""
-        return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
+        return bool(setting(self.method, "early_stop", False))
 
     @property
     def streaming(self) -> FitMethod:

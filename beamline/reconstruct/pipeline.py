@@ -41,7 +41,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
-from recon.base.method import BoundedMethod
+from recon.base.method import setting
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
@@ -190,9 +190,9 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         compile_kernels(options, prepared.geometry, sink, clock)
         phases.enter("reconstruction")
         before_report = Stop()
-        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
+        if (limit := setting(options.method, "seconds")) is not None:
             started = channels.started, channels.worked
-            method, before_report = fit_within(options.method, prepared, options.target, started, clock, warn)
+            method, before_report = fit_within(options.method, limit, prepared, options.target, started, clock, warn)
             options = replace(options, method=method)
         yield Job(
             options,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from recon.base.geometry import Geometry
-from recon.base.method import DividedMethod
+from recon.base.method import for_part
 from recon.base.volume import Grid
 
 CLOCK = "clock"
@@ -132,7 +132,7 @@ def costs_of(method: Any, parts: Sequence[tuple[Geometry, Grid]], decided: bool 
     each = []
     for geometry, grid in parts:
         share = grid.shape[0] / whole
-        own = method.for_part(share, share) if share < 1 and isinstance(method, DividedMethod) else method
+        own = for_part(method, share, share) if share < 1 else method
         each.append(own.costs(geometry, grid))
     volumes = {name: sum((costs.volumes[name] for costs in each), Work()) for name in each[0].volumes}
     return Costs(volumes, Work() if decided else each[0].choice)

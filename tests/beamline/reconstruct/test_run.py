@@ -22,6 +22,7 @@ from beamline.reconstruct.run import fit_within, warnings_told
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
+from recon.base.method import setting
 from recon.features.neural.methods import NAF
 from recon.splatting.r2 import R2
 from tests.beamline.prepared_views import prepared_views
@@ -50,10 +51,9 @@ def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, f
     target = OutputPaths(Path("out.h5"), Path("out.html") if report else None)
     started = 100.0, time.process_time() - spent  # all of the machine is ours
     method, before_report = fit_within(
-        R2(seconds=seconds), _prepared(), target, started, SteppedClock(100.0 + spent), said.append
+        R2(seconds=seconds), seconds, _prepared(), target, started, SteppedClock(100.0 + spent), said.append
     )
-    assert method.seconds is not None
-    return method.seconds, 100.0 + seconds - before_report.deadline, said
+    return float(setting(method, "seconds")), 100.0 + seconds - before_report.deadline, said
 
 
 @pytest.mark.usefixtures("sweeps")
@@ -77,7 +77,7 @@ def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> Non
 def test_a_method_without_a_start_is_told_of_none() -> None:
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), None)
-    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), SteppedClock(109.0), said.append)
+    fit_within(NAF(seconds=12.0), 12.0, _prepared(), target, (100.0, 0.0), SteppedClock(109.0), said.append)
     assert len(said) == 1 and "nothing is left for the NAF method" in said[0] and "start" not in said[0]
 
 
