@@ -78,16 +78,26 @@ def shift_between(first: NDArray[np.floating], again: NDArray[np.floating]) -> V
             return UNKNOWN
         if max(abs(more_across), abs(more_down)) < ENOUGH:
             break
+    return _known(moved[inside].ravel(), b[inside].ravel(), left - basis.T @ step, inverse, size, (across, down))
+
+
+def _known(moved: F64, seen: F64, rest: F64, inverse: F64, size: F64, shift: tuple[float, float]) -> ViewShift:
+    """The shift where the views determine it.
+
+    Args:
+        moved, seen: [pixel], the first view after the shift, and the second.
+        rest: [pixel], what the least squares leave.
+        inverse, size: of their normal equations, and norms of their terms; the shifts come first.
+    """
     spread = 4 * math.pi * SMOOTH**2  # pixels that share their noise
-    alike = float(np.corrcoef(moved[inside].ravel(), b[inside].ravel())[0, 1]) if moved[inside].std() > 0 else 0.0
-    if not alike * math.sqrt(left.size / spread) > SIGMAS:
+    alike = float(np.corrcoef(moved, seen)[0, 1]) if moved.std() > 0 else 0.0
+    if not alike * math.sqrt(rest.size / spread) > SIGMAS:
         return UNKNOWN
-    rest = left - basis.T @ step
     variance = float((rest**2).mean()) * spread
     sigmas = [
         math.sqrt(variance * float(inverse[i, i])) if inverse[i, i] > 0 and size[i] > 0 else math.inf for i in range(2)
     ]
-    told = [value if sigma < KNOWN else math.nan for value, sigma in zip((across, down), sigmas, strict=True)]
+    told = [value if sigma < KNOWN else math.nan for value, sigma in zip(shift, sigmas, strict=True)]
     return ViewShift(*told, *(sigma if sigma < KNOWN else math.nan for sigma in sigmas))
 
 
