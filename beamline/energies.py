@@ -25,7 +25,7 @@ from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Method, volume_names_of
 from recon.features.joint.energy_fit import EnergyViews, refuse_alike
-from recon.features.joint.registration import register_energies
+from recon.features.joint.learnt_motion import register_energies
 from recon.voxels.displacement import measured_unmagnified, unmagnified
 
 

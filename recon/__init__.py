@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from recon.features.iterative.methods import Sart as Sart
     from recon.features.iterative.methods import Sirt as Sirt
     from recon.features.joint.energy_fit import EnergyViews
+    from recon.features.joint.learnt_motion import register_energies
     from recon.features.joint.methods import EnergySeries, TimeSeries
     from recon.features.joint.proportions import fit_share
-    from recon.features.joint.registration import register_energies
     from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
     from recon.features.joint.spectral import Materials, fit_materials
     from recon.features.neural.methods import NAF as NAF
@@ -124,7 +124,7 @@ _LAZY = {
     "Counts": "recon.prep.counts",
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings"),
     "reconstruct": "recon.reconstruction",
-    "register_energies": "recon.features.joint.registration",
+    "register_energies": "recon.features.joint.learnt_motion",
     **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.features.joint.series"),
     "EnergyViews": "recon.features.joint.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.features.joint.spectral"),

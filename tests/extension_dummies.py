@@ -64,7 +64,6 @@ from beamline.cli.recon import recon as command
 from beamline.features.trials.command import tradeoff
 from beamline.reconstruct.option_rules import RULES, takers
 from beamline.reconstruct.scan_facts import label_of
-from beamline.features.trials.front import pareto_plot
 from beamline.features.trials.tradeoff import plan
 from recon import methods
 
@@ -76,7 +75,6 @@ assert (recon.reconstruct(data, views, white).volume.data == 1).all()
 trials = plan(("grey", "fbp"), 60, 1000, "quick")
 labels = {t.label for t in trials if t.method == "grey"}
 assert labels == {"grey, 60 views", "grey, 30 views"}, labels
-assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
 assert "grey" in takers(RULES["iterations"]) and "grey" not in takers(RULES["tv-weight"])

@@ -1,4 +1,5 @@
-"""The features of `[tool.splatline.features]`: where they are, and how many statements the core and each of them have.
+"""The features of `[tool.splatline.features]`: where they are, and how many statements the core, each of them and each
+add-on have.
 
 python -m tests.features [ROOT]
 """
@@ -34,11 +35,13 @@ def statements(path: Path) -> int:
 
 
 def counted(root: Path = ROOT) -> dict[str, int]:
-    """Statements of the four packages by feature; "core": of what belongs to none."""
+    """Statements of the four packages by feature, "core": of what belongs to none; and of each add-on."""
     owners = {root / folder: feature for feature, own in table(root).items() for folder in own}
-    counts = {"core": 0, **dict.fromkeys(table(root), 0)}
-    for package in PACKAGES:
-        for path in (root / package).rglob("*.py"):
+    add_ons = {folder: folder.parent.name for folder in sorted(root.glob("packages/*/splatline_*"))}
+    owners |= add_ons
+    counts = {"core": 0, **dict.fromkeys([*table(root), *add_ons.values()], 0)}
+    for package in (*(root / name for name in PACKAGES), *add_ons):
+        for path in package.rglob("*.py"):
             counts[next((owners[p] for p in (path, *path.parents) if p in owners), "core")] += statements(path)
     return counts
 
@@ -46,5 +49,5 @@ def counted(root: Path = ROOT) -> dict[str, int]:
 if __name__ == "__main__":
     counts = counted(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT)
     for feature, count in sorted(counts.items(), key=lambda item: -item[1]):
-        print(f"{feature:<12}{count:>7}")
-    print(f"{'all':<12}{sum(counts.values()):>7}")
+        print(f"{feature:<20}{count:>7}")
+    print(f"{'all':<20}{sum(counts.values()):>7}")

@@ -17,12 +17,11 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 
-FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "txrm", "cluster", "tango")
+FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "txrm", "zarr", "archive", "cluster", "tango")
 
 # Where the metadata name no licence, or only a family: read in the licence file of the package.
 READ = {
     "bluesky": "BSD-3-Clause",
-    "dask-jobqueue": "BSD-3-Clause",
     "hdf5plugin": "MIT",  # its plug-ins: BSD, MIT, Apache-2.0, Zlib and that of bzip2
     "historydict": "BSD-3-Clause",
     "mongoquery": "Unlicense",

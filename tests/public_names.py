@@ -28,11 +28,23 @@ FOR_BLUESKY = {
 
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
+    "beamline.cli.options": ("as_scan", "json_option"),
+    "beamline.cli.terminal": ("answering",),
+    "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "user_message"),
+    "beamline.core.files": ("refuse_existing", "whole_file"),
+    "beamline.core.text": ("size",),
+    "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues"),
+    "beamline.scan.control": ("State", "Verb", "ask"),
+    "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem", "Traits"),
     "recon.testing": ("MethodConformance",),
     "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
     "beamline.projections.step": ("StepDone", "StepMemory", "option"),
+    "beamline.storage.datasets": ("copy_attributes", "missing_links"),
+    "beamline.storage.hdf5": ("created", "is_hdf5", "open_hdf5", "readable", "reason"),
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
+    "beamline.storage.readers.open": ("open_scan",),
+    "beamline.storage.writers.layout": ("LIBVER",),
     "beamline.storage.volumes.base": ("Slices", "VolumeFormat", "bare_record"),
     "beamline.monitor.check": ("Check", "Flag", "Level", "Look", "Policy", "ScanContext"),
     "beamline.testing": ("ReaderConformance",),

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from beamline.config.beam import NoMonochromator
 from beamline.config.load import NO_LIVE, Config, changed, load, override_of
-from beamline.core.errors import ConfigError, refuse_wrong_arguments
+from beamline.core.errors import ConfigError, ScanStopped, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
@@ -95,7 +95,8 @@ class Instrument:
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended it; ScanAborted: at once.
-            In all these cases the acquired frames are in the file: see `last`.
+            In all these cases the acquired frames are in the file: see `last`. A scan that ends because its views were
+            enough (`recon.stop_when`) does not raise.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
@@ -146,6 +147,9 @@ class Instrument:
                     [remember, say, *([on_event] if on_event else [])], stop,
                     live=how.live, afterwards=how.afterwards, instrument=self._devices,
                 )  # fmt: skip
+        except ScanStopped:
+            if not stop.enough:
+                raise
         finally:
             self.last = _result(ends)
         assert self.last is not None

@@ -126,8 +126,8 @@ def recover(file: Path, as_json: bool) -> None:
     """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
 
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
-    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. It can be
-    run again after whatever stopped it, needs no room for a copy, and says what room it needs.
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. The frames
+    are copied, which takes time and room; whatever stops it leaves FILE as it was.
     """
     from beamline.core.files import JOINED, SCAN
     from beamline.scan.resume import recover_run

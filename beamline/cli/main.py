@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import errno
-import io
 import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
@@ -17,7 +15,7 @@ import click
 from click.exceptions import Abort, ClickException, Exit
 from click.shell_completion import CompletionItem
 
-from beamline.cli.commands import CORE, CommandEntry, Libraries, commands, own_commands
+from beamline.cli.commands import CORE, CommandEntry, commands, own_commands
 from beamline.core.errors import (
     INTERRUPTED,
     BeamlineError,
@@ -28,27 +26,36 @@ from beamline.core.errors import (
     user_message,
 )
 from beamline.core.installed import version
-from beamline.core.text import printable, size
-from recon.base.registry import did_you_mean
+from beamline.core.text import printable
+from recon.base.registry import ADD_ONS, did_you_mean
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
 """Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
 
-_QUIET = {"-h", "--help", "--help-all", "--json"}
 
+class _Lasting:
+    """A text stream that accepts all text; after the first error it drops it."""
 
-class _Lasting(io.FileIO):
-    """Accepts all output; after the first error it drops it."""
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.error: OSError | None = None
 
-    error: OSError | None = None
+    def _tried(self, work: Callable[..., Any], *arguments: Any) -> None:
+        try:
+            work(*arguments)
+        except OSError as error:
+            self.error = error
+            os.dup2(os.open(os.devnull, os.O_RDWR), self._stream.fileno())  # what is buffered goes there, too
 
-    def write(self, data: Any, /) -> int:
-        if self.error is None:
-            try:
-                return super().write(data)
-            except OSError as error:
-                self.error = error
-        return memoryview(data).nbytes
+    def write(self, text: str) -> int:
+        self._tried(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._tried(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 class _Printable:
@@ -57,7 +64,7 @@ class _Printable:
     `unfiltered` is the stream itself, for a progress bar.
     """
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: _Lasting) -> None:
         self.unfiltered = stream
 
     def write(self, text: str) -> int:
@@ -67,73 +74,30 @@ class _Printable:
         return getattr(self.unfiltered, name)
 
 
-class Outputs:
-    """Puts `sys.stdout` and `sys.stderr` on files that last, and that get printable text. Both, and stdin, are open
+def outlast() -> None:
+    """Put `sys.stdout` and `sys.stderr` on streams that last, and that get printable text. Both, and stdin, are open
     from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
-    Only `sys.stdout` leads to the results: what a library or a plug-in writes to the descriptor 1 goes to stderr.
     """
-
-    def __init__(self) -> None:
-        while (number := os.open(os.devnull, os.O_RDWR)) < 3:
-            os.set_inheritable(number, True)
-        os.close(number)
-        sys.stdout = _Printable(_lasting(sys.stdout, apart=True) or _nowhere())
-        sys.stderr = _Printable(_lasting(sys.stderr) or _nowhere())
-
-    def lost(self) -> str:
-        """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
-        buffer = getattr(sys.stdout, "buffer", None)
-        error = getattr(getattr(buffer, "raw", buffer), "error", None)
-        return "" if error is None or error.errno in _CLOSED else error.strerror
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        os.set_inheritable(number, True)
+    os.close(number)
+    streams: Any = sys  # typeshed knows text files alone
+    streams.stdout = _Printable(_Lasting(sys.stdout or _nowhere()))
+    streams.stderr = _Printable(_Lasting(sys.stderr or _nowhere()))
 
 
-def _lasting(stream: TextIO | None, apart: bool = False) -> TextIO | None:
-    """The same stream without errors; the stream itself if the system has no file for it (console of Windows).
-
-    Args:
-        apart: by a descriptor of its own; the stream's leads to stderr from now on.
-    """
-    buffer = getattr(stream, "buffer", None)
-    raw = getattr(buffer, "raw", buffer)  # unbuffered (`python -u`) it is the same
-    if not (isinstance(stream, io.TextIOWrapper) and type(raw) is io.FileIO):
-        return stream
-    stream.flush()
-    number = stream.fileno()
-    if apart:
-        number = os.dup(number)
-        os.dup2(2, stream.fileno())
-    lasting: Any = _Lasting(number, "w", closefd=False)
-    return io.TextIOWrapper(
-        lasting if raw is buffer else io.BufferedWriter(lasting),
-        stream.encoding,
-        stream.errors,
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )
+def lost_output() -> str:
+    """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    error: OSError | None = getattr(sys.stdout, "error", None)
+    return "" if error is None or error.errno in _CLOSED else str(error.strerror)
 
 
 def _nowhere() -> TextIO:
     return open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123 - as long as the process
-
-
-def _load_early(modules: tuple[str, ...]) -> None:
-    """Load these libraries, and the compiler of kernels, before data take the room.
-
-    OpenBLAS waits for ever where it gets no memory while it is loaded, and LLVM ends the process.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # each thread takes 40 MB of addresses
-    for module in ("recon", *modules):  # recon first: where numba is there already, it uses no compiled kernels
-        import_module(module)
-    numba: Any = import_module("numba")
-    numba.njit(_nothing)()
-
-
-def _nothing() -> None:
-    pass
 
 
 def _command(name: str) -> CommandEntry | None:
@@ -154,19 +118,11 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does. DataError where a limit leaves no room for the libraries: some end the process then."""
-        from beamline.core.machine import memory_limit  # here, so that the help loads without it
-
+        """As click does, with the nearest name in the sentence on an unknown one."""
         command = _command(args[0]) if args else None
-        if command is not None and (libraries := command.libraries).early and (limit := memory_limit()) is not None:
-            if limit < libraries.addresses:
-                raise DataError(
-                    f"Out of memory: this process may use {size(limit)} of address space (ulimit -v), and the "
-                    f"libraries of `beamline {args[0]}` alone need {size(libraries.addresses)}. Nothing was read or "
-                    "written."
-                )
-            _load_early(libraries.early)
         if args and command is None and args[0][:1] not in ("", "-"):
+            if args[0] in ADD_ONS:
+                ctx.fail(f"`beamline {args[0]}`: install {ADD_ONS[args[0]]}.")
             ctx.fail(f"There is no command {args[0]!r}{did_you_mean(args[0], commands())}.")
         return super().resolve_command(ctx, args)
 
@@ -233,14 +189,6 @@ def main(debug: bool) -> None:
         )
 
 
-def _say_begun(words: Sequence[str]) -> None:
-    """A first line of commands whose libraries take seconds to load, from a cold disk many."""
-    name = next((word for word in words if not word.startswith("-")), "")
-    command = own_commands().get(name)
-    if command is not None and command.libraries in (Libraries.FRAMES, Libraries.FITS) and not _QUIET & {*words}:
-        click.echo(f"{name}: loading libraries", err=True)
-
-
 def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
@@ -250,8 +198,8 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
-    outputs, code = Outputs(), 0
-    _say_begun(sys.argv[1:])
+    outlast()
+    code = 0
     try:
         main(prog_name="beamline")
     except SystemExit as end:
@@ -259,7 +207,7 @@ def run() -> NoReturn:
     except KeyboardInterrupt:  # outside the work of a command, as while its result is printed
         code = INTERRUPTED
     exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
-    if lost := outputs.lost():
+    if lost := lost_output():
         click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
         command = _command(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
         if code == 0 and (command is None or not command.files):

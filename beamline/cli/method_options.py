@@ -169,13 +169,20 @@ _ALLOW_NEGATIVE = run_option(
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
-_IN_TIME = run_option(
-    "--time",
-    "volumes",
-    type=WholeRange(min=2),
-    metavar="N",
-    help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
-    "views. Each needs twelve views or more.",
+_IN_TIME = together(
+    run_option(
+        "--time",
+        "volumes",
+        type=WholeRange(min=2),
+        metavar="N",
+        help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
+        "views. Each needs twelve views or more.",
+    ),
+    run_option(
+        "--moves/--no-moves",
+        default=None,
+        help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
+    ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
 """The options of methods for every row of a table: length and start of the work."""

@@ -80,8 +80,8 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "makes several volumes, in time: use beamline recon --time N, or beamline tradeoff --time N",
-    "materials": "takes scans at several energies: use beamline materials, or beamline tradeoff --spectra TABLE",
+    "times": "makes several volumes, in time: use beamline recon --time N",
+    "materials": "takes scans at several energies: use beamline materials",
 }
 """Of methods that make several volumes: what takes them."""
 

@@ -11,6 +11,7 @@ import click
 from beamline.cli.method_options import method_options, preset_option
 from beamline.cli.options import (
     NOT_NEGATIVE,
+    POSITIVE,
     MethodChoice,
     NameChoice,
     json_option,
@@ -42,12 +43,9 @@ def memory_size(text: str) -> int:
 
 
 def cluster_of(text: str) -> str:
-    """Parse a cluster: number of workers, `local:N`, an address or `slurm:CONFIG`. Raises ValueError for any other
-    text.
-    """
-    from beamline.reconstruct.memory import cluster  # here: help needs none of it
-
-    cluster().check_cluster(text)
+    """`local:N` or `tcp://HOST:PORT`. Raises ValueError for any other text."""
+    if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+", text):
+        raise ValueError(f"{text!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT")
     return text
 
 
@@ -155,16 +153,28 @@ recon_options = together(
         metavar="FILE",
         help="With --follow: an earlier part of a resumed run, whose views come first. May be repeated.",
     ),
+    run_option(
+        "--enough-loss",
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: report when all remaining views together would add at most so many dB of PSNR.",
+    ),
+    run_option(
+        "--enough-gain",
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: report when ten more views would add at most so many dB.",
+    ),
     unfinished_option,
     heading(RESOURCES),
     memory_option,
     run_option(
         "--cluster",
         of_one_call=True,
-        metavar="local:N|tcp://HOST:PORT|slurm[:CONFIG]",
+        metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),
         help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
-        "those of a scheduler, or jobs of Slurm by a YAML file.",
+        "or those of a scheduler. It needs splatline-cluster.",
     ),
     heading(OUTPUT),
     run_option(

@@ -23,8 +23,9 @@ Name = Annotated[str, Field(min_length=1, max_length=80)]
 class MotorSection(Section):
     """A separate motor, of any kind of stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
 
-    speed_deg_s: Annotated[float, Field(gt=0)] | None = None
-    """null: the stage's max_speed_deg_s."""
+    speed_deg_s: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="null: the stage's max_speed_deg_s."
+    )
     stage: Annotated[StageConfig, Field(discriminator="kind")]
 
     def refuse_unreachable(self, places: Mapping[str, float]) -> None:
@@ -51,12 +52,13 @@ class StageMover(MotorSection):
     """A motor that moves the sample out of the beam for flats, between two positions."""
 
     kind: Literal["stage"]
-    in_deg: float
-    """Where the sample is in the beam."""
-    out_deg: float
-    """Where flats are taken."""
-    mm_per_deg: Annotated[float, Field(ge=-1e3, le=1e3)] | None = None
-    """mm towards higher columns of the frame that a unit of the axis moves the sample; null: unknown, or not across."""
+    in_deg: float = Field(description="Where the sample is in the beam.")
+    out_deg: float = Field(description="Where flats are taken.")
+    mm_per_deg: Annotated[float, Field(ge=-1e3, le=1e3)] | None = Field(
+        default=None,
+        description="mm towards higher columns of the frame that a unit of the axis moves the sample; null: "
+        "unknown, or not across.",
+    )
 
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
@@ -98,8 +100,7 @@ class MotorFilter(MotorSection):
     """Filters on a motor."""
 
     kind: Literal["stage"]
-    places: Annotated[dict[Name, float], Field(min_length=1)]
-    """Name: deg."""
+    places: Annotated[dict[Name, float], Field(min_length=1)] = Field(description="Name: deg.")
 
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
@@ -134,17 +135,20 @@ class BeamMonitorSection(Section):
     """Keys that all beam monitors share. Each kind is listed in BEAM_MONITORS of a folder of `beamline.config`."""
 
     unit: str
-    scale: PositiveFloat = 1.0
-    """What the number is multiplied by to be in `unit`."""
+    scale: PositiveFloat = Field(default=1.0, description="What the number is multiplied by to be in `unit`.")
     timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
-    period_s: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    """Between readings while a scan runs (real time); they are kept in the scan's file."""
-    pause_below: PositiveFloat | None = None
-    """In `unit`: a scan pauses while there is less; null: it never does."""
-    resume_above: PositiveFloat | None = None
-    """In `unit`: from here on there is beam again; null: a tenth above pause_below."""
-    settle_s: Annotated[float, Field(ge=0)] = 5.0
-    """For which there must be beam again before the scan goes on."""
+    period_s: Annotated[float, Field(gt=0, le=1e6)] = Field(
+        default=1.0, description="Between readings while a scan runs (real time); they are kept in the scan's file."
+    )
+    pause_below: PositiveFloat | None = Field(
+        default=None, description="In `unit`: a scan pauses while there is less; null: it never does."
+    )
+    resume_above: PositiveFloat | None = Field(
+        default=None, description="In `unit`: from here on there is beam again; null: a tenth above pause_below."
+    )
+    settle_s: Annotated[float, Field(ge=0)] = Field(
+        default=5.0, description="For which there must be beam again before the scan goes on."
+    )
 
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
@@ -190,12 +194,9 @@ class StageOutputShutter(Section):
     """A shutter on a digital output of the stage's controller, if the controller has outputs that can be set."""
 
     kind: Literal["stage_output"]
-    output: PositiveInt
-    """Number of the output; not the one that the trigger pulses come from."""
-    open_high: bool = True
-    """A high output opens."""
-    settle_s: Annotated[float, Field(ge=0)] = 0.1
-    """How long the blade travels."""
+    output: PositiveInt = Field(description="Number of the output; not the one that the trigger pulses come from.")
+    open_high: bool = Field(default=True, description="A high output opens.")
+    settle_s: Annotated[float, Field(ge=0)] = Field(default=0.1, description="How long the blade travels.")
 
 
 class FoundShutter(Section):
@@ -217,8 +218,9 @@ class NoMonochromator(Section):
 
 
 class _Monochromator(Section):
-    range_kev: tuple[Kev, Kev] | None = None
-    """Lowest and highest energy that a scan may ask for; null: any."""
+    range_kev: tuple[Kev, Kev] | None = Field(
+        default=None, description="Lowest and highest energy that a scan may ask for; null: any."
+    )
 
     @model_validator(mode="after")
     def _range_rises(self) -> Self:
@@ -232,8 +234,7 @@ class SceneMonochromator(_Monochromator):
     """Sets the energy of the simulated beam, which starts at that of the scene."""
 
     kind: Literal["simulated"]
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """Time that each move takes."""
+    settle_s: Annotated[float, Field(ge=0, le=1e6)] = Field(default=1.0, description="Time that each move takes.")
 
 
 class HandMonochromator(_Monochromator):

@@ -46,15 +46,21 @@ class _Orca(Section):
     """The keys that the real and the simulated ORCA-Quest share."""
 
     kind: str
-    model: Literal["C15550-20UP", "C15550-22UP"] = "C15550-20UP"
-    """ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and simulations go by it."""
-    roi: Roi | None = None
-    """null: the full sensor, 2304 x 4096."""
+    model: Literal["C15550-20UP", "C15550-22UP"] = Field(
+        default="C15550-20UP",
+        description="ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and "
+        "simulations go by it.",
+    )
+    roi: Roi | None = Field(default=None, description="null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1
-    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
-    """photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."""
-    trigger_polarity: Literal["positive", "negative"] = "positive"
-    """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = Field(
+        default="standard", description="photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."
+    )
+    trigger_polarity: Literal["positive", "negative"] = Field(
+        default="positive",
+        description="The edge that counts; a camera that was just switched on takes negative, the driver sets "
+        "what stands here.",
+    )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
         """What the camera will say of its timing. ValueError for what it would refuse."""
@@ -67,18 +73,21 @@ class SimulatedOrca(_Orca):
 
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
-    library: str | None = None
-    """Path of the DCAM-API library; null: the installed one."""
-    index: Annotated[int, Field(ge=0)] = 0
-    """Which camera, where DCAM finds several."""
-    link: Literal["usb3", "coaxpress"] = "usb3"
-    """USB3 carries 17.7 full frames a second, CoaXPress 120."""
-    cool_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Wait at most so long for the sensor to be cold before a scan; 0: do not wait."""
-    usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
-    """USB product id, for the doctor; null: any of the vendor's (which makes other things too)."""
-    usb_serial: str | None = None
-    """USB serial number, for the doctor, where there are several cameras."""
+    library: str | None = Field(default=None, description="Path of the DCAM-API library; null: the installed one.")
+    index: Annotated[int, Field(ge=0)] = Field(default=0, description="Which camera, where DCAM finds several.")
+    link: Literal["usb3", "coaxpress"] = Field(
+        default="usb3", description="USB3 carries 17.7 full frames a second, CoaXPress 120."
+    )
+    cool_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=0.0, description="Wait at most so long for the sensor to be cold before a scan; 0: do not wait."
+    )
+    usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = Field(
+        default=None,
+        description="USB product id, for the doctor; null: any of the vendor's (which makes other things too).",
+    )
+    usb_serial: str | None = Field(
+        default=None, description="USB serial number, for the doctor, where there are several cameras."
+    )
 
     @property
     def options(self) -> DcamOptions:
@@ -94,8 +103,9 @@ class PluggedCamera(Section):
     """A camera of another package, with the keys that its settings declare."""
 
     kind: str
-    roi: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = None
-    """row0, col0, rows, cols on the sensor; null: all of it."""
+    roi: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = Field(
+        default=None, description="row0, col0, rows, cols on the sensor; null: all of it."
+    )
     binning: PositiveInt = 1
     readout: str = "standard"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from beamline.config.beam import Kev, NoMonochromator
 from beamline.config.devices import DeviceSection
@@ -15,7 +15,7 @@ from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
 from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT, names_of_one_volume
+from recon.methods import DEFAULT, names_of_one_volume, streams
 
 if TYPE_CHECKING:
     MethodName = str
@@ -24,11 +24,13 @@ else:
 
 
 class SampleSection(Section):
-    name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)]
-    """letters, digits and _ . + - (it ends the run folder's name)"""
+    name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)] = Field(
+        description="letters, digits and _ . + - (it ends the run folder's name)"
+    )
     description: str = ""
-    diameter_mm: Annotated[float, Field(gt=0, le=1e3)] | None = None
-    """Of the circle about the rotation axis that holds all of the sample; null: not known."""
+    diameter_mm: Annotated[float, Field(gt=0, le=1e3)] | None = Field(
+        default=None, description="Of the circle about the rotation axis that holds all of the sample; null: not known."
+    )
 
 
 Views = Annotated[int, Field(gt=0, le=1_000_000)]
@@ -83,8 +85,7 @@ class FileAngles(Section):
     """Degrees from a text file, one a line, in the order of acquisition; # starts a comment."""
 
     scheme: Literal["file"]
-    path: str
-    """Relative to the configuration file."""
+    path: str = Field(description="Relative to the configuration file.")
 
 
 AnglesSection = Annotated[
@@ -109,70 +110,139 @@ class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: AnglesSection
     exposure_s: Seconds
-    period_s: Seconds
-    """Time between views: sets the speed of a fly scan, the least time per frame of a step scan."""
-    frames_per_view: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has them all."""
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
-    """Wait after each move of a step scan."""
-    warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
-    """Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm."""
-    filter: str | None = None
-    """Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."""
-    energy: Kev | None = None
-    """keV to which devices.monochromator goes before the first frame; null: as it stands."""
-    energies: Annotated[tuple[Kev, ...], Field(min_length=2, max_length=1000)] | None = None
-    """keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle."""
-    return_views: Annotated[int, Field(ge=0, le=100)] = 0
-    """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
-    wide_views: Annotated[int, Field(ge=0, le=100)] = 0
-    """Angles at which a sample wider than the field is stepped across the beam after the views, until all was shown."""
-    without_watchdog: Literal["warn", "pause"] = "warn"
-    """The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."""
+    period_s: Seconds = Field(
+        description="Time between views: sets the speed of a fly scan, the least time per frame of a step scan."
+    )
+    frames_per_view: Annotated[int, Field(ge=1, le=1000)] = Field(
+        default=1,
+        description="Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has "
+        "them all.",
+    )
+    settle_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=0.1, description="Wait after each move of a step scan."
+    )
+    warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=0.0,
+        description="Light on the scintillator before frames with light, each time the shutter opens; it glows "
+        "brighter when warm.",
+    )
+    filter: str | None = Field(
+        default=None,
+        description="Name of one of the places of devices.filter, where it is before the first frame; null: as it "
+        "stands.",
+    )
+    energy: Kev | None = Field(
+        default=None, description="keV to which devices.monochromator goes before the first frame; null: as it stands."
+    )
+    energies: Annotated[tuple[Kev, ...], Field(min_length=2, max_length=1000)] | None = Field(
+        default=None,
+        description="keV of a series: a scan at each, one after the other; each begins a fraction of a step later "
+        "in angle.",
+    )
+    return_views: Annotated[int, Field(ge=0, le=100)] = Field(
+        default=0,
+        description="Views that are taken a second time on the way back, evenly spread: they tell whether the "
+        "sample has moved.",
+    )
+    wide_views: Annotated[int, Field(ge=0, le=100)] = Field(
+        default=0,
+        description="Angles at which a sample wider than the field is stepped across the beam after the views, "
+        "until all was shown.",
+    )
+    without_watchdog: Literal["warn", "pause"] = Field(
+        default="warn",
+        description="The behaviour of a scan without a watchdog, or with one that ended and could not be replaced.",
+    )
     darks: Fields = Fields()
     flats: Fields = Fields()
 
 
 class OpticsSection(Section):
-    pixel_size_um: Annotated[float, Field(gt=0, le=1e6)]
-    """Size of an unbinned pixel at the sample."""
+    pixel_size_um: Annotated[float, Field(gt=0, le=1e6)] = Field(description="Size of an unbinned pixel at the sample.")
     energy_kev: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    distance_mm: Annotated[float, Field(ge=0, le=1e7)] | None = None
-    """Sample to detector."""
-    axis_col: Column | None = None
-    """Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."""
-    light_path: LightPath | None = None
-    """From X-ray photons to photoelectrons, for `beamline tune`; null: not known."""
+    distance_mm: Annotated[float, Field(ge=0, le=1e7)] | None = Field(default=None, description="Sample to detector.")
+    axis_col: Column | None = Field(
+        default=None,
+        description="Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; "
+        "null: unknown.",
+    )
+    light_path: LightPath | None = Field(
+        default=None, description="From X-ray photons to photoelectrons, for `beamline tune`; null: not known."
+    )
 
 
 class StorageSection(Section):
     folder: Annotated[str, Field(min_length=1)] = RUNS
     preview_bin: Annotated[int, Field(gt=0, le=10_000)] = 4
-    flush_every: Annotated[int, Field(gt=0, le=1_000_000)] = 16
-    """Frames that are flushed together, at most, while others wait to be written; else each is flushed at once."""
+    flush_every: Annotated[int, Field(gt=0, le=1_000_000)] = Field(
+        default=16,
+        description="Frames that are flushed together, at most, while others wait to be written; else each is "
+        "flushed at once.",
+    )
+
+
+class StopWhen(Section):
+    """Limits at which the views suffice, as predicted from the live volume; if both are given, both must be met."""
+
+    psnr_gain_per_10_views: PositiveFloat | None = Field(
+        default=None, description="dB that ten more views may still add; null: any."
+    )
+    psnr_loss: PositiveFloat | None = Field(
+        default=None, description="dB that the volume may stay below that of the whole scan; null: any."
+    )
+
+    @model_validator(mode="after")
+    def _some_limit(self) -> Self:
+        if self.psnr_gain_per_10_views is self.psnr_loss is None:
+            raise ValueError("stop_when needs psnr_gain_per_10_views or psnr_loss, in dB; null never stops early")
+        return self
 
 
 class ReconSection(Section):
-    live: bool = True
-    """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
-    method: MethodName = DEFAULT
-    """r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."""
-    seconds: Seconds = 1800.0
-    """Most time after the last view: the volume is made as of a finished scan, and takes longer on a busy machine."""
+    live: bool = Field(
+        default=True,
+        description="A volume while the scan runs; by a method that needs the whole scan, when it is complete.",
+    )
+    method: MethodName = Field(
+        default=DEFAULT,
+        description="r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`.",
+    )
+    seconds: Seconds = Field(
+        default=1800.0,
+        description="Most time after the last view: the volume is made as of a finished scan, and takes longer on "
+        "a busy machine.",
+    )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
+    stop_when: StopWhen | None = Field(
+        default=None, description="End the scan when its views are enough; needs live: true. null: take all views."
+    )
+
+    @model_validator(mode="after")
+    def _somebody_looks(self) -> Self:
+        if self.stop_when is not None and not self.live:
+            raise ValueError(
+                "stop_when needs live: true, because the live reconstruction decides when the views suffice"
+            )
+        if self.stop_when is not None and not streams(self.method):
+            raise ValueError(
+                f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
+            )
+        return self
 
 
 class Speed(Section):
-    speed: Annotated[float, Field(gt=0, le=1e6)]
-    """Simulated seconds per real second."""
+    speed: Annotated[float, Field(gt=0, le=1e6)] = Field(description="Simulated seconds per real second.")
 
 
 class SimulationSection(Section):
     """Only with simulated devices."""
 
-    scene: str | dict[str, Any] = "scenes/battery.yaml"
-    """A scene file (relative to the configuration file or to the installed configs), or the scene itself."""
+    scene: str | dict[str, Any] = Field(
+        default="scenes/battery.yaml",
+        description="A scene file (relative to the configuration file or to the installed configs), or the scene "
+        "itself.",
+    )
     clock: Literal["real", "virtual"] | Speed = "real"
     seed: int = Field(0, ge=0, lt=2**63)
 
@@ -248,6 +318,8 @@ class Config(Section):
         texts = [f"{energy:.7g}" for energy in energies]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+        if several and self.recon.stop_when is not None:
+            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(

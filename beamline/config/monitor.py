@@ -29,13 +29,17 @@ def _names(retake: bool | tuple[str, ...]) -> bool | tuple[str, ...]:
 class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
-    act_after: Annotated[int, Field(ge=1)] = 10
-    """Frames in a row with an alarm before the check's policy pauses or stops the scan."""
-    retake: Annotated[bool | tuple[str, ...], AfterValidator(_names)] = False
-    """Views with an alarm or without a frame are taken again, once, after the last view. Names of checks: those with a
-    warning of these checks, too."""
-    retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Share of the views that are taken again at most."""
+    act_after: Annotated[int, Field(ge=1)] = Field(
+        default=10, description="Frames in a row with an alarm before the check's policy pauses or stops the scan."
+    )
+    retake: Annotated[bool | tuple[str, ...], AfterValidator(_names)] = Field(
+        default=False,
+        description="Views with an alarm or without a frame are taken again, once, after the last view. Names of "
+        "checks: those with a warning of these checks, too.",
+    )
+    retake_share: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.25, description="Share of the views that are taken again at most."
+    )
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
@@ -82,8 +86,10 @@ def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
 class ReferencesBase(Section):
     """The keys that are not limits."""
 
-    on_fault: Literal["stop", "log"] = "stop"
-    """Darks or flats with a fault stop the scan before its first projection, or the fault is logged."""
+    on_fault: Literal["stop", "log"] = Field(
+        default="stop",
+        description="Darks or flats with a fault stop the scan before its first projection, or the fault is logged.",
+    )
 
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ class Section(BaseModel):
     What a validator of a group says begins with the key that is to be looked at, whose line the message then has.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -102,9 +102,5 @@ def _declared(field: FlatField) -> tuple[Any, Any]:
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:
-    """A section with further keys, (type, default) each, as pydantic.create_model takes a field.
-
-    Their docstrings are not looked for: pydantic would search every loaded module, which takes most of the import.
-    """
-    unread = {"use_attribute_docstrings": False}
-    return create_model(name, __base__=base, __doc__=doc, __cls_kwargs__=unread, **keys)
+    """A section with further keys, (type, default) each, as pydantic.create_model takes a field."""
+    return create_model(name, __base__=base, __doc__=doc, **keys)

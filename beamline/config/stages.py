@@ -84,8 +84,10 @@ class StageSection(Section):
     """Keys that all stages share. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
 
     kind: str
-    port: Annotated[str, Field(min_length=1)]
-    """Where its controller is; sim:// and the kind is its simulated counterpart, which takes all else from here."""
+    port: Annotated[str, Field(min_length=1)] = Field(
+        description="Where its controller is; sim:// and the kind is its simulated counterpart, which takes all "
+        "else from here."
+    )
 
     @model_validator(mode="after")
     def _sensible(self) -> Self:

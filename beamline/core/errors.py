@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import sys
 import tempfile
 import traceback
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.installed import version
-from beamline.core.text import size
 from drivers.base.errors import DeviceError
 
 
@@ -98,36 +96,9 @@ def exit_code(error: BaseException) -> int:
     return BeamlineError.exit_code
 
 
-def memory_limit_sentence() -> str:
-    """A sentence, after a space, on the limit of this process's address space; "" without one."""
-    from beamline.core.machine import memory_limit  # here, because most messages need none of it
-
-    limit = memory_limit()
-    return "" if limit is None else f" This process may use {size(limit)} of address space (ulimit -v)."
-
-
-_NO_MEMORY = re.compile(
-    "failed to map segment(?!.*not permitted)|can't start new thread|bad_alloc|Resource temporarily unavailable|"
-    "memory allocation (of|failed)|"
-    "out of memory|not enough memory|(can't|cannot|could not|failed to|unable to) allocate(?!.*static TLS)",
-    re.IGNORECASE,
-)
-"""Sentences of the loader of libraries, Python's threads, C++ and its threads, Rust, HDF5, torch (also CUDA), LLVM and
-numpy."""
-
-
-def out_of_memory(error: BaseException | None) -> bool:
-    """Whether memory or address space ran out; each library reports that in its own words.
-
-    An error that was raised on the way from such a one counts, too, unless it says itself what happened.
-    """
-    if error is None or isinstance(error, BeamlineError | DeviceError):
-        return False
-    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
-        return True
-    if isinstance(error, OSError | RuntimeError | ImportError | SystemError) and _NO_MEMORY.search(str(error)):
-        return True
-    return out_of_memory(error.__cause__ or error.__context__)
+def out_of_memory(error: BaseException) -> bool:
+    """Whether memory or address space ran out."""
+    return isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
 
 
 def damaged(error: BaseException) -> bool:
@@ -146,21 +117,14 @@ def user_message(error: BaseException) -> str:
     if out_of_memory(error):
         what = " ".join(str(error).split()) or "no details"
         return (
-            f"Out of memory ({what}).{memory_limit_sentence()} No half result was kept, and what was there is "
-            "untouched. Take fewer --rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
+            f"Out of memory ({what}). No half result was kept, and what was there is untouched. Take fewer --rows or "
+            "--views, a coarser --bin, or a smaller --memory, which works in slabs."
         )
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
-        limit = (
-            f"{memory_limit} If that is too little, the file may be good."
-            if (memory_limit := memory_limit_sentence())
-            else ""
-        )
-        return (
-            f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original.{limit}"
-        )
+        return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
     if is_defect(error):

@@ -238,6 +238,16 @@ class SlicesDrawn(Event, event="slices"):
     degrees: float
 
 
+class EnoughReached(Event, event="enough"):
+    """The views so far suffice: further views would add `mean` dB, between `low` and `high`."""
+
+    n_views: int
+    planned: int
+    mean: float
+    low: float
+    high: float
+
+
 class Counted(Event, event="progress"):
     """n of so many frames, slices, views or axes are done; `stage` names the work."""
 

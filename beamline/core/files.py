@@ -9,7 +9,6 @@ import os
 import platform
 import shutil
 import stat
-import sys
 import time
 import uuid
 import zlib
@@ -19,7 +18,7 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TextIO
 
-from beamline.core.errors import DataError, out_of_memory
+from beamline.core.errors import DataError
 
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
@@ -70,7 +69,6 @@ def _numbered(run: Path) -> dict[int, Path]:
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems and file systems without this call
 TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
-STEP_BY_STEP = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")  # not on Windows
 _JUNCTION = 0xA0000003  # st_reparse_tag of a mount point of Windows
 SETTINGS = 2**20  # Most bytes of a text file of settings: YAML of 1 MB takes seconds to read
 
@@ -130,16 +128,6 @@ def is_link(path: Path) -> bool:
     return stat.S_ISLNK(status.st_mode) or getattr(status, "st_reparse_tag", 0) == _JUNCTION
 
 
-def same_file(first: os.stat_result, second: os.stat_result) -> bool:
-    """Whether two stat results are of the same file or folder.
-
-    Some network file systems give a file a new inode number at each look. Then device, owner, mode, size and the times
-    at which content and inode changed are compared; no program can set the second of these.
-    """
-    fields = "st_dev", "st_uid", "st_mode", "st_size", "st_mtime_ns", "st_ctime_ns"
-    return os.path.samestat(first, second) or all(getattr(first, name) == getattr(second, name) for name in fields)
-
-
 def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     """The path of a regular file at a relative path below a folder, for a library that opens it by its name.
 
@@ -165,29 +153,9 @@ def is_below(folder: Path, name: str) -> bool:
 
 
 def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
-    """Open for reading the file that `require_below` finds. Where the system can, nobody can put a link or a pipe in
-    its place meanwhile: each folder on the way is opened relative to the one before.
-
-    A caller reads at most `largest` bytes, as the file may grow.
-    """
-    place = require_below(folder, name, largest)
-    if sys.platform == "win32" or not STEP_BY_STEP:
-        return place.open("rb")
-    *within, last = PurePosixPath(name).parts
-    at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        for part in within:
-            deeper = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=at)
-            os.close(at)
-            at = deeper
-        handle = os.open(last, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=at)
-    finally:
-        os.close(at)
-    file = os.fdopen(handle, "rb")
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        file.close()
-        raise OSError(errno.EINVAL, "A regular file is expected", str(place))
-    return file
+    """Open for reading the file that `require_below` finds. A caller reads at most `largest` bytes, as the file may
+    grow."""
+    return require_below(folder, name, largest).open("rb")
 
 
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
@@ -235,21 +203,11 @@ def no_file(path: Path) -> str:
     return broken_link(path) or f"{path} {kind if path.exists() else 'does not exist'}."
 
 
-_BESIDE = 44  # bytes that names of temporary files, and of what is written beside an output, add to its name
-
-
 def refuse_existing(path: Path) -> None:
     """Raise DataError unless a new file or folder can be created at `path`.
 
     Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
     """
-    longest = os.pathconf(path.parent, "PC_NAME_MAX") if hasattr(os, "pathconf") and path.parent.is_dir() else 255
-    if len(os.fsencode(path.name)) > (most := longest - _BESIDE):
-        raise DataError(
-            f"{path}: the name is too long: it has {len(os.fsencode(path.name))} bytes, and {most} are possible, as "
-            "names of temporary files, and of what is written beside it, are longer. Name another output. Nothing was "
-            "written."
-        )
     if link := broken_link(path):
         raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
     if path.exists():
@@ -279,8 +237,6 @@ def named_on_failure(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if out_of_memory(error):
-            raise
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
 
 
@@ -340,8 +296,6 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
     except OSError as error:
-        if out_of_memory(error):
-            raise
         left = "what was there is untouched" if replace else "nothing is left of it"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:
@@ -350,12 +304,8 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def _here() -> str:
-    """The scope of process numbers: this machine, and in it this container."""
-    try:
-        namespace = Path("/proc/self/ns/pid").readlink()
-    except OSError:  # not Linux
-        namespace = Path()
-    return f"{zlib.crc32(f'{platform.node()} {namespace}'.encode()):08x}"
+    """The scope of process numbers: this machine."""
+    return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
 def _remove_left(path: Path) -> None:

@@ -1,5 +1,4 @@
-"""What is installed: the version, the configurations and scenes of the package, and other distributions that bring a
-package of our name."""
+"""What is installed: the version, the configurations and scenes of the package, and modules by the names of ours."""
 
 from __future__ import annotations
 
@@ -66,20 +65,4 @@ def _way_out(name: str, origin: str) -> str:
     """What to do about a module that is not ours."""
     if not any(f"{os.sep}{folder}{os.sep}" in origin for folder in ("site-packages", "dist-packages")):
         return "rename that one, or work in another folder"
-    owner = next((owner for owner, names in clashing_distributions().items() if name in names), "another distribution")
-    return f"it belongs to {owner}. Install splatline in an environment of its own (python -m venv)"
-
-
-def clashing_distributions() -> dict[str, tuple[str, ...]]:
-    """Other distributions in this environment with a package or module of the same name as one of this project, with
-    these names.
-    """
-    from importlib.metadata import distributions
-
-    owners = {}
-    for package in distributions():
-        files = "\n" + (package.read_text("RECORD") or "")
-        names = tuple(name for name in OWN_PACKAGES if f"\n{name}/__init__.py," in files or f"\n{name}.py," in files)
-        if names and (owner := str(package.metadata["Name"])) != "splatline":
-            owners[owner] = names
-    return owners
+    return "it belongs to another distribution. Install splatline in an environment of its own (python -m venv)"

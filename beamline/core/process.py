@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from enum import Enum, auto
 from pathlib import Path
 from typing import Any, Self, TextIO
@@ -18,10 +18,9 @@ from typing import Any, Self, TextIO
 import psutil
 
 from beamline.core.errors import INTERRUPTED
-from beamline.core.stop import StopScope, signals_held
+from beamline.core.stop import StopScope
 
 _POLL = 0.2  # real s between two questions whether the process should stop
-FROZEN_AFTER = 4.0  # real s without output or processor time, after which a process that was asked to end is killed
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
 ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
@@ -70,32 +69,27 @@ class ChildProcess:
     ) -> None:
         self._on_line, self._on_end = on_line, on_end
         self._silent_since = time.monotonic()
-        with ExitStack() as interrupted:
-            with signals_held():  # they would leave a process that nobody knows
-                self._process = subprocess.Popen(
-                    list(command),
-                    stdin=subprocess.PIPE if tether else subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=stderr,
-                    text=True,
-                    encoding="utf-8",
-                    errors="replace",
-                    env={**(os.environ if environment is None else environment), **SAFE_PATH},
-                    start_new_session=True,  # POSIX
-                    # Windows; without a window of its own a child ends with the console that is closed.
-                    creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-                    | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
-                )
-                interrupted.callback(self.let_go)
-                interrupted.callback(self._end, 0.0, lambda: False)
-                if behind:
-                    with suppress(psutil.Error):  # it has ended, or the system does not allow it
-                        child = psutil.Process(self._process.pid)
-                        child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
-                name = f"output of process {self._process.pid}"
-                self._reader = threading.Thread(target=self._read, name=name, daemon=True)
-                self._reader.start()
-            interrupted.pop_all()
+        self._process = subprocess.Popen(
+            list(command),
+            stdin=subprocess.PIPE if tether else subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            env={**(os.environ if environment is None else environment), **SAFE_PATH},
+            start_new_session=True,  # POSIX
+            # Windows; without a window of its own a child ends with the console that is closed.
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+            | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
+        )
+        if behind:
+            with suppress(psutil.Error):  # it has ended, or the system does not allow it
+                child = psutil.Process(self._process.pid)
+                child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
+        name = f"output of process {self._process.pid}"
+        self._reader = threading.Thread(target=self._read, name=name, daemon=True)
+        self._reader.start()
 
     def __enter__(self) -> Self:
         return self
@@ -128,7 +122,7 @@ class ChildProcess:
             hurry: polled in the same way while the process ends; True kills it at once.
             seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
-            grace: real s between the request to end and the kill; 0 kills at once. One that is frozen has FROZEN_AFTER.
+            grace: real s between the request to end and the kill; 0 kills at once.
         """
         self._silent_since = time.monotonic()
         ending, deadline = ProcessEnd.EXITED, self._silent_since + seconds
@@ -166,25 +160,13 @@ class ChildProcess:
     def _end(self, grace: float, hurry: Callable[[], bool]) -> None:
         if grace > 0:
             self._process.terminate()
-            work, since = self._work(), time.monotonic()
-            deadline = since + grace
-            while (left := min(deadline, since + FROZEN_AFTER) - time.monotonic()) > 0 and not hurry():
+            deadline = time.monotonic() + grace
+            while (left := deadline - time.monotonic()) > 0 and not hurry():
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(min(_POLL, left))
                     return
-                if (now := self._work()) != work:
-                    work, since = now, time.monotonic()
         self._process.kill()
         self._process.wait()
-
-    def _work(self) -> tuple[float, float]:
-        """What grows while it works: the time of its last line, or now while it waits for a disk, and its processor
-        time in s. Neither grows in a process that is stopped (SIGSTOP), or waits for itself."""
-        with suppress(psutil.Error):
-            process = psutil.Process(self._process.pid)
-            busy, waits = process.cpu_times(), process.status() == psutil.STATUS_DISK_SLEEP
-            return time.monotonic() if waits else self._silent_since, busy.user + busy.system
-        return self._silent_since, 0.0
 
     def let_go(self) -> None:
         """Close the stdin of a tethered process, as happens when this process ends."""

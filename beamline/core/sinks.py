@@ -14,6 +14,7 @@ from beamline.core.events import (
     BlockDone,
     BlockStarted,
     Done,
+    EnoughReached,
     Event,
     Failed,
     FrameFlagged,
@@ -63,6 +64,9 @@ def sentence(event: Event) -> str | None:
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
             return f"Volume from {n_views} views so far: {path}"
+        case EnoughReached(n, planned, mean, low, high):
+            spread = f"{mean:.2f} dB ({low:.2f} to {high:.2f})"
+            return f"Enough views: {n} of {planned}; the others would add {spread}"
         case ScanDone(scan):
             alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
             again = f", {scan.retaken} views taken again" if scan.retaken else ""

@@ -87,21 +87,6 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 
 @contextmanager
-def signals_held() -> Iterator[None]:
-    """A context in which Ctrl-C, SIGTERM and SIGHUP wait, if this is the main thread and has handlers for them: they
-    are delivered at its end, so that what it begins is whole, and its owner can end it.
-    """
-    numbers = [number for number in (signal.SIGINT, *_asking_to_end()) if callable(signal.getsignal(number))]
-    with ExitStack() as later:  # one whose handler raises does not keep the others from theirs
-
-        def hold(number: int, frame: FrameType | None) -> None:
-            later.callback(signal.raise_signal, number)
-
-        with _caught(dict.fromkeys(numbers, hold)):
-            yield
-
-
-@contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
     """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones."""
     with ExitStack() as restore:
@@ -220,7 +205,7 @@ class StopRequest:
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self.stopping = self.aborting = self.by_person = False
+        self.stopping = self.aborting = self.by_person = self._enough = False
         self.reason, self._now, self._requested_at = "", now, 0.0
 
     def refuse_abort(self) -> None:
@@ -239,12 +224,22 @@ class StopRequest:
         self._requested_at = self._requested_at or self._now()
         self.stopping = True
 
+    def stop_as_enough(self, reason: str) -> None:
+        """Stop as by `stop`, but without hurry, because the views suffice."""
+        self._enough = not self.stopping
+        self.stop(reason, by_itself=True)
+
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
         self.reason, self.by_person = reason, True
         self._requested_at = self._requested_at or self._now()
         self.aborting = True
         self.stopping = True
+
+    @property
+    def enough(self) -> bool:
+        """Whether only `stop_as_enough` asked for the stop."""
+        return self._enough and not self.aborting
 
     @property
     def seconds(self) -> float:

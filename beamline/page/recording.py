@@ -15,7 +15,6 @@ from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean, lit
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
-from beamline.storage.structure import require_inside
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
@@ -33,22 +32,17 @@ class ScanProgress:
 class Recording:
     """A scan file of this program, opened for reading while it may still be written.
 
-    Args:
-        alone: it may be no link and draw on no file outside of its folder, since another user may have written it.
-
     Raises:
         NotReadyError: the file is just being made.
         DataError: no scan of ours.
     """
 
-    def __init__(self, path: Path, alone: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        if not alone and path.is_file() and path.stat().st_size and not hdf5.is_hdf5(path):
+        if path.is_file() and path.stat().st_size and not hdf5.is_hdf5(path):
             raise _foreign(path)
         self._file = hdf5.open_hdf5(path, follow=True)
         with hdf5.closed_on_error(self), hdf5.readable(path):
-            if alone:
-                require_inside(self._file)
             if layout.COMMITTED not in self._file:
                 raise _foreign(path)
             self._data: h5py.Dataset = self._file[layout.DATA]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import threading
 import time
@@ -15,15 +14,13 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, event_in
-from beamline.core.files import EVENTS, JOINED, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
+from beamline.core.files import EVENTS, JOINED, RECON, SCAN, is_below, open_below, parts_of, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
-from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import joined_file_of
 from beamline.storage.run_record import DIED, read_record
-from beamline.storage.structure import require_inside
 from beamline.storage.writer_lock import abandoned
 
 _AT_ONCE = 2**24  # bytes of a log that are read in one call
@@ -170,13 +167,7 @@ class Reader:
 
     def _open(self) -> Recording:
         if self._recording is None:
-            what = self.what
-            if what.folder is not None and os.path.lexists(what.scan):
-                try:
-                    require_below(what.scan.parent, what.scan.name)
-                except OSError as error:
-                    raise DataError(f"{what.scan}: {error.strerror}. Name the scan file itself to watch it.") from error
-            self._recording = Recording(what.scan, alone=what.folder is not None)
+            self._recording = Recording(self.what.scan)
         return self._recording
 
     def _newest_volume(self) -> ShownVolume:
@@ -187,9 +178,7 @@ class Reader:
             before, self._volume = self._volume, None
             if before is not None:
                 before.close()
-            with hdf5.open_hdf5(file.path) as opened:
-                require_inside(opened)
-                self._volume, self._volume_file = ShownVolume(file.path), file
+            self._volume, self._volume_file = ShownVolume(file.path), file
             self._thread.submit(self._read_more)
         return self._volume
 

@@ -20,17 +20,16 @@ from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.base.views import spread, spread_views
-from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, closest_pair, find_axis
+from recon.prep.align import AxisError, AxisEstimate, find_axis
 from recon.prep.axis_ends import ENDS
 from recon.prep.axis_wedge import AGREE
 from recon.prep.correct import Projections
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
-_PAIR_AGREES = 0.75  # columns from one pair of opposite views to an axis that is given
-_PAIR_MISSES = 2.0  # columns by which such a pair may miss half a turn, at the edge of the field
+_COMPARED = 90  # views that are enough for an axis that is given
+_CONFIRMED = 0.5  # columns, of binned views, up to which those held out confirm an axis
 _CANDIDATES = 14  # of the axis of a cone, usually
-_SIDE_BY_SIDE = 3  # columns that a message names where the axis is uncertain
 
 
 def rotation_axis(
@@ -59,34 +58,22 @@ def rotation_axis(
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
     if selection.axis_col is not None and not posed and cone_of(source, selection) is None:
-        _compare_with_pair(source, axis_col, correction.quiet(), usable.frames, warn)
+        _compare_with_views(source, axis_col, correction, usable.frames, warn)
     return axis_col, axis
 
 
-def _compare_with_pair(
+def _compare_with_views(
     source: ScanSource, given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
 ) -> None:
-    """Warn where two views half a turn apart are mirror images about another column than the one that was given."""
-    cols = source.shape[1]
-    pair = closest_pair(source.angles[frames], tolerance=2 * _PAIR_MISSES / cols)
-    if pair is None or not cols / 8 < given < 7 * cols / 8:  # nearer to the edge too little is seen twice
-        return
-    height = (correction.rows.stop - correction.rows.start) // correction.binning
-    start = max(0, (height - _AXIS_ROWS) // 2)
-    with suppress(DataError, ValueError):  # these two do not show the axis
-        views = correction.at_once(np.sort(frames[list(pair)]), slice(start, min(height, start + _AXIS_ROWS)))
-        if views.view_ids.size < 2:
-            return
-        estimate = axis_from_pair(*views.data)
-        seen = unbinned(estimate.value, correction.binning)
-        turned = np.ptp(source.angles[views.view_ids]) % (2 * np.pi)
-        uncertain = abs(turned - np.pi) * cols / 4  # columns, of matter half-way to the edge
-        if estimate.confident and abs(seen - given) > _PAIR_AGREES * correction.binning + uncertain:
+    """Warn where some of the views clearly show another column than the one that was given."""
+    with suppress(DataError):
+        some = spread(frames, _COMPARED)
+        shown, estimate = locate_axis(source, correction.quiet(), some, lambda _: None, all_there=False)
+        if estimate.confident and abs(shown - given) > AGREE * correction.binning:
             warn(
-                f"Frames {views.view_ids[0]} and {views.view_ids[1]}, about half a turn apart, are mirror images about "
-                f"column {seen:.2f}; the rotation axis given is column {given:g}. Columns are counted from 0 at the "
-                "centre of the first. Unless the sample moved, leave --axis out, or compare axes by "
-                "`beamline sweep FILE axis=A:B:STEP`."
+                f"The views show the rotation axis in column {shown:.2f}; column {given:g} was given. Columns are "
+                "counted from 0 at the centre of the first. Unless the sample moved, leave --axis out, or compare axes "
+                "by `beamline sweep FILE axis=A:B:STEP`."
             )
 
 
@@ -112,26 +99,24 @@ def _axis_by_views(
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
-        estimate = axis_by_views(
-            views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), near=stated is not None
-        )  # fmt: skip
+        estimate = axis_by_views(views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)))
     except ValueError as error:
-        if stated is not None:
-            if isinstance(error, AxisError):
-                warn(f"The file's rotation axis, column {stated:.2f}, was not confirmed: {error}.")
-            return stated, None
-        raise _not_found(source, error) from error
+        if stated is None:
+            raise _not_found(source, error) from error
+        if isinstance(error, AxisError):
+            warn(f"The file's rotation axis, column {stated:.2f}, was not confirmed: {error}.")
+        return stated, None
     axis_col = unbinned(estimate.value, binning)
     if stated is None:
         if not estimate.confident:
-            warn(_unclear(estimate, binning))
+            warn(_unclear(axis_col))
         return axis_col, estimate
     if not estimate.confident:
         warn(
             f"The file's rotation axis, column {stated:.2f}, was not confirmed: views held out show no axis clearly. "
             "Check the slices for doubled edges, or give --axis COLUMN."
         )
-    if not estimate.confident or estimate.value == geometry.axis_col:
+    if not estimate.confident or abs(axis_col - stated) <= _CONFIRMED * binning:
         return stated, None
     warn(
         f"Views held out agree better with a rotation axis in column {axis_col:.2f} than with the file's {stated:.2f}: "
@@ -195,7 +180,7 @@ def locate_axis(
     if estimate.confident:
         return axis_col, estimate
     if source.axis_col is None:
-        warn(_unclear(estimate, correction.binning))
+        warn(_unclear(axis_col))
         return axis_col, estimate
     warn(
         f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
@@ -243,15 +228,8 @@ def _not_found(source: ScanSource, error: Exception) -> DataError:
     )
 
 
-def _unclear(estimate: AxisEstimate, binning: int) -> str:
-    curve, columns = estimate.curve, [estimate.value]
-    lows = 1 + np.flatnonzero((curve[1:-1] <= curve[:-2]) & (curve[1:-1] < curve[2:]))
-    for low in lows[np.argsort(curve[lows])]:  # the best first; one of those that are nearly the same
-        if len(columns) < _SIDE_BY_SIDE and min(abs(estimate.candidates[low] - each) for each in columns) > AGREE:
-            columns.append(float(estimate.candidates[low]))
-    first, *others = (f"{unbinned(column, binning):.2f}" for column in columns)
-    after = f"; after it {' and '.join(others)} {'agree' if others[1:] else 'agrees'} best" if others else ""
+def _unclear(axis_col: float) -> str:
     return (
-        f"The rotation axis found, column {first}, is not a clear optimum{after}. Check the slices for doubled edges "
+        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum. Check the slices for doubled edges "
         "(`beamline sweep FILE axis=A:B:STEP` compares columns), or give --axis COLUMN."
     )

@@ -15,7 +15,7 @@ from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection, unbinned
+from beamline.projections.selection import Selection
 from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
@@ -45,10 +45,7 @@ _BESIDE = np.radians(4.1)  # a slab 20 times as long as thick, wider than the fi
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
-_AXES_AGREE = 0.75  # columns, as for a pair of opposite views
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
-_TURNED, _TURNED_SIGMAS = np.radians(4.0), 9.0  # of errors of angles along a scan; 240 scans at rest have up to 8.8
-_TURNED_LEFT = 0.95  # of the variance of moments: at angles that are wrong, others explain it; a tooth leaves 0.96
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
@@ -61,7 +58,6 @@ _INVERTED = (
 # Least changes in a scan that are told: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
-_EVEN, _STEP, _IN_TURN = 0.5, 0.8, -0.5  # shares that a line and a step explain of a change of mass; from view to view
 
 
 @dataclass(frozen=True)
@@ -108,34 +104,27 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
             frames = prepared.projections.view_ids[some]
             laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         elif data.shape[1] >= _LEAST_ROWS and selection.rows is None:
-            laws = _laws_within_the_field(prepared, selection, some)
+            laws = _laws_within_the_field(prepared, some)
     if (wide or not air_is_off) and not any(law.broken for law in laws):
         laws.append(_at_rest(data, geometry, prepared.projections.view_ids, max(faint, 1.0)))
-    return _reported(laws, warn)
+    for law in laws:
+        if law.broken:
+            warn(law.sentence)
+    return {law.name: law.in_words() for law in laws if np.isfinite(law.residual)}
 
 
-def _laws_within_the_field(prepared: PreparedProjections, selection: Selection, some: NDArray[np.intp]) -> list[Law]:
+def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[Law]:
     """Laws of parallel views that show the whole sample, by some of the views."""
     geometry, data = prepared.geometry, prepared.projections.data
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
     shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
-    laws = [_upside_down(shown, frames), _masses(shown, angles, frames, of_mass)]
-    if not laws[1].broken:  # such views spoil the other moments
-        near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
-        laws += [_across(shown), _heights(shown)]
-        laws += [_angles(shown, geometry.angles)] if near else []
-        laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
-        laws += [_axis(shown, geometry.axis_col, selection)]
-    return laws
-
-
-def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
-    for law in laws:
-        if law.broken:
-            warn(law.sentence)
-    return {law.name: law.in_words() for law in laws if np.isfinite(law.residual)}
+    masses = _masses(shown, angles, frames, of_mass)
+    if masses.broken:  # such views spoil the other moments
+        return [masses]
+    near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
+    return [masses, _across(shown), _heights(shown), *([_angles(shown, geometry.angles)] if near else [])]
 
 
 def compare_with_flats(
@@ -237,16 +226,6 @@ def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
     return int(order[off.argmax() + 2]), float(off.max())
 
 
-def _upside_down(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:
-    of = frames[shown.flipped]
-    sentence = (
-        f"{count(of.size, 'view')} of {frames.size} looked at (frames {spans(of.tolist())}) hold the matter of the "
-        "first view's rows in the opposite order, the last row first: were they turned upside down? Turn them in a "
-        "copy of the scan, or leave them out with --views."
-    )
-    return Law("frames upside down", float(of.size), 0.0, "of the views looked at", sentence)
-
-
 def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: float) -> Law:
     """One mass in all views, but for what hardening makes of the longer side of a sample, twice a turn."""
     parts = np.column_stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
@@ -265,30 +244,13 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         )
         return Law("mass of the views", float(abs(most)), limit, "of the mass", sentence)
     sentence = (
-        f"The mass of the views changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%}, {because}: "
-        f"{_way_of(1 + shown.mass, frames)}. Did the energy "
+        f"The mass of the views changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%}, {because}: it is least "
+        f"in frame {frames[shown.mass.argmin()]} and greatest in frame {frames[shown.mass.argmax()]}. Did the energy "
         "or the sample change within the scan, or are views of another scan, exposure or reference among them? Choose "
-        "views that belong together with --views; --time where the sample changes."
+        "views that belong together with --views (every:2, where two lights take turns); --time where the sample "
+        "changes."
     )
     return Law("mass of the views", float(high - low), tolerance, "of the mass", sentence)
-
-
-def _way_of(mass: F64, frames: NDArray[np.int64]) -> str:
-    """How masses change from the first view to the last, in words."""
-    away = mass - mass.mean()
-    whole, n = float(away @ away), mass.size
-    if float(away[1:] @ away[:-1]) < _IN_TURN * whole:
-        by = np.abs(np.diff(mass)).mean()
-        return f"in turn, from view to view, by {by:.0%} (--frames 0::2 or 1::2 take every second view)"
-    sums, before = np.cumsum(away)[:-1], np.arange(1, n)
-    steps = sums**2 * n / (before * (n - before))
-    at = int(steps.argmax())
-    if steps[at] > _STEP * whole:
-        return f"by {mass[at + 1 :].mean() / mass[: at + 1].mean() - 1:+.0%} from frame {frames[at + 1]} on"
-    line = np.polyfit(np.arange(n), mass, 1)
-    if line[0] ** 2 * ((np.arange(n) - (n - 1) / 2) ** 2).sum() > _EVEN * whole:
-        return f"evenly, by {line[0] * (n - 1) / line[1]:+.0%} from the first view to the last"
-    return f"most in frame {frames[np.abs(away).argmax()]}"
 
 
 def _across(shown: ViewMoments) -> Law:
@@ -310,7 +272,7 @@ def _heights(shown: ViewMoments) -> Law:
         "each row of a sample at rest holds one mass in all views: slices are blurred across rows. Give --calibrate "
         "shifts where the sample or the stage moved, or --poses; --time where the sample changes."
     )
-    known = np.isfinite([*shown.down, shown.down_sigma]).all() and not shown.flipped.any()
+    known = np.isfinite([*shown.down, shown.down_sigma]).all()
     tolerance = max(_HALF_A_PIXEL, 2 * _NOISE * shown.down_sigma)
     return Law("mass of each row", float(high - low) if known else np.nan, tolerance, "rows", sentence)
 
@@ -325,20 +287,6 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> Law:
     )
     tolerance = max(_STRETCH, _SURE * shown.stretch_sigma)
     return Law("moments, scale of the angles", abs(shown.stretch), tolerance, "of the angles", sentence)
-
-
-def _turned(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:
-    least, most = int(shown.turned.argmin()), int(shown.turned.argmax())
-    size = float(np.degrees(np.ptp(shown.turned)))
-    sentence = (
-        f"Beside their angles the views seem to be turned by up to {size:.2g} degrees against one another (most in "
-        f"frame {frames[most]}, least in frame {frames[least]}; uncertain by {np.degrees(shown.turned_sigma):.1g}, by "
-        "the moments of their rows): views are missing and the others late, or the stage did not turn evenly. Give "
-        "the right angles with --angles FILE (degrees, one a line)."
-    )
-    tolerance = float(np.degrees(max(_TURNED, _TURNED_SIGMAS * shown.turned_sigma)))
-    known = np.isfinite(shown.turned_sigma) and shown.turned_left < _TURNED_LEFT  # else other angles explain nothing
-    return Law("moments, angle of each view", size if known else np.nan, tolerance, "degrees", sentence)
 
 
 def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> Law:
@@ -361,17 +309,6 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 "for a part of the scan."
             )
     return Law("views of the same rays", worst, 1.0, "of the least change that is told", sentence)
-
-
-def _axis(shown: ViewMoments, used: float, selection: Selection) -> Law:
-    seen = unbinned(shown.axis_col, selection.binning)
-    sentence = (
-        f"The centres of mass of the views go round column {seen:.2f}; the rotation axis given is column "
-        f"{selection.axis_col or 0.0:g}. Columns are counted from 0 at the centre of the first. Unless the sample "
-        "moved, leave --axis out, or compare axes by `beamline sweep FILE axis=A:B:STEP`."
-    )
-    off = abs(shown.axis_col - used) if selection.axis_col is not None else np.nan
-    return Law("axis of the centres of mass", off, max(_AXES_AGREE, _SURE * shown.axis_sigma), "columns", sentence)
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from beamline.storage.recon_record import Value
 
 
+@runtime_checkable
 class NamedStep(Protocol):
     """What a selection knows of a step; its abilities are the protocols in `beamline.projections.protocols`.
 

@@ -21,7 +21,7 @@ from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules import Finding, angle_order
+from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
@@ -117,7 +117,7 @@ class ViewGeometry:
         return geometry
 
 
-_OF_A_CIRCLE = angle_order.RULE, "axis"  # rules on what vectors of each view take the place of
+_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:

@@ -291,7 +291,7 @@ def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
     options = replace(job.options, method=job.method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now, decide=decided)
 
-    with nullcontext() if options.cluster is None else cluster().connected(options.cluster) as connected:
+    with nullcontext() if options.cluster is None else cluster(options.cluster) as connected:
         workers = None
         if connected is not None:
             workers = SlabWorkers(connected.workers, runner_of(options, connected.reconstruct))

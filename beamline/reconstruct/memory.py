@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
@@ -20,7 +20,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import Method, candidates_of, volumes_of
 from recon.base.method import for_part as method_for_part
-from recon.base.registry import in_folders
+from recon.base.registry import ADD_ONS, plugins
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
@@ -182,7 +182,7 @@ def memory_of(options: ReconOptions) -> int:
     if options.memory is not None:
         return options.memory
     free = free_memory()
-    return round(SHARE * (free if options.cluster is None else cluster().memory_of_each(options.cluster, free)))
+    return round(SHARE * free / (1 + local_workers(options.cluster)))
 
 
 def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
@@ -238,14 +238,22 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
     )
 
 
-def cluster() -> Any:
-    """The module of the cluster feature: `check_cluster`, `refuse_unusable`, `memory_of_each` and `connected` take its
-    spec.
+def cluster(spec: str) -> AbstractContextManager[Any]:
+    """Workers that reconstruct slabs, of the add-on splatline-cluster: a context with `workers` and `reconstruct`.
+
+    Args:
+        spec: `local:N` for N workers on this machine, or `tcp://HOST:PORT` of a scheduler.
 
     Raises:
-        ConfigError: this installation has none.
+        ConfigError: the add-on is not installed.
     """
-    modules = in_folders("beamline.features", "WORKERS")
-    if "cluster" not in modules:
-        raise ConfigError("--cluster: the cluster feature is not installed. Leave it out. Nothing was started.")
-    return import_module(modules["cluster"])
+    found = plugins("workers", ())
+    if "cluster" not in found:
+        raise ConfigError(f"--cluster: install {ADD_ONS['cluster']}. Nothing was read.")
+    connected: AbstractContextManager[Any] = found["cluster"](spec)
+    return connected
+
+
+def local_workers(spec: str | None) -> int:
+    """Number of workers to start on this machine; 0 where a scheduler has its own, or there is no cluster."""
+    return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0

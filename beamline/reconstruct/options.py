@@ -31,10 +31,11 @@ from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Method, PresetMethod, setting
-from recon.methods import has_setting
+from recon.methods import has_setting, names, streams
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
+from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
 
@@ -191,6 +192,7 @@ class ReconOptions:
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
         follow: settings for a scan that is still running; None for one that has ended.
+        enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: whose workers reconstruct slabs, as `--cluster` names them; None: this process does.
         region: the box of the volume to make; None: all of it.
@@ -213,6 +215,7 @@ class ReconOptions:
     truth: str | None = None
     unfinished: bool = False
     follow: FollowTiming | None = None
+    enough: Goal | None = None
     memory: int | None = None
     region: Region | AroundSample | None = None
     cluster: str | None = None
@@ -298,8 +301,16 @@ class ReconOptions:
 
     @property
     def streaming(self) -> FitMethod:
-        """The method for a scan that is followed while it runs, where it `streams`."""
-        assert isinstance(self.method, FitMethod)
+        """The method for a scan that is followed while it runs.
+
+        Raises:
+            ConfigError: it needs the whole scan.
+        """
+        if not isinstance(self.method, FitMethod):
+            raise ConfigError(
+                f"--enough-loss and --enough-gain need a method whose volume grows with the views "
+                f"({', '.join(filter(streams, names()))}); {self.method.name} begins when the scan has ended."
+            )
         return self.method
 
     @property

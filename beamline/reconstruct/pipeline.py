@@ -161,6 +161,7 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
         elif clock.now() - last_snapshot >= timing.snapshot:
             follower.write_snapshot()
             last_snapshot = clock.now()
+        follower.ask_whether_enough()
 
 
 @contextmanager

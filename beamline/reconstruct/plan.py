@@ -27,6 +27,7 @@ from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.memory import (
     ReconMemory,
     cluster,
+    local_workers,
     memory_of,
     recon_memory_of,
     refuse_few_views,
@@ -287,7 +288,10 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
-        cluster().refuse_unusable(options.cluster)
+        workers = cluster(options.cluster)
+        if not local_workers(options.cluster):
+            with workers:  # which a scheduler has, or ConfigError
+                pass
     truth = None if options.truth is None else read_truth(options.truth)
     if options.follow is None:
         for each in scans_of(options.source):
@@ -300,7 +304,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 def _refuse_unfollowed(options: ReconOptions) -> None:
     """Raises ConfigError for a method or views that a growing scan cannot have."""
-    if not options.streams:
+    if not options.streams and options.enough is None:
         return
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:

@@ -1,16 +1,12 @@
 """Control: states of a scan in their allowed order, and verbs to a running one from another terminal.
 
 docs/states.md draws the states and explains the verbs in each. A verb is an empty file of that name in the folder
-`control` of the run, which only its owner can write to. The scan removes the file and obeys. This works on every system
-and file system, without an open port or a parser. Owners and modes, if the system has them, are checked at every use,
-and a replaced folder is ignored.
+`control` of the run, which only its owner can enter. The scan removes the file and obeys. This works on every system
+and file system, without an open port or a parser.
 """
 
 from __future__ import annotations
 
-import os
-import stat
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,8 +16,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Sink, StateEntered, Warned
-from beamline.core.files import CONTROL, parts_of, same_file
+from beamline.core.events import Sink, StateEntered
+from beamline.core.files import CONTROL, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.storage.run_record import DIED, alive, read_record
 
@@ -95,71 +91,9 @@ class Verb(StrEnum):
     RESUME = "resume"
 
 
-class _Requests:
-    """The folder of requests, made here and held open, so that a replacement is noticed. OSError: it cannot be made."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(mode=0o700)
-        self._folder, self._held = folder, -1
-        if sys.platform != "win32":
-            self._held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            os.fchmod(self._held, 0o700)
-
-    def fault(self) -> str:
-        """Reason for which no request can be trusted, or can arrive; "" if all is well."""
-        if self._held < 0:
-            return ""
-        try:
-            ours = os.fstat(self._held)
-            same = same_file(os.lstat(self._folder), ours)
-        except OSError:
-            same = False
-        return _not_private(ours) if same else "it is gone, or another was put in its place"
-
-    def taken(self, verb: Verb) -> bool:
-        """Remove a request; False if there is none by its owner or root."""
-        if self._held < 0:
-            return _taken(self._folder / verb)
-        try:
-            made = os.stat(verb, dir_fd=self._held, follow_symlinks=False)
-            os.unlink(verb, dir_fd=self._held)
-        except OSError:
-            return False
-        return stat.S_ISREG(made.st_mode) and made.st_uid in (_user(), 0)
-
-    def close(self) -> None:
-        """Remove the remaining requests, and the folder."""
-        for verb in Verb:
-            self.taken(verb)
-        if self._held >= 0:
-            os.close(self._held)
-        with suppress(OSError):
-            self._folder.rmdir()
-
-
-def _user() -> int:
-    """The number of the user whose rights this process has; 0 on Windows, whose files name none."""
-    if sys.platform == "win32":
-        return 0
-    return os.geteuid()
-
-
-def _not_private(folder: os.stat_result) -> str:
-    """Why somebody else may have made requests there; "" if only we can."""
-    if not stat.S_ISDIR(folder.st_mode):
-        return "it is no folder of its own"
-    if _user() not in (folder.st_uid, 0):
-        return f"it belongs to the user {folder.st_uid}"
-    if folder.st_mode & 0o022:
-        return f"others may write to it (mode {stat.S_IMODE(folder.st_mode):03o})"
-    return ""
-
-
 @contextmanager
-def verbs_taken(
-    folder: Path, stop: StopRequest, pause: PauseRequest, sink: Sink = lambda event: None
-) -> Iterator[None]:
-    """A context in which the scan of this folder obeys commands; warns if that is impossible.
+def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+    """A context in which the scan of this folder obeys commands, by files in a folder that only its owner can enter.
 
     Raises:
         DataError: the disk does not take the folder for them.
@@ -170,20 +104,13 @@ def verbs_taken(
     }  # fmt: skip
 
     def take_verbs() -> None:
-        told = False
         while not over.wait(POLL):
-            if fault := requests.fault():
-                if not told:
-                    message = f"No verb from another terminal is done: {place}: {fault}. Ctrl-C here stops the scan."
-                    sink(Warned(message))
-                told = True
-                continue
             for verb, action in actions.items():
-                if requests.taken(verb):
+                if _taken(place / verb):
                     action()
 
     try:
-        requests = _Requests(place)
+        place.mkdir(mode=0o700)
     except OSError as error:
         raise DataError(
             f"{place} cannot be created ({error.strerror}). Nothing has moved, and no frame was recorded."
@@ -195,7 +122,10 @@ def verbs_taken(
     finally:
         over.set()
         thread.join(ANSWER_WITHIN)
-        requests.close()
+        for verb in Verb:
+            _taken(place / verb)
+        with suppress(OSError):
+            place.rmdir()
 
 
 def _taken(request: Path) -> bool:
@@ -243,25 +173,19 @@ def ask(run: Path, verb: Verb) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Raises:
-        ConfigError: no scan runs there, or somebody else's.
+        ConfigError: no scan runs there.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
     request = part / CONTROL / verb
+    if not request.parent.is_dir():
+        raise ConfigError(f"no scan is running in {run}. Nothing was changed.")
     try:
-        folder = os.lstat(request.parent)
-    except OSError:
-        raise ConfigError(f"no scan is running in {run}. Nothing was changed.") from None
-    if sys.platform != "win32" and (fault := _not_private(folder)):
-        raise ConfigError(
-            f"{request.parent}: {fault}. Only the user who started a scan can control it. Nothing was changed."
-        )
-    try:
-        with suppress(FileExistsError):
-            os.close(os.open(request, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        request.touch()
     except OSError as error:
         raise DataError(
-            f"{run} does not accept {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
+            f"{run} does not accept {verb}: {error.strerror}. Only the user who started a scan can control it; Ctrl-C "
+            "at its terminal stops it."
         ) from error
     return Asked(part, verb, time.monotonic())
 

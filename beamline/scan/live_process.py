@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from beamline.config.load import Config, plan_of
 from beamline.core.events import (
     Done,
+    EnoughReached,
     Failed,
     ReconDone,
     Sink,
@@ -51,6 +52,9 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
     """
     recon, plan = config.recon, plan or LivePlan()
     options = {**_common(config), "--seconds": recon.seconds}
+    if (when := recon.stop_when) is not None:
+        limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
+        options |= {name: limit for name, limit in limits.items() if limit is not None}
     if plan.binning > 1:
         options["--bin"] = plan.binning
     if plan.every > 1:
@@ -107,9 +111,9 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
-    new stop, or ASK_LIVE_AFTER after the scan's stop. Also with a `useless` file, which is broken or has no
-    projections."""
-    last = ASK_LIVE_AFTER if stop.stopping else 0.0
+    new stop, or ASK_LIVE_AFTER after the scan's stop (unless its views were enough). Also with a `useless` file, which
+    is broken or has no projections."""
+    last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
     return lambda: useless or stop.aborting or (stop.stopping and stop.seconds >= last)
 
 
@@ -122,6 +126,7 @@ class LiveReconstruction:
     the file has all views, and its last round makes up for the steps that are lost.
 
     Args:
+        enough: is told why the views so far are enough, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan beside it takes precedence.
@@ -132,11 +137,12 @@ class LiveReconstruction:
         command: Sequence[str],
         log: Path,
         sink: Sink,
+        enough: Callable[[str], None] = lambda reason: None,
         what: str = "live reconstruction",
         silence: float = _SILENCE,
         low_priority: bool = True,
     ) -> None:
-        self._sink, self._log, self._what = sink, log, what
+        self._sink, self._log, self._enough, self._what = sink, log, enough, what
         self._silence = silence
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
@@ -234,6 +240,10 @@ class LiveReconstruction:
         match event:
             case StateEntered(state="ready"):
                 self._ready.set()
+            case EnoughReached(n_views=n, planned=planned, mean=mean, low=low, high=high):
+                self._enough(
+                    f"{n} of {planned} views are enough, the others would add {mean:.2f} dB ({low:.2f} to {high:.2f})"
+                )
             case Done():
                 self._done = event.data
                 event = ReconDone(self._done)

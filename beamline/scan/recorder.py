@@ -2,8 +2,7 @@
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
 frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
-of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same. Where a
-check does not come back, the second thread goes on without the first.
+of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same.
 """
 
 from __future__ import annotations
@@ -39,12 +38,8 @@ WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the threads
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
-STALL = 60.0  # real s that a write may take, after which the disk counts as dead
+STALL = 60.0  # real s that a write, or the checks of a frame, may take
 SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
-CHECKS = 60.0  # real s that the checks may take for a frame, after which they count as hanging
-COMPILES = 300.0  # the same of their rehearsal, which compiles once on a machine
-REHEARSED = 10.0  # real s of it, after which the scan says what it waits for
-STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
 
@@ -89,8 +84,8 @@ class Recorder:
 
     No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
     so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
-    raise DataError where a frame could not be written, or a write takes longer than STALL. A stop or an abort waits for
-    neither disk nor checks: what the camera still owes is kept in memory.
+    raise DataError where a frame could not be written, or a write or the checks of a frame take longer than STALL. A
+    stop or an abort waits for neither: what the camera still owes is kept in memory.
 
     Args:
         pause: a request that pauses the scan.
@@ -122,11 +117,6 @@ class Recorder:
         self._monitor_off = False
         self._unjudged: list[int] = []  # frames that the monitor did not look at
         self._check_name = ""  # that looks, or looked last
-        self._under_checks: deque[tuple[Frame | None, float]] = deque()
-        """The frame that the first thread works on (None: the rehearsal), and since when. Whoever takes it out hands it
-        on: the first thread, or the second one, which goes on alone from then on."""
-        self._alone = False
-        self._told_of_rehearsal = False
         self.n_frames = 0
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
@@ -146,7 +136,7 @@ class Recorder:
         self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
         self._backlog = BacklogGuard(most, pause, self._work) if views.trains else None
         self._flying = False
-        self._looked_at, self._busy_since = -math.inf, math.inf
+        self._looked_at, self._checking_since, self._writing_since = -math.inf, math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
         self._thread.start()
         threading.Thread(target=self._check_frames, name="recorder's checks", daemon=True).start()
@@ -250,7 +240,11 @@ class Recorder:
                 return
 
     def _refuse_stall(self) -> None:
-        if time.monotonic() - self._busy_since > STALL:
+        if time.monotonic() - self._checking_since > STALL:
+            raise DataError(
+                f"The check {self._check_name} has not come back from a frame for {STALL:g} s. {self._safe()}"
+            )
+        if time.monotonic() - self._writing_since > STALL:
             raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
 
     def _raise_failure(self) -> None:
@@ -266,29 +260,17 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _check_frames(self) -> None:
-        """The first thread: digests and checks, until the last frame, or until the second one goes on alone."""
-        self._under_checks.append((None, time.monotonic()))
+        """The first thread: digests and checks, until the last frame."""
         self._rehearse()
-        if not self._taken_out():
-            return
-        while isinstance(item := self._next(), Frame | threading.Event):
-            checked: _Item = item if isinstance(item, threading.Event) else None
-            if isinstance(item, Frame):
-                if self._failure is not None:
-                    continue  # frames after a failure are discarded, so that `put` does not wait for room
-                self._under_checks.append((item, time.monotonic()))
+        while (item := self._next()) is not None:
+            if isinstance(item, threading.Event):
+                self._checked.put(item)
+            elif self._failure is None:  # frames after a failure are discarded, so that `put` does not wait for room
+                self._checking_since = time.monotonic()
                 checked = self._digested(item)
-                if not self._taken_out():
-                    return
-            self._checked.put(checked)
+                self._checking_since = math.inf
+                self._checked.put(checked)
         self._checked.put(None)
-
-    def _taken_out(self) -> bool:
-        """Take out what the first thread has worked on; False where the second one has done so."""
-        with suppress(IndexError):
-            self._under_checks.pop()
-            return True
-        return False
 
     def _rehearse(self) -> None:
         """Compile what the checks need, before the first frame. An error costs no frame."""
@@ -303,7 +285,7 @@ class Recorder:
 
     def _digested(self, frame: Frame) -> _Item:
         """A frame with its digests and flags, or why it has none: it then fails at its turn to be written."""
-        begun, cpu = time.monotonic(), time.thread_time()
+        begun = time.monotonic()
         try:
             seen, stored = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
             return frame, seen, stored, self._look(_as_stored(frame), seen)
@@ -311,59 +293,17 @@ class Recorder:
             return error
         finally:
             self._work.checking += time.monotonic() - begun
-            self._work.checking_cpu += time.thread_time() - cpu
-
-    def _next_checked(self) -> _Item:
-        """The next item of the second thread, which digests frames itself once the checks hang."""
-        while True:
-            with suppress(Empty):
-                return self._checked.get(not self._alone, SLICE)
-            if self._alone:
-                item = self._next()
-                return self._digested(item) if isinstance(item, Frame) else item
-            self._give_up_checks_that_hang()
-
-    def _give_up_checks_that_hang(self) -> None:
-        """Switch the monitor off where it takes too long, and take its frame; the first thread may hang for ever."""
-        with suppress(IndexError):  # it has come back
-            looked_at = self._under_checks[0]
-            frame, since = looked_at
-            usual = COMPILES if frame is None else CHECKS
-            limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
-            if (seconds := time.monotonic() - since) <= limit:
-                if frame is None and seconds > REHEARSED and not self._told_of_rehearsal:
-                    self._told_of_rehearsal = True
-                    self._sink(
-                        Warned(
-                            f"The check {self._check_name} is being rehearsed for {seconds:.0f} s now, which compiles "
-                            f"what it needs. Frames wait; without an answer in {COMPILES:.0f} s the monitor is off."
-                        )
-                    )
-                return
-            if (taken := self._under_checks.pop()) is not looked_at:  # it came back, and has the next frame
-                self._under_checks.append(taken)
-                return
-            self._monitor_off = self._alone = True
-            where = "its rehearsal" if frame is None else f"frame {frame.index}"
-            self._sink(
-                Warned(
-                    f"The check {self._check_name} has not come back from {where} for {seconds:.0f} s. The monitor is "
-                    "off: frames from here on are stored without flags."
-                )
-            )
-            if frame is not None:
-                self._checked.put(self._digested(frame))
 
     def _write_frames(self) -> None:
         """The second thread: writes, and reports."""
-        item, flushed = self._next_checked(), True
+        item, flushed = self._checked.get(), True
         while True:
-            begun, cpu = time.monotonic(), time.thread_time()
+            begun = time.monotonic()
             try:
                 if isinstance(item, BaseException):
                     raise item
                 if self._failure is None:
-                    self._busy_since = time.monotonic()
+                    self._writing_since = time.monotonic()
                     if isinstance(item, tuple):
                         self._write(*item)
                         flushed = False
@@ -376,13 +316,12 @@ class Recorder:
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
             self._work.writing += time.monotonic() - begun
-            self._work.writing_cpu += time.thread_time() - cpu
-            self._busy_since = math.inf
+            self._writing_since = math.inf
             if item is None:
                 return
             if isinstance(item, threading.Event):
                 item.set()
-            item = self._next_checked()
+            item = self._checked.get()
 
     def _next(self) -> Frame | threading.Event | None:
         """The next item of the queue; checks the disk about once a second meanwhile."""

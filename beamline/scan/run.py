@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -121,7 +121,7 @@ def run_scan(
             for sentence in remarks:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
-            stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
+            stack.enter_context(verbs_taken(folder, stop, run.pause))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
                 pause = run.pause if config.scan.without_watchdog == "pause" else None
@@ -230,7 +230,7 @@ class _Run:
         with ExitStack() as ending:
             follower = None
             if command is not None:
-                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink)
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink, self.stop.stop_as_enough)
                 ending.callback(follower.close)
             return self._acquire_and_follow(writer, follower, release)
 
@@ -289,29 +289,29 @@ class _Run:
         beam = beam_log(self.config.devices.beam_monitor, self.instrument.beam_monitor, self.sink, self.pause)
         acquisition = self._acquisition(recorder, beam, follower)
         labels = LabelLog()
-        with beam:
-            error = _failure_of(lambda: self._acquire(acquisition, recorder, labels, follower))
+        ended = _Ending(self.sink)
+        with ended.kept(), beam:
+            self._acquire(acquisition, recorder, labels, follower)
         self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
-        disk = _failure_of(recorder.finish)
-        error = self._worse(error, disk)
+        with ended.kept():
+            recorder.finish()
         faults = self.references.faults(recorder.references)
-        status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
-        missing, why = acquisition.missing, "" if error is None else user_message(error)
-        # A write that does not return holds HDF5's lock: closing the file would wait for it.
-        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings, why))
-        error = self._worse(error, unfinished)
-        if self.instrument.simulated is not None and not recorder.hangs:
-            n = writer.committed
-            error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
+        missing, status, closed = acquisition.missing, ended.status, False
+        with ended.kept():
+            if not recorder.hangs:  # a write that does not return holds HDF5's lock: closing would wait for it
+                writer.close(status, missing, beam.readings, ended.reason)
+                closed = True
+        with ended.kept():
+            if self.instrument.simulated is not None and not recorder.hangs:
+                write_labels(labels_path(writer.path), labels.runs(writer.committed), writer.committed)
         for remark in filter(None, (*writer.remarks, recorder.drift, recorder.unjudged)):
             self.sink(Warned(remark))
-        error = self._worse(error, _failure_of(release))
+        with ended.kept():
+            release()
         path, n_frames = writer.path, writer.committed
-        if self.series is not None and n_frames and unfinished is None:
-            try:
+        with ended.kept():
+            if self.series is not None and n_frames and closed:
                 path, n_frames = self.series.join(path)
-            except DataError as failure:
-                error = self._worse(error, failure)
         result = RunResult(
             path=path,
             n_frames=n_frames,
@@ -325,16 +325,16 @@ class _Run:
             bytes=writer.path.stat().st_size,
             recon=None,
             status=status,
-            returned=self._returned(path) if unfinished is None else (),
+            returned=self._returned(path) if closed else (),
             sample=self.config.sample.name,
         )
         self.sink(ScanDone(result))
         if follower is not None:
-            useless = unfinished is not None or isinstance(error, ReferencesError)
+            useless = not closed or isinstance(ended.error, ReferencesError)
             recon = follower.finish(live_should_end(self.stop, useless), lambda: self.stop.aborting)
             result = replace(result, recon=recon)
-        if error is not None:
-            raise error
+        if ended.error is not None:
+            raise ended.error
         return replace(result, seconds=time.monotonic() - self.began)
 
     def _returned(self, path: Path) -> tuple[ReturnedView, ...]:
@@ -362,15 +362,6 @@ class _Run:
                 if self.instrument.simulated is not None:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
-
-    def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
-        """The error that ends the run: any other one before a stop or lost frames, which become a warning."""
-        if error is None or after is None or after is error:
-            return error or after
-        if isinstance(error, ScanStopped | LedgerError):
-            error, after = after, error
-        self.sink(Warned(str(after)))
-        return error
 
     def _end_by(self, error: BaseException) -> State:
         """The state in which an error ends the run."""
@@ -465,10 +456,34 @@ def wait_in_pause(recorder: Recorder) -> bool:
     return enter_pressed()
 
 
-def _failure_of(action: Callable[[], None]) -> BaseException | None:
-    """The exception that the action raised, or None; it is raised after everything is closed."""
-    try:
-        action()
-    except BaseException as error:
-        return error
-    return None
+class _Ending:
+    """The error that ends a run, raised after everything is closed: any other one before a stop or lost frames, which
+    become a warning."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self.error: BaseException | None = None
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """A step whose failure does not keep the next ones from being taken."""
+        try:
+            yield
+        except BaseException as after:
+            if self.error is None or after is self.error:
+                self.error = after
+                return
+            if isinstance(self.error, ScanStopped | LedgerError):
+                self.error, after = after, self.error
+            self._sink(Warned(str(after)))
+
+    @property
+    def status(self) -> str:
+        """Of the scan so far: complete, stopped or failed."""
+        if self.error is None:
+            return "complete"
+        return "stopped" if isinstance(self.error, ScanStopped) else "failed"
+
+    @property
+    def reason(self) -> str:
+        return "" if self.error is None else user_message(self.error)

@@ -118,27 +118,15 @@ class SpaceGuard:
 
 @dataclass
 class Workload:
-    """Busy seconds of a recorder's threads, by wall clock and processor time.
-
-    Checking a frame waits only for the processor. Its ratio of clock time to processor time, applied to writing, gives
-    the writing time without the disk; the rest is waiting for the disk.
-    """
+    """Busy seconds of a recorder's threads: checking frames, and writing them."""
 
     checking: float = 0.0
-    checking_cpu: float = 0.0
     writing: float = 0.0
-    writing_cpu: float = 0.0
-
-    @property
-    def disk(self) -> float:
-        """Seconds that writes waited for the disk."""
-        contended = self.checking / self.checking_cpu if self.checking_cpu > 0 else 1.0
-        return max(0.0, self.writing - max(1.0, contended) * self.writing_cpu)
 
     @property
     def behind(self) -> tuple[str, str]:
-        """The cause of the backlog, and a remedy: the disk if writes waited longer than the checks took."""
-        if self.disk > self.checking:
+        """The cause of the backlog, and a remedy: the disk if writing took longer than the checks."""
+        if self.writing > self.checking:
             return "the disk is behind", "a longer period_s or a faster disk"
         return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
 

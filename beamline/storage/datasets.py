@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.text import printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
-from beamline.storage.structure import drawn_on, plain_name
+from beamline.storage.structure import plain_name
 
 _JOULE = 1 / 1.602176634e-16  # keV
 DEGREE = np.pi / 180
@@ -71,33 +71,8 @@ def text_at(group: h5py.Group, path: str) -> str:
 
 
 def text_of(item: h5py.Dataset) -> str:
-    """The first value of a dataset as text; "" if it `is_foreign`."""
-    return "" if is_foreign(item) else text(first_of(item))
-
-
-def is_foreign(item: h5py.Dataset) -> bool:
-    """Whether a text is behind a link to a file without images: no scan needs it, and a reader would print its
-    content."""
-    if item.dtype.kind in "uifb":
-        return False
-    if item.is_virtual:
-        return file_of(item) != item.file.filename
-    number = h5py.h5o.get_info(item.file.id).fileno
-    if number not in _HOLD_IMAGES:
-        if len(_HOLD_IMAGES) > 1000:
-            _HOLD_IMAGES.clear()
-        _HOLD_IMAGES[number] = any(True for _ in images_in(item.file))
-    return not _HOLD_IMAGES[number]
-
-
-def file_of(item: h5py.Dataset) -> str:
-    """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
-    source."""
-    sources = drawn_on(item.id.get_create_plist()) if item.is_virtual else ()
-    return next((name for name, _ in sources if name != "."), str(item.file.filename))
-
-
-_HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's number of it
+    """The first value of a dataset as text."""
+    return text(first_of(item))
 
 
 def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
@@ -240,7 +215,7 @@ def _numbers(item: h5py.Dataset, read: Callable[[h5py.Dataset], Any]) -> tuple[N
     stated = {attribute(item, "units")} - {""}
     if item.dtype.kind in "uif":
         return np.ravel(np.asarray(read(item), np.float64)), stated
-    if item.dtype.kind not in "SO" or is_foreign(item):
+    if item.dtype.kind not in "SO":
         return None, stated
     written = [_WRITTEN.fullmatch(text(each).strip()) for each in np.ravel(read(item))]
     numbers = [match for match in written if match is not None]

@@ -8,23 +8,19 @@ import shutil
 import tempfile
 import threading
 import time
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
 from io import SEEK_CUR, SEEK_END, SEEK_SET, FileIO
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
 from beamline.core.files import to_disk
 from beamline.core.text import size
-from beamline.storage.superblock import Superblock, made_whole
+from beamline.storage.superblock import Superblock, make_whole
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
-_BLOCK = 2**24  # bytes that are read back at once
 _ENDLESS = 2**60  # bytes, more than any file grows to
 
 
@@ -92,13 +88,13 @@ class GrowingFile(UnderHdf5):
 
     def __init__(self, path: Path, head: Superblock) -> None:
         super().__init__(path, "r", _ENDLESS)
-        self._head = head.closed(_ENDLESS).head
+        self._head = head.closed(_ENDLESS)
 
     def _read(self, at: int, out: memoryview) -> None:
         super()._read(at, out)
         head = self._head[at : at + len(out)]
         out[: len(head)] = head
-        made_whole(at, out)
+        make_whole(at, out)
 
 
 class DiskFile(UnderHdf5):
@@ -113,7 +109,6 @@ class DiskFile(UnderHdf5):
         super().__init__(path, "x+" if mode == "x" else "r+")
         self._error: BaseException | None = None
         self._since: list[tuple[int, bytes]] = []
-        self._sums: list[tuple[int, int, int]] = []  # first byte, bytes, CRC-32 of each write
 
     def _read(self, at: int, out: memoryview) -> None:
         try:
@@ -130,7 +125,6 @@ class DiskFile(UnderHdf5):
         self._size = max(self._size, self._at + len(data))
         try:
             if self._error is None:
-                self._sums.append((self._at, len(data), zlib_ng.crc32(data)))
                 self._file.seek(self._at)
                 while put < len(data):
                     put += self._file.write(data[put:])
@@ -142,7 +136,6 @@ class DiskFile(UnderHdf5):
 
     def truncate(self, size: int) -> int:
         self._size = size
-        self._sums = [(at, n, checksum) for at, n, checksum in self._sums if at + n <= size]
         try:
             if self._error is None:
                 self._file.truncate(size)
@@ -163,36 +156,11 @@ class DiskFile(UnderHdf5):
             raise error
 
     def finish(self) -> None:
-        """Flush the file to the disk, read it back and compare, a block at a time.
-
-        A write that a later one changed in part is not compared: these are metadata.
-
-        Raises:
-            OSError: the disk did not take it, or holds something else.
-        """
+        """Wait until the file is on the disk. OSError: the disk did not take it, or the file has another length."""
         self.require_taken()
         to_disk(self._file.fileno())
         if (size := os.fstat(self._file.fileno()).st_size) != self._size:
             raise OSError(errno.EIO, f"it has {size} bytes of {self._size}", str(self.path))
-        for at, n, checksum in self._unchanged():
-            if self._checksum(at, n) != checksum:
-                raise OSError(errno.EIO, f"{n} bytes at {at} are not those that were written", str(self.path))
-
-    def _unchanged(self) -> Iterator[tuple[int, int, int]]:
-        """Writes that no later write changed."""
-        begins, ends = list[int](), list[int]()  # of what later writes cover: apart, in order
-        for at, n, checksum in reversed(self._sums):
-            first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches
-            if not any(begins[i] < at + n and ends[i] > at for i in range(first, end)):
-                yield at, n, checksum
-            begins[first:end], ends[first:end] = ([min([at, *begins[first:end]])], [max([at + n, *ends[first:end]])])
-
-    def _checksum(self, at: int, n: int) -> int:
-        block, checksum = memoryview(bytearray(min(n, _BLOCK))), 0
-        self._file.seek(at)
-        while n > 0 and (got := self._file.readinto(block[: min(n, _BLOCK)])):
-            checksum, n = zlib_ng.crc32(block[:got], checksum), n - got
-        return checksum
 
 
 def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -248,8 +248,6 @@ def write_legend(file: h5py.File) -> None:
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
     """The legend of a scan file. Raises ValueError for impossible bits."""
     items = [file[f"{LEGEND}/{name}"] for name in ("name", "bit", "unit", "meaning")]
-    if any(map(datasets.is_foreign, items)):
-        raise ValueError(f"{LEGEND} lies in another file")
     columns = (datasets.values_of(item) for item in items)
     legend = tuple(
         FlagBit(datasets.text(name), int(bit), datasets.text(unit), datasets.text(meaning))

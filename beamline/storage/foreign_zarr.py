@@ -1,4 +1,4 @@
-"""Zarr of other programs, versions 2 and 3 with any codec, by the format's own library where it is installed.
+"""Volumes in a Zarr, versions 2 and 3 with any codec, by the format's library where it is installed.
 
 Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import TEXT, require_below
 from beamline.core.machine import free_memory
 from beamline.storage.structure import numbers_of, shape_of
 
 _METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
-_FACTS = (*_METADATA, ".zattrs", ".zmetadata")
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -69,19 +66,25 @@ class ZarrScale:
             raise DataError(f"{self.path} cannot be read ({type(error).__name__}: {error}).") from error
 
 
+def zarr_library(path: Path) -> Any:
+    """The package zarr. DataError: it is not installed."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise DataError(f"{path}: a Zarr needs the package zarr: pip install splatline[zarr]") from error
+    return zarr
+
+
 def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacing | None]:
     """The finest scale of an OME-Zarr with the coarser ones, or the array `dataset`; voxel size in mm, if stated.
 
     Raises:
         DataError: no library, not readable, no volume, or several channels or times.
     """
+    zarr = zarr_library(path)
     try:
-        import zarr
-    except ImportError as error:
-        raise DataError(f"{path} is a Zarr store. Reading it needs the package zarr: pip install zarr") from error
-    try:
-        root: Any = zarr.open(store=_regular_files(path), mode="r")
-        image = _image(root)
+        root: Any = zarr.open(store=str(path), mode="r")
+        image = root.attrs.get("ome", root.attrs).get("multiscales", [{}])[0]
         names = [each["path"] for each in image.get("datasets", [])] if dataset is None else [dataset]
         arrays: list[Any] = [root] if hasattr(root, "chunks") else [root[name] for name in names]
         spacing = _spacing(image, arrays[0].ndim, names[0]) if arrays and names else None
@@ -112,39 +115,6 @@ def _require_chunks(path: Path, array: Any) -> None:
         raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
     if piece > free_memory():
         raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
-
-
-def _regular_files(path: Path) -> Any:
-    """The files of a Zarr for its library: regular ones below its folder, behind no link."""
-    from zarr.storage import LocalStore
-
-    def look_at(key: str) -> None:
-        with suppress(FileNotFoundError, NotADirectoryError):  # a chunk of the fill value
-            require_below(path, key, TEXT if key.rpartition("/")[2] in _FACTS else math.inf)
-
-    class RegularFiles(LocalStore):
-        async def get(self, key: str, *args: Any, **options: Any) -> Any:
-            look_at(key)
-            return await super().get(key, *args, **options)
-
-        def get_sync(self, key: str, **options: Any) -> Any:
-            look_at(key)
-            return super().get_sync(key, **options)
-
-        async def get_partial_values(self, prototype: Any, key_ranges: Any) -> Any:
-            parts = [*key_ranges]
-            for key, _ in parts:
-                look_at(key)
-            return await super().get_partial_values(prototype, parts)
-
-    return RegularFiles(path, read_only=True)
-
-
-def _image(root: Any) -> Mapping[str, Any]:
-    """The first image of an OME-Zarr; {} without."""
-    attributes = root.attrs.get("ome", root.attrs)
-    multiscales = attributes.get("multiscales", [{}])
-    return multiscales[0]
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:

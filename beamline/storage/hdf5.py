@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import errno
 import os
 import re
 import struct
-import sys
 import zlib
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -17,12 +15,12 @@ from typing import Any, Literal
 import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
 
-from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import no_file, same_file
+from beamline.core.errors import DataError
+from beamline.core.files import no_file
 from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
-from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
+from beamline.storage.writer_lock import QUIET, LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
 COMMITTED = "/entry/progress/frames_committed"  # of our own files
 
@@ -47,16 +45,15 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(no_file(path))
     head = superblock(path)
-    # HDF5 would wait for ever for a writer that died to mend a torn block.
-    if grows_here(path) or (head is not None and head.grows and abandoned(path)):
-        return _apart(path, follow)
+    if grows_here(path) or (head is not None and head.open_for_writing and abandoned(path)):
+        return _apart(path, head, follow)
     problems = []
     for swmr, locking in _ways(head, follow):
         try:
             if swmr:
                 file = h5py.File(path, "r", swmr=swmr, locking=locking)
             else:
-                file = opened_whole(path, unlocked=not _being_written(head))
+                file = opened_whole(path, unlocked=head is None or not head.open_for_writing)
         except (OSError, RuntimeError, ValueError) as error:
             problems.append(error)
             continue
@@ -66,17 +63,13 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     raise _unopened(path, follow, head, problems)
 
 
-def _being_written(head: Superblock | None) -> bool:
-    return head is not None and head.open_for_writing and head.intact
-
-
 def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None]]:
     """Ways to open a file, (swmr, locking), in the order in which they are tried."""
     # A follower takes no lock, so as not to be taken for a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)
     ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
     # HDF5 would wait for ever for a writer that mends what is missing or damaged
-    waits = (head is not None and head.missing) or not (follow or _being_written(head))
+    waits = head is None or head.missing or not (follow or head.open_for_writing)
     return [way for way in ways if not (way[0] and waits)]
 
 
@@ -94,10 +87,10 @@ def _unopened(
             f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original: if there is "
             f"no other, {rescue}. Nothing was read."
         )
-    if _being_written(head):
+    if head is not None and head.open_for_writing:
         return DataError(
-            f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
-            f"writer died, `beamline recover {path}` clears the mark; nothing was read."
+            f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, or its writer just "
+            f"died, try again in {QUIET:.0f} s. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(held_sentence(path))
@@ -120,18 +113,20 @@ def grows_here(path: Path) -> bool:
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
             by_name = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
             writes = by_name and file.get_intent() != h5py.h5f.ACC_RDONLY
-            if writes and same_file(here, Path(os.fsdecode(file.name)).stat()):
+            if writes and os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
                 return True
     return False
 
 
-def _apart(path: Path, follow: bool) -> h5py.File:
-    """The file by a driver that HDF5 shares with no other."""
-    head = superblock(path)
-    if head is None or not head.intact or (head.open_for_writing and not head.grows):
+def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
+    """The file of this program, or of a writer that died, by a driver that HDF5 shares with no other."""
+    if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
         raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
     with readable(path):
-        return h5py.File(GrowingFile(path, head), "r")
+        file = h5py.File(GrowingFile(path, head), "r")
+        with closed_on_error(file):
+            require_harmless(file)
+        return file
 
 
 def look_again(item: h5py.Dataset) -> None:
@@ -174,16 +169,11 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except ALTERED as error:
-        # HDF5 asks for too much memory where a file is damaged, too; without a limit that is why it gets none.
-        limit = memory_limit_sentence()
-        no_memory = out_of_memory(error) and (limit or not damaged(error))
-        if no_memory or isinstance(error, PermissionError | FileNotFoundError):
+        if isinstance(error, MemoryError | PermissionError | FileNotFoundError):
             raise
-        limit = f"{limit} If that is too little, the file may be good." if limit and damaged(error) else ""
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
-            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was "
-            f"changed.{limit}"
+            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was changed."
         ) from error
 
 
@@ -203,20 +193,6 @@ def reason(error: Exception) -> str:
     return message[1] if message else (isinstance(error, OSError) and error.strerror) or str(error)
 
 
-def never_close(file: h5py.File) -> None:
-    """Keep a file open until the process ends, so that HDF5 does not change it any more.
-
-    For a file that the disk did not take. Closing it would repeat the writes, with a traceback for each object, and may
-    leave the file marked so that nobody can open it. HDF5 still closes it at the end of the process, and crashes if the
-    disk fails: on Linux its handle then leads to memory.
-    """
-    for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
-        item.locked = True  # each is a reference of its own to the object, which is now never given back
-    if sys.platform == "linux":
-        with suppress(OSError, RuntimeError, ValueError):
-            atexit.register(os.dup2, os.memfd_create("closed"), file.id.get_vfd_handle())
-
-
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
     """A file that is created by `created` or changed by `changed`."""
 
@@ -228,25 +204,25 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
 
 @contextmanager
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
-    """Create a file. At the end of the block it is flushed to the disk, read back and compared.
+    """Create a file. At the end of the block it is flushed to the disk.
 
     Raises:
-        OSError: the disk refused the bytes or holds others; the file is closed and stays.
+        OSError: the disk refused the bytes; the file is closed and stays.
     """
     with _written(path, "x", libver) as file:
         yield file
 
 
 @contextmanager
-def changed(path: Path) -> Iterator[NewFile]:
+def changed(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
     """Open an existing file to change it, as `created` does; a disk error leaves the changes half done."""
-    with _written(path, "r+", None) as file:
+    with _written(path, "r+", libver) as file:
         yield file
 
 
 @contextmanager
 def _written(path: Path, mode: Literal["x", "r+"], libver: str | tuple[str, str] | None) -> Iterator[NewFile]:
-    with closing(DiskFile(path, mode)) as disk, _nothing_ignored(disk):
+    with closing(DiskFile(path, mode)) as disk:
         try:
             with NewFile(disk, mode, libver) as file:
                 yield file
@@ -257,21 +233,3 @@ def _written(path: Path, mode: Literal["x", "r+"], libver: str | tuple[str, str]
                 number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
                 raise OSError(number, reason(error), str(path)) from error
             raise
-
-
-@contextmanager
-def _nothing_ignored(disk: DiskFile) -> Iterator[None]:
-    """What h5py can only print, as Ctrl-C while an object goes, is kept."""
-    before = sys.unraisablehook
-
-    def keep(args: Any) -> None:
-        if "h5py" in str(args.object) and args.exc_value is not None:
-            disk.keep(args.exc_value)
-        else:
-            before(args)
-
-    sys.unraisablehook = keep
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before

@@ -24,6 +24,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
+from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -269,8 +270,12 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     return int(firsts[-1])
 
 
-def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
-    """Copy the first `n` rows of a scan file, with all that is not stored by row, into a new, closed file."""
+def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> tuple[int, ...]:
+    """Copy the first `n` rows of a scan file, with all that is not stored by row, into a new, closed file.
+
+    Returns:
+        the rows whose pixels differ from their checksum; those that cannot be read become zeros.
+    """
     _copy(file["/"], target, {path: file[path][:n] for path in layout.growing(file)})
     for path in _VIRTUAL:
         item = file[path]
@@ -278,9 +283,18 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
         made = target.create_dataset(path, (n, *item.shape[1:]), item.dtype, chunks=chunks, maxshape=maxshape)
         datasets.copy_attributes(item, made)
         for row in range(n):
-            made[row] = item[row]
+            with suppress(*hdf5.ALTERED):
+                made[row] = item[row]
             target.require_taken()
     _complete(file, target, n)
+    return tuple(row for row in range(n) if not is_whole(target, row))
+
+
+def is_whole(file: h5py.File, row: int) -> bool:
+    """Whether the pixels of a row are as they were written, by their checksum."""
+    with suppress(*hdf5.ALTERED):
+        return has_checksum(file[layout.DATA][row], int(file["/entry/digest/checksum"][row]))
+    return False
 
 
 def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
@@ -297,9 +311,13 @@ def _complete(source: h5py.File, target: h5py.File, n: int) -> None:
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
     """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
     datasets.copy_attributes(source, target)
-    for name, item in source.items():
+    for name in source:
         path = f"{source.name.rstrip('/')}/{name}"
-        if path in _MADE_ANEW or path in _VIRTUAL or datasets.attribute(item, "target") not in ("", path):
+        if (
+            path in _MADE_ANEW
+            or path in _VIRTUAL
+            or datasets.attribute(item := source[name], "target") not in ("", path)
+        ):
             continue
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)

@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,171 +23,57 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 
-MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
-_NESTED = 8  # virtual datasets of which each draws on the next; HDF5 crashes where there is no end to them
-CLAIMED = 1e9  # bytes
+MOST_OBJECTS, DEEPEST = 50_000, 64
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
 def require_harmless(file: h5py.File) -> None:
-    """Raise DataError for a file with more objects or deeper groups than any scan has, for one that refers to a path
-    without a file, for one that claims more data than it has, and for a virtual dataset that draws on itself.
-
-    Files that it draws on are looked at, too, and those that they draw on.
-    """
+    """Raise DataError for a file with more objects or deeper groups than any scan has, and for one that refers to a
+    path that is no regular file."""
     path = Path(file.filename)
-    opened, virtual = {_number_of(path): file}, list[h5py.Dataset]()
-    waiting = _looked_at(file, path, virtual)
-    with ExitStack() as files:
-        while waiting:
-            path = waiting.pop()
-            if (number := _number_of(path)) in opened:
+    for name in dict.fromkeys(_names(file, path)):
+        # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
+        for place in (Path(name), path.parent / name, path.parent / Path(name).name):
+            if place.is_dir():
                 continue
-            if len(opened) >= FILES:
+            try:
+                require_regular(place)
+            except OSError as error:
                 raise DataError(
-                    f"{file.filename} links to more than {FILES} files, directly or through others. Nothing was read."
-                )
-            opened[number] = None
-            with suppress(*_DAMAGED):
-                opened[number] = files.enter_context(h5py.File(path, "r", locking=False))
-                waiting += _looked_at(opened[number], path, virtual)
-        sources = {_place_of(item): {*_sources(item, opened)} for item in virtual}
-    nested = {*sources}
-    for _ in range(_NESTED):
-        nested = {place for each in nested for place in sources[each] if place in sources}
-    if nested:
-        raise DataError(
-            f"{file.filename}: a virtual dataset draws on itself, or on more than {_NESTED} others one after the "
-            "other. Nothing was read."
-        )
+                    f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
+                ) from error
 
 
-def _number_of(path: Path) -> tuple[int, int]:
-    """What tells a file from all others, under whatever name."""
-    status = path.stat()
-    return status.st_dev, status.st_ino
-
-
-def _place_of(item: h5py.Dataset) -> tuple[int, int]:
-    """What tells an object of open files from all others, under whatever name."""
-    known = h5py.h5o.get_info(item.id)
-    return known.fileno, known.addr
-
-
-def _sources(item: h5py.Dataset, opened: dict[tuple[int, int], Any]) -> Iterator[tuple[int, int]]:
-    """The places of what a virtual dataset draws on, as far as its files are open."""
-    path = Path(item.file.filename)
-    for name, where in drawn_on(item.id.get_create_plist()):
-        for place in [path] if name == "." else _places(name, path):
-            with suppress(*_DAMAGED):
-                yield _place_of(opened[_number_of(place)][where])
-
-
-def require_inside(file: h5py.File) -> None:
-    """Raise DataError if a file links to one outside of its folder."""
-    path = Path(file.filename)
-    for other in _looked_at(file, path, []):
-        if path.resolve().parent not in other.resolve().parents:
-            raise DataError(
-                f"{path} links to {other}, outside of its folder. Name the file itself to have that read, too."
-            )
-
-
-def _places(name: str, path: Path) -> Iterator[Path]:
-    """Where HDF5 looks for a file that another names: as it is named, beside that, and by its last part beside it."""
-    for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-        with suppress(ValueError):  # a name that no file can have
-            if os.path.lexists(place):
-                yield place
-
-
-def _looked_at(file: h5py.File, path: Path, virtual: list[h5py.Dataset]) -> list[Path]:
-    """The regular files that a file draws on; DataError where one is something else. Its virtual datasets are added to
-    `virtual`."""
-    files = dict[Path, None]()
-    for name in dict.fromkeys(_names(file, path, virtual)):
-        for place in _places(name, path):
-            with suppress(ValueError):
-                if place.is_dir():
-                    continue
-                try:
-                    require_regular(place)
-                except OSError as error:
-                    raise DataError(
-                        f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
-                    ) from error
-                files[place] = None
-    return [*files]
-
-
-def _names(file: h5py.File, path: Path, virtual: list[h5py.Dataset]) -> Iterator[str]:
+def _names(file: h5py.File, path: Path) -> Iterator[str]:
     """The other files that links and datasets name."""
     groups, known = [(h5py.h5g.open(file.id, b"/"), 0)], set[tuple[int, int]]()
     while groups:
         group, depth = groups.pop()
-        links: list[tuple[bytes, int]] = []
-        with suppress(*_DAMAGED):
-            _list(group, links)
-        if len(known) + len(links) > MOST_OBJECTS or depth > DEEPEST:
+        names = [*group]
+        if len(known) + len(names) > MOST_OBJECTS or depth > DEEPEST:
             raise DataError(
                 f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} deep: it is no scan or "
                 "volume. Nothing was read."
             )
-        for name, kind in links:
+        for name in names:
             with suppress(*_DAMAGED):
+                kind = group.links.get_info(name).type
                 if kind == h5py.h5l.TYPE_EXTERNAL:
                     yield os.fsdecode(group.links.get_val(name)[0])
-                elif kind == h5py.h5l.TYPE_HARD:
-                    info = h5py.h5o.get_info(group, name)
-                    if (info.fileno, info.addr) in known:
-                        continue
-                    known.add((info.fileno, info.addr))
-                    if info.type == h5py.h5o.TYPE_GROUP:
-                        groups.append((h5py.h5g.open(group, name), depth + 1))
-                    elif info.type == h5py.h5o.TYPE_DATASET:
-                        dataset = h5py.h5d.open(group, name)
-                        made, text = dataset.get_create_plist(), name.decode("utf-8", "replace")
-                        _refuse_empty_claim(dataset, made, f"{path}: {text}")
-                        _refuse_foreign_bytes(dataset, made, path, text)
-                        if made.get_layout() == h5py.h5d.VIRTUAL:
-                            virtual.append(h5py.Dataset(dataset))
-                            yield from (other for other, _ in drawn_on(made) if other != ".")
-                        for i in range(made.get_external_count()):
-                            yield os.fsdecode(made.get_external(i)[0])
-
-
-def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
-    def take(name: bytes, info: Any) -> bool | None:
-        links.append((name, info.type))
-        return True if len(links) > MOST_OBJECTS else None
-
-    group.links.iterate(take, info=True)
-
-
-def _refuse_empty_claim(dataset: Any, made: Any, what: str) -> None:
-    """DataError for a dataset of more bytes than any compression makes of what is stored of it."""
-    n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
-    if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
-        return
-    chunk = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else ()
-    piece, stored = math.prod(chunk) * dataset.dtype.itemsize, dataset.get_storage_size()
-    if n > PACKED * stored or is_blank(n, stored, piece):
-        raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
-
-
-def _refuse_foreign_bytes(dataset: Any, made: Any, path: Path, name: str) -> None:
-    """DataError for values in a file of any kind (HDF5's external storage), unless they are numbers, and that file is
-    below the folder of this one and not hidden."""
-    for i in range(made.get_external_count()):
-        other, root = os.fsdecode(made.get_external(i)[0]), path.resolve().parent
-        for place in _places(other, path):
-            within = place.resolve()
-            inside = root in within.parents and not any(part.startswith(".") for part in within.relative_to(root).parts)
-            if dataset.dtype.kind not in "uif" or not inside:
-                raise DataError(
-                    f"{path} keeps the values of {name} in the file {other}. From such a file only numbers are read, "
-                    "and only where it lies below the folder of the scan. Nothing was read."
-                )
+                if kind != h5py.h5l.TYPE_HARD:
+                    continue
+                info = h5py.h5o.get_info(group, name)
+                if (info.fileno, info.addr) in known:
+                    continue
+                known.add((info.fileno, info.addr))
+                if info.type == h5py.h5o.TYPE_GROUP:
+                    groups.append((h5py.h5g.open(group, name), depth + 1))
+                elif info.type == h5py.h5o.TYPE_DATASET:
+                    made = h5py.h5d.open(group, name).get_create_plist()
+                    if made.get_layout() == h5py.h5d.VIRTUAL:
+                        yield from (other for other, _ in drawn_on(made) if other != ".")
+                    for i in range(made.get_external_count()):
+                        yield os.fsdecode(made.get_external(i)[0])
 
 
 def drawn_on(made: Any) -> Iterator[tuple[str, str]]:

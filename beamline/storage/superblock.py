@@ -12,13 +12,13 @@ little-endian.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 SIZE = 48
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
-_WRITTEN, _GROWS = 1, 4
+_GROWS = 4
 _WORD = 0xFFFFFFFF
 
 _PAGE = 4096  # bytes; larger pages end where some of these do
@@ -50,60 +50,35 @@ class Superblock:
         return max(0, self.end - self.size)
 
     @property
-    def intact(self) -> bool:
-        """Whether the checksum of the superblock is correct."""
-        return self.head[_CHECKSUM] == lookup3(self.head[: _CHECKSUM.start])
-
-    @property
     def end(self) -> int:
         """Length of the file in bytes, as its superblock states it."""
         return int.from_bytes(self.head[_END], "little")
 
-    def closed(self, end: int) -> Superblock:
-        """The superblock of the same file as if it had been closed with so many bytes."""
-        return self._with(0, end)
-
-    def marked(self) -> Superblock:
-        """The superblock of the same file as if its writer had died, so that others may read it."""
-        return self._with(_WRITTEN | _GROWS, self.end)
-
-    def _with(self, flags: int, end: int) -> Superblock:
+    def closed(self, end: int) -> bytes:
+        """The head of the same file as if it had been closed with so many bytes."""
         head = bytearray(self.head)
-        head[_FLAGS] = flags
+        head[_FLAGS] = 0
         head[_END] = end.to_bytes(8, "little")
         head[_CHECKSUM] = lookup3(bytes(head[: _CHECKSUM.start]))
-        return replace(self, head=bytes(head))
+        return bytes(head)
 
 
 def superblock(path: Path) -> Superblock | None:
-    """The superblock of a file; None unless the file begins with a supported version with addresses of eight bytes.
-
-    Of one of which only the first half was written, as before: its flags come first.
-    """
+    """The superblock of a file; None unless the file begins with a whole one of a supported version, with addresses of
+    eight bytes."""
     with path.open("rb") as file:
         head = file.read(SIZE)
     if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:
         return None
-    tries = [head, *(head[:_FLAGS] + bytes([flags]) + head[_FLAGS + 1 :] for flags in (0, _WRITTEN | _GROWS))]
-    found = [Superblock(each, path.stat().st_size) for each in tries]
-    return next((each for each in found if each.intact), found[0])
+    return Superblock(head, path.stat().st_size) if head[_CHECKSUM] == lookup3(head[: _CHECKSUM.start]) else None
 
 
-def made_whole(at: int, read: memoryview) -> tuple[int, bytes] | None:
-    """Repair the checksum of a torn block in `read`, the bytes from `at` on that HDF5 asked for.
-
-    Returns:
-        where in the file the checksum is, and the right one. None: no block across the end of a page begins at `at`,
-        or its checksum is right.
-    """
+def make_whole(at: int, read: memoryview) -> None:
+    """Repair the checksum of a block in `read`, the bytes from `at` on that HDF5 asked for, that a kill or a loss of
+    power left half written: across the end of a page of memory, each field is the new or the old one."""
     size = block_size(read)
-    if not 8 < size <= len(read) or at // _PAGE == (at + size - 1) // _PAGE:
-        return None
-    right = lookup3(bytes(read[: size - 4]))
-    if read[size - 4 : size] == right:
-        return None
-    read[size - 4 : size] = right
-    return at + size - 4, right
+    if 8 < size <= len(read) and at // _PAGE != (at + size - 1) // _PAGE:
+        read[size - 4 : size] = lookup3(bytes(read[: size - 4]))
 
 
 def block_size(read: memoryview) -> int:

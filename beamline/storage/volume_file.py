@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -144,57 +143,28 @@ def _check_size(path: Path, n: int) -> None:
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
-    """Single-file NIfTI-1 (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
+    """NIfTI (Cox et al. 2004): values scaled as the header says, and mm between voxels along z, y, x.
 
     Scaled values are float32, others of the file's type. The orientation of the patient is not applied.
     """
     try:
-        from nibabel import Nifti1Header
-        from nibabel.openers import ImageOpener
-        from nibabel.spatialimages import HeaderDataError
-        from nibabel.wrapstruct import WrapStructError
+        import nibabel
     except ImportError as error:
         raise DataError(
             f"{path} is a NIfTI volume; install nibabel to read it: pip install splatline[nifti]."
         ) from error
-    try:
-        with ImageOpener(str(path)) as file:
-            header = Nifti1Header.from_fileobj(file, check=False)
-            dtype, size = _checked_nifti(path, header)
-            _check_size(path, size)
-            stored = np.asarray(header.raw_data_from_fileobj(file))  # [x, y, z], then any axes of length 1
-            values = stored.T.reshape(header["dim"][3:0:-1])
-    except (EOFError, HeaderDataError, WrapStructError, OSError, OverflowError, ValueError, zlib.error) as error:
-        raise DataError(
-            f"{path} cannot be read as NIfTI: it is cut or damaged ({str(error).splitlines()[0]})."
-        ) from error
-    unit = LENGTHS[int(header["xyzt_units"]) & 7]
-    x, y, z = (abs(float(size)) * unit for size in header["pixdim"][1:4])
-    values = values.astype(dtype.newbyteorder("="))
-    slope, intercept = (float(header[name]) for name in ("scl_slope", "scl_inter"))
-    if not math.isfinite(slope) or slope == 0 or (slope == 1 and intercept == 0):
-        return values, (z, y, x)
-    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinite; the caller refuses them
-        return values.astype(np.float32) * np.float32(slope) + np.float32(intercept), (z, y, x)
-
-
-def _checked_nifti(path: Path, header: Any) -> tuple[np.dtype[Any], int]:
-    """Type and bytes of the values; DataError for a header that no volume of real numbers has."""
-    magic = bytes(header["magic"]).rstrip(b"\0")
-    if int(header["sizeof_hdr"]) != 348 or magic != b"n+1":
-        raise DataError(f"{path} is no NIfTI-1 in one file (header of {header['sizeof_hdr']} bytes, magic {magic!r}).")
-    dtype, dims = header.get_data_dtype(), header["dim"].tolist()
-    if dtype.kind not in "iuf" or int(header["bitpix"]) != 8 * dtype.itemsize or dtype.itemsize > 8:
-        kind, bits = header["datatype"], header["bitpix"]
-        raise DataError(f"{path} holds values of type {kind} with {bits} bits; real numbers of 8 to 64 bits are read.")
-    if not (3 <= dims[0] <= 7 and min(dims[1:4]) >= 1 and all(n == 1 for n in dims[4 : dims[0] + 1])):
-        raise DataError(f"{path} has the axes {dims[1 : max(dims[0], 0) + 1]}; a volume has three.")
-    sizes, offset = header["pixdim"][1:4], float(header["vox_offset"])
-    if not (np.isfinite(sizes).all() and sizes.all() and math.isfinite(offset) and offset >= 348):
-        raise DataError(f"{path}: voxels of {sizes.tolist()}, values from byte {offset:g} on: the header is damaged.")
-    if (unit := int(header["xyzt_units"]) & 7) not in LENGTHS:
-        raise DataError(f"{path}: lengths in unit {unit} of xyzt_units; 1, 2 and 3 (m, mm, um) are known.")
-    return dtype, math.prod(dims[1:4]) * dtype.itemsize
+    image: Any = nibabel.load(path)
+    shape, unit = image.shape, LENGTHS.get(int(image.header["xyzt_units"]) & 7)
+    dtype, steps = image.get_data_dtype(), np.abs(image.header.get_zooms()[:3])
+    if len(shape) < 3 or any(n != 1 for n in shape[3:]) or dtype.kind not in "iuf":
+        raise DataError(f"{path} holds {dtype} of shape {shape}; expected real numbers of three axes.")
+    if unit is None or not (np.isfinite(steps).all() and steps.all()):
+        raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
+    _check_size(path, math.prod(shape) * dtype.itemsize)
+    values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any axes of length 1
+    x, y, z = (float(step) * unit for step in steps)
+    scaled = values.dtype.newbyteorder("=") != dtype.newbyteorder("=")
+    return values.astype(np.float32 if scaled else dtype.newbyteorder("=")), (z, y, x)
 
 
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:

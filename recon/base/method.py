@@ -317,6 +317,7 @@ class Traits:
         return self.in_time or self.by_energy
 
 
+@runtime_checkable
 class Method(Protocol):
     """A reconstruction method: a frozen dataclass whose fields are its settings.
 

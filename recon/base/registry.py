@@ -19,6 +19,12 @@ from pkgutil import iter_modules
 from typing import Any, Generic, Literal, TypeVar
 
 _PREFIX = "splatline."
+ADD_ONS = {
+    "archive": "splatline-archive",
+    "cluster": "splatline-cluster",
+    "tango": "splatline-tango",
+}
+"""Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant
 
 T = TypeVar("T")
@@ -30,6 +36,8 @@ def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
     Args:
         kind: what the name is of, such as "method"; empty where the sentence goes on from that.
     """
+    if (package := ADD_ONS.get(str(name))) is not None:
+        return f"{kind} {name!r} needs a package that is not installed: pip install {package}".lstrip()
     names = list(legal)
     return f"{kind} {name!r} is unknown; legal: {', '.join(names) or 'none'}{did_you_mean(name, names)}".lstrip()
 

@@ -90,10 +90,10 @@ def _slope(a: F64, b: F64, axis_col: float) -> tuple[float, float]:
     near = max(8.0, 0.05 * a.shape[1])
     for rows in np.array_split(np.arange(len(a)), max(n, 1)):
         try:
-            estimate = axis_from_pair(a[rows], b[rows], (axis_col - near, axis_col + near))
+            estimate = axis_from_pair(a[rows], b[rows])
         except AxisError:
             continue
-        if estimate.confident:
+        if estimate.confident and abs(estimate.value - axis_col) < near:
             heights.append(float(rows.mean()) - (len(a) - 1) / 2)
             columns.append(estimate.value)
     h, c = np.array(heights), np.array(columns)

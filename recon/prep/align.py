@@ -19,7 +19,7 @@ from scipy.ndimage import uniform_filter1d
 from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.prep.axis_ends import axis_from_ends
-from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, Search, few_rows, is_cut_off, lowest, optimum, within
+from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, few_rows, is_cut_off, lowest, optimum
 from recon.prep.axis_wedge import AxisError as AxisError
 from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
@@ -32,7 +32,7 @@ _ALL = slice(None)
 _EDGE = 25  # one column in so many, at each edge, is too near to it for an axis
 
 
-def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating], search: Search = None) -> AxisEstimate:
+def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> AxisEstimate:
     """Axis from two views half a turn apart: p180 is p0 mirrored about the axis.
 
     The normalised correlation of p0 with the mirrored p180 is taken at every half column, then a parabola through the
@@ -41,11 +41,10 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating], search:
 
     Args:
         p0, p180: float32 [row, col], line integrals.
-        search: (lowest, highest) column; None: the middle three quarters.
 
     Raises:
         ValueError: for shapes that differ or values that are not finite.
-        AxisError: where the best match lies at the edge of the search range or outside it.
+        AxisError: the best match lies at the edge of the candidates.
     """
     a, b = np.atleast_2d(p0).astype(np.float64), np.atleast_2d(p180).astype(np.float64)
     if a.shape != b.shape:
@@ -55,16 +54,16 @@ def axis_from_pair(p0: NDArray[np.floating], p180: NDArray[np.floating], search:
     cols = a.shape[1]
     rows = np.unique(np.linspace(0, len(a) - 1, min(len(a), 4 * MOST_ROWS)).astype(int))
     candidates = np.arange(cols // 8 * 2, 2 * cols - 1 - cols // 8 * 2) / 2
-    curve = _mirror_mismatch(a[rows], b[rows], candidates)
-    value, depth = optimum(candidates, curve, search)
+    curve = mirror_mismatch(a[rows], b[rows], candidates)
+    value, depth = optimum(candidates, curve)
     confident = depth > 0.5
     if confident and rows.size >= 8:
-        halves = [_mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
+        halves = [mirror_mismatch(a[part], b[part], candidates) for part in (rows[::2], rows[1::2])]
         confident = max(abs(lowest(candidates, half)[0] - value) for half in halves) < AGREE
-    return AxisEstimate(value, *within(search, candidates, curve), confident, "pair")
+    return AxisEstimate(value, candidates, curve, confident, "pair")
 
 
-def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
+def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
     """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
 
     As `axis_from_pair`, but from the views' slopes along the columns, which share no trend if the overlap is narrow.
@@ -77,11 +76,10 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
-        search: (lowest, highest) column; None: all but 2 at each edge.
 
     Raises:
         ValueError: fewer than 8 pairs of opposite views, or values that are not finite.
-        AxisError: where the best match lies at the edge of the search range or outside it.
+        AxisError: the best match lies at the edge of the candidates.
     """
     a, b = _opposites(projections, angles)
     cols = projections.shape[2]
@@ -96,12 +94,10 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
 
     curve = views.mismatch()
     score = score_of(curve)
-    inside = np.ones(candidates.size, np.bool_)
-    if search is not None:
-        inside = (candidates >= search[0]) & (candidates <= search[1])
-    optimum(candidates, score.max() - score, search)  # refuses a range without the axis
-    best = int(np.flatnonzero(inside)[score[inside].argmax()])
-    value = _vertex(candidates, curve, best)
+    optimum(candidates, score.max() - score)  # refuses an axis at the edge
+    best = int(score.argmax())
+    near = slice(best - 1, best + 2)
+    value = lowest(candidates[near], curve[near])[0]
     middle = pairs // 2 * height  # neighbouring views are alike, the two quarters of a turn are not
     halves = [score_of(views.mismatch(part)) for part in (slice(middle), slice(middle, None))]
     apart = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
@@ -109,13 +105,7 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
     confident = apart < AGREE and all(
         score[best] > score_of(views.mismatch(others=int(n) * height)).max() for n in turned
     )
-    return AxisEstimate(value, *within(search, candidates, curve), confident, "opposite views")
-
-
-def _vertex(candidates: Floats, curve: Floats, best: int) -> float:
-    """Vertex of the parabola through the curve at three candidates."""
-    near = slice(max(best - 1, 0), best + 2)
-    return lowest(candidates[near], curve[near])[0]
+    return AxisEstimate(value, candidates, curve, confident, "opposite views")
 
 
 def _opposite_candidates(cols: int) -> Floats:
@@ -152,7 +142,7 @@ def _rows_of(views: Floats) -> Floats:
     return views.reshape(-1, views.shape[2])
 
 
-def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
+def mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
 
     It is 1 if these columns hold too little of the views' variance: air alone always matches.
@@ -219,10 +209,10 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     a, b = _opposites(data, theta)
     candidates = _opposite_candidates(data.shape[2])
     rows = range(data.shape[1])
-    return candidates, np.stack([_mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
+    return candidates, np.stack([mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
 
 
-def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) -> AxisEstimate:
+def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
     If all views together give no axis, and they cover the full turn, pairs of opposite views do: the axis of a wide
@@ -231,7 +221,6 @@ def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
-        search: (lowest, highest) column; None: the whole detector.
 
     Returns:
         The estimate from all views, or from opposite views, the ends or the pair if only these are confident. It is
@@ -250,20 +239,20 @@ def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) 
     warn_of_degrees(theta)
     warn_of_other_quantity(projections)
     try:
-        from_all = axis_from_sinogram(projections, theta, search)
+        from_all = axis_from_sinogram(projections, theta)
     except AxisError:
-        if (from_some := _from_some(projections, theta, search)) is not None:
+        if (from_some := _from_some(projections, theta)) is not None:
             return from_some
         raise
     if not from_all.confident:
-        from_all = _from_some(projections, theta, search) or from_all
+        from_all = _from_some(projections, theta) or from_all
         if from_all.confident or _has_opposites(theta, projections.shape[2]):
             return from_all  # one pair tells less than all of them, which do not agree
     pair = closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
         return from_all
     try:
-        from_pair = axis_from_pair(projections[pair[0]], projections[pair[1]], search)
+        from_pair = axis_from_pair(projections[pair[0]], projections[pair[1]])
     except AxisError:  # these two views do not show the axis, but all views together do
         return from_all
     if not from_pair.confident:
@@ -278,12 +267,12 @@ def _has_opposites(theta: Floats, cols: int) -> bool:
     return _opposite_pairs(theta, cols)[0].size >= _FEWEST_PAIRS
 
 
-def _from_some(projections: NDArray[np.floating], theta: Floats, search: Search) -> AxisEstimate | None:
+def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
     """The axis by opposite views if they show it clearly; by the ends of half a turn if the field cuts the sample."""
     with suppress(ValueError):  # an AxisError is a ValueError, too
         if not _has_opposites(theta, projections.shape[2]):
-            return axis_from_ends(projections, theta, search) if is_cut_off(projections) else None
-        estimate = axis_from_opposites(projections, theta, search)
+            return axis_from_ends(projections, theta) if is_cut_off(projections) else None
+        estimate = axis_from_opposites(projections, theta)
         return estimate if estimate.confident else None
     return None
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from recon.prep.axis_wedge import AxisEstimate, Floats, Search, few_rows, lowest, optimum, within
+from recon.prep.axis_wedge import AxisEstimate, Floats, few_rows, lowest, optimum
 
 ENDS = "ends of half a turn"
 _SIDE = 4  # views on each side of the join: they show how fast each structure moves
@@ -17,7 +17,7 @@ _SURE = 0.3  # columns by which the median of the joins within the scan may be o
 _CLEAR, _NEAR = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
 
 
-def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
+def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
     """Axis from the two ends of half a turn, also of a sample wider than the field.
 
     The last views mirrored about the axis are those before the first one. The 4 views on each side of this join count
@@ -29,7 +29,6 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
     Args:
         projections: float32 [view, row, col], line integrals; a few rows are enough.
         angles: [view], radians; views up to half a turn after the first are used.
-        search: (lowest, highest) column; None: the middle half.
 
     Returns:
         The curve is 0 where the ends fit as the median join within the scan does. Confident if the median of these is
@@ -37,7 +36,7 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
 
     Raises:
         ValueError: the views are not half a turn in even steps, or too few.
-        AxisError: where the best axis lies at the edge of the search range or outside it.
+        AxisError: the best axis lies at the edge of the middle half.
     """
     order, times = _half_turn(np.asarray(angles, np.float64))
     data = few_rows(projections[order])
@@ -50,10 +49,10 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats, search: Se
         error = float(np.median(errors)) if values.min() < curve.min() else error
         curve[at] = np.minimum(curve[at], values)
     candidates, curve = np.flatnonzero(np.isfinite(curve)) / _FINER, curve[np.isfinite(curve)]
-    value, _ = optimum(candidates, curve, search)
+    value, _ = optimum(candidates, curve)
     rivals = curve[np.abs(candidates - candidates[curve.argmin()]) > cols / _NEAR]
     confident = bool(error < _SURE and rivals.min() - curve.min() > _CLEAR)
-    return AxisEstimate(value, *within(search, candidates, curve), confident, ENDS)
+    return AxisEstimate(value, candidates, curve, confident, ENDS)
 
 
 def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:

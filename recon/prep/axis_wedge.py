@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy import fft
 
 Floats = NDArray[np.float64]
-Search = tuple[float, float] | None
 
 MOST_ROWS = 16  # Rows that are enough for 0.1 px
 FEWEST_COLS = 8  # Columns that an axis can be found from
@@ -20,7 +19,7 @@ AGREE = 1.0  # Two independent estimates no farther apart than this (px) are the
 
 
 class AxisError(ValueError):
-    """The best axis lies at or outside the edge of the search range, so there is no estimate."""
+    """The best axis lies at the edge of the candidates or outside them, so there is no estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,42 +66,24 @@ def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
     return float(candidates[i] + shift * (candidates[1] - candidates[0])), i
 
 
-def within(search: Search, candidates: Floats, curve: Floats) -> tuple[Floats, Floats]:
-    if search is None:
-        return candidates, curve
-    inside = (candidates >= search[0]) & (candidates <= search[1])
-    return candidates[inside], curve[inside]
-
-
-def axis_error(value: float, search: Search, candidates: Floats, where: str) -> AxisError:
-    low, high = (candidates[0], candidates[-1]) if search is None else search
+def axis_error(value: float, candidates: Floats, place: str) -> AxisError:
     return AxisError(
-        f"no rotation axis in the search range {low:g} to {high:g}: the best column is {value:.2f}, {where}; "
-        "widen the range, or give the axis"
+        f"no rotation axis in columns {candidates[0]:g} to {candidates[-1]:g}: the best column is {value:.2f}, "
+        f"{place}; give the axis"
     )
 
 
-def optimum(candidates: Floats, curve: Floats, search: Search) -> tuple[float, float]:
-    """The minimum inside the search range and its depth, 0 (as bad as the typical candidate) to 1 (perfect agreement).
+def optimum(candidates: Floats, curve: Floats) -> tuple[float, float]:
+    """The minimum of a curve and its depth, 0 (as bad as the typical candidate) to 1 (perfect agreement).
 
-    A minimum at the edge of the range, or clearly worse than one outside, raises AxisError: a range without the axis
-    also has a minimum.
+    Raises:
+        AxisError: the minimum lies at an end of the curve.
     """
-    part, values = within(search, candidates, curve)
-    if part.size < 3:
-        low, high = (candidates[0], candidates[-1]) if search is None else search
-        raise ValueError(
-            f"search range {low:g} to {high:g} holds {part.size} candidates; the axis is looked for in columns "
-            f"{candidates[0]:g} to {candidates[-1]:g}"
-        )
-    value, i = lowest(part, values)
-    if i in (0, part.size - 1):
-        raise axis_error(value, search, candidates, "at its edge")
+    value, i = lowest(candidates, curve)
+    if i in (0, candidates.size - 1):
+        raise axis_error(value, candidates, "at the edge")
     typical = float(np.median(curve))
-    depth, deepest = typical - float(values[i]), typical - float(curve.min())
-    if depth < 0.8 * deepest:
-        raise axis_error(lowest(candidates, curve)[0], search, candidates, "outside it")
-    return value, depth / typical if typical > 0 else 0.0
+    return value, (typical - float(curve[i])) / typical if typical > 0 else 0.0
 
 
 _MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for 0.1 px
@@ -111,7 +92,7 @@ _ROUNDING = 1e-10  # of a vector's length
 _WIDEST_GAP = np.deg2rad(20)  # share of a half turn; with a wider gap the double wedge does not determine the axis
 
 
-def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
+def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats) -> AxisEstimate:
     """Axis from all views, without a pair: for uneven, sparse and noisy scans, sectors and full turns.
 
     About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
@@ -127,11 +108,10 @@ def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats, search: S
     Args:
         sinogram: float32 [view, col] or [view, row, col], line integrals; a few rows are enough.
         angles: [view], radians, any order and range.
-        search: (lowest, highest) column; None: the whole detector.
 
     Raises:
         ValueError: for shapes that do not fit, fewer than 4 views, or values that are not finite.
-        AxisError: where the best axis lies at the edge of the search range or outside it.
+        AxisError: the best axis lies at the edge of the detector or outside it.
     """
     theta = np.asarray(angles, np.float64)
     if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
@@ -144,17 +124,17 @@ def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats, search: S
     if not (np.isfinite(data).all() and np.isfinite(theta).all()):
         raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
     if not _covers_half_a_turn(theta):
-        return _axis_from_mass(data, theta, search)
-    wedge = _axis_from_wedge(data, theta, search)
+        return _axis_from_mass(data, theta)
+    wedge = _axis_from_wedge(data, theta)
     if wedge.confident:
         return wedge
     with suppress(AxisError):
-        mass = _axis_from_mass(data, theta, search)
+        mass = _axis_from_mass(data, theta)
         return mass if mass.confident and abs(mass.value - wedge.value) < AGREE else wedge
     return wedge
 
 
-def _axis_from_mass(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
+def _axis_from_mass(data: Floats, theta: Floats) -> AxisEstimate:
     cols = data.shape[2]
     order = np.argsort(theta)
     theta, profile = theta[order], data[order].mean(axis=1)
@@ -171,9 +151,8 @@ def _axis_from_mass(data: Floats, theta: Floats, search: Search) -> AxisEstimate
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
-    low, high = (candidates[0], candidates[-1]) if search is None else search
-    if not low < value < high:
-        raise axis_error(value, search, candidates, "outside it")
+    if not candidates[0] < value < candidates[-1]:
+        raise axis_error(value, candidates, "outside them")
     # Correlated neighbouring residuals are not independent; air that is not at zero biases the axis without scatter.
     correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
     error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
@@ -182,7 +161,7 @@ def _axis_from_mass(data: Floats, theta: Floats, search: Search) -> AxisEstimate
     bias = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
     whole = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
     confident = whole and 2 * error + bias / mass.mean() < AGREE
-    return AxisEstimate(value, *within(search, candidates, curve), bool(confident), "centre of mass")
+    return AxisEstimate(value, candidates, curve, bool(confident), "centre of mass")
 
 
 def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
@@ -223,7 +202,7 @@ def is_cut_off(part: NDArray[np.floating]) -> bool:
     return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
 
 
-def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
+def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
     part, theta, bin_ = _for_wedge(data, theta)
     cols = part.shape[2]
     omega, fits = _wedge_residuals(part, theta)
@@ -241,9 +220,9 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimat
     )  # worse low frequencies; one harmonic more and one less must give the same axis
     curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
-    value, depth = optimum(full, curve, search)
+    value, depth = optimum(full, curve)
     bands = abs(lowest(full, curve_for(power - 1))[0] - lowest(full, curve_for(power + 1))[0])
-    return AxisEstimate(value, *within(search, full, curve), depth > 0.5 and bands < AGREE * bin_, "double wedge")
+    return AxisEstimate(value, full, curve, depth > 0.5 and bands < AGREE * bin_, "double wedge")
 
 
 def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 STEEPEST = math.radians(5)  # Largest tilt of the search, radians
 _DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
 _FLOOR = 1e-3  # least mismatch that counts
-_NEWTON, _CLOSE = 20, 1e-4  # steps, and the change in px at which they end
-_OWN = 6  # px from the line: search range of a band's own axis
+_SIGMAS = 1.4826  # standard deviation over the median distance, of normal errors
+_OWN = 6  # px from the line, within which a band has its own axis
 
 
 @dataclass(frozen=True)
@@ -61,10 +61,6 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
         ValueError: fewer than 4 bands or 8 columns, or bands that do not show the axis.
     """
     data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
-    if data.ndim != 3 or heights.shape != data.shape[1:2] or len(angles) != len(data):
-        raise ValueError(f"bands {data.shape} must be [view, band, col] for {heights.shape} heights")
-    if not np.isfinite(data).all():
-        raise ValueError("bands hold NaN or infinite values; correct them first")
     if data.shape[2] < FEWEST_COLS:
         raise ValueError(f"{data.shape[2]} columns are too few to show the axis; at least {FEWEST_COLS} are needed")
     if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
@@ -103,53 +99,31 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
         raise ValueError("no clear optimum")
     from scipy.interpolate import CubicSpline  # half a second
 
-    splines = [CubicSpline(candidates, curve) for curve in curves]
-    start = np.array([candidates[at], slope * step / far])
-    every = np.arange(heights.size)
-    line = _descend(splines, heights, every, start)
-    spread = 0.0
+    splines = [CubicSpline(candidates, np.log(curve)) for curve in curves]
+    every, start = np.arange(heights.size), np.array([candidates[at], slope * step / far])
+    line = _best_line(splines, heights, every, start)
+    variances = []
     for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
         parts = np.array_split(every, count)
-        without = np.array([_descend(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts])
-        spread = max(spread, math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2))))
-    spread = math.hypot(spread, _scatter(splines, heights, line))
-    return TiltEstimate(math.atan(line[1]), spread / (1 + line[1] ** 2), float(line[0]))
-
-
-def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:
-    """Standard deviation of the slope from the distances of the bands' own axes to the line (weighted least squares).
-
-    A band's weight is the curvature of its logarithm. Few bands may lie at the ends, which determine the slope. The
-    scatter is therefore divided by the effective number of bands for the slope, not by their total.
-    """
+        slopes = [_best_line(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts]
+        variances.append((count - 1) * np.var(slopes))
     at = line[0] + line[1] * heights
-    value, second = (np.array([spline(x, order) for spline, x in zip(splines, at, strict=True)]) for order in (0, 2))
-    weight = np.maximum(second, 0) / np.maximum(value, _FLOOR)
-    near = at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1)
-    near = np.clip(near, splines[0].x[0], splines[0].x[-1])
+    near = np.clip(at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
     own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - at
-    lever = weight * (heights - np.average(heights, weights=weight)) ** 2
-    carriers = lever.sum() ** 2 / (lever**2).sum()
-    variance = np.average(own**2, weights=weight) * heights.size / (heights.size - 2)
-    return math.sqrt(variance / carriers * weight.sum() / lever.sum())
+    scatter = float(np.median(np.abs(own))) * _SIGMAS / math.sqrt(float(((heights - heights.mean()) ** 2).sum()))
+    uncertainty = math.hypot(math.sqrt(max(variances)), scatter)
+    return TiltEstimate(math.atan(line[1]), uncertainty / (1 + line[1] ** 2), float(line[0]))
 
 
-def _descend(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
-    """(axis at height 0, slope) of the least sum of logarithms near `start`, by least squares weighted anew."""
-    line, h, far = start.copy(), heights[bands], float(np.abs(heights).max())
-    for _ in range(_NEWTON):
-        at = line[0] + line[1] * h
-        value, first, second = (
-            np.array([splines[b](x, order) for b, x in zip(bands, at, strict=True)]) for order in range(3)
-        )
-        weight = 1 / np.maximum(value, _FLOOR)
-        first, second = weight * first, weight * np.maximum(second, 0)  # a band counts only within its own minimum
-        bend = np.array([[second.sum(), (h * second).sum()], [(h * second).sum(), (h * h * second).sum()]])
-        if np.linalg.det(bend) <= 0:
-            raise ValueError("no clear optimum")
-        move = np.linalg.solve(bend, [first.sum(), (h * first).sum()])
-        move *= min(1.0, 1 / max(abs(move[0]), abs(move[1]) * far, 1e-12))
-        line -= move
-        if max(abs(move[0]), abs(move[1]) * far) < _CLOSE:
-            break
-    return line
+def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
+    """(axis at height 0, slope) of the least sum of logarithms of some bands, near `start`."""
+    from scipy.optimize import minimize
+
+    def total(line: F64) -> float:
+        return sum(float(splines[band](line[0] + line[1] * heights[band])) for band in bands)
+
+    far = float(np.abs(heights).max())
+    corners = start + np.array([[0, 0], [0.5, 0], [0, 0.5 / far]])
+    return np.asarray(
+        minimize(total, start, method="Nelder-Mead", options={"initial_simplex": corners, "xatol": 1e-5}).x
+    )

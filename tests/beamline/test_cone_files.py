@@ -106,9 +106,9 @@ def test_the_axis_of_one_row_is_found_on_pixels_as_coarse_as_that_of_all_rows(
 ) -> None:
     asked, columns, told = list[Geometry](), 12, list[str]()
 
-    def find(data: NDArray[np.float32], geometry: Geometry, *_: object, near: bool) -> AxisEstimate:
+    def find(data: NDArray[np.float32], geometry: Geometry, *_: object) -> AxisEstimate:
         asked.append(geometry)
-        return axis_by_views(data, geometry, near=near)
+        return axis_by_views(data, geometry)
 
     monkeypatch.setattr("beamline.projections.axis.COLS", columns)
     monkeypatch.setattr("beamline.projections.axis.axis_by_views", find)

@@ -13,7 +13,6 @@ NEED = {
     "beamline.core.machine",  # asks for its version, where it is loaded
     "recon.features.neural.networks",
     "recon.features.neural.train",
-    "recon.kernels.reference",  # of double precision, for derivatives
     "recon.splatting.autograd",
     "recon.splatting.finish",  # these hold Gaussians as tensors
     "recon.splatting.gaussians",

@@ -22,6 +22,8 @@ from simulators.scenes.scene import load_scene
 pytestmark = pytest.mark.bench
 SIDE, PITCH, PHOTONS, VIEWS = 48, 0.01, 5e4, 72
 TIMES = (np.arange(12) + 0.5) / 12
+FOAM = {"kind": "foam", "diameter": 0.408, "height": 0.408, "n_holes": 120, "largest_um": 107.0, "smallest_um": 35.0,
+        "gap_um": 4.0, "candidates": 40_000, "change": {"kind": "settle", "share": 0.25, "over_s": 0.7}}  # fmt: skip
 CELL = {"kind": "cathode", "diameter": 0.442, "height": 0.384, "wall_um": 15.0, "size_um": 68.6, "fill": 0.35,
         "change": {"kind": "charge", "factor": 0.5, "from_s": 0.1, "over_s": 0.8, "each_s": 0.08}}  # fmt: skip
 
@@ -56,8 +58,8 @@ def of_sub_scans(views: recon.TimedViews, parts: int) -> F32:
     return np.tensordot(shares, np.stack(volumes), 1)
 
 
-@pytest.mark.parametrize(("phantom", "knots"), [(CELL, 4)])
-def test_one_fit_in_time(phantom: dict[str, Any], knots: int) -> None:
+@pytest.mark.parametrize(("phantom", "knots", "motion"), [(FOAM, 3, True), (CELL, 4, False)])
+def test_one_fit_in_time(phantom: dict[str, Any], knots: int, motion: bool) -> None:
     views, truth = scanned(phantom)
 
     def psnr(found: F32) -> float:
@@ -72,7 +74,7 @@ def test_one_fit_in_time(phantom: dict[str, Any], knots: int) -> None:
             end="",
         )
     began = time.process_time()
-    found = recon.fit_series(views, knots)
+    found = recon.fit_series(views, knots, motion=motion)
     ours = psnr(np.stack([found.at(t) for t in TIMES.tolist()]))
     print(f"\n{phantom['kind']}: {knots} volumes: {ours:.2f} dB, {time.process_time() - began:.1f} CPU s")
     assert ours > max(others.values())

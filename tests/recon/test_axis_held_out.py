@@ -69,19 +69,6 @@ def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> None:
-    """Also where it is so far from the axis that the candidates beside it leave nearly as much."""
-    views, told = _views(29.2, SOD, SDD), list[int]()
-    right = Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=29.2)
-    assert axis_by_views(views, right, told.append, near=True).value == 29.2 and told == list(range(1, 11))
-    for wrong in (29.9, 40.2):
-        found = axis_by_views(views, replace(right, axis_col=wrong), near=True)
-        assert found.value == pytest.approx(29.2, abs=0.1) and found.confident
-    with suppress(AxisError):
-        assert not axis_by_views(views, replace(right, axis_col=59.2), near=True).confident
-
-
-@pytest.mark.slow
 def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
     with pytest.raises(AxisError, match=r"12 columns.*best with column"):
         axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=50.0))

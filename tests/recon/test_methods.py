@@ -149,6 +149,8 @@ class TestConformance(MethodConformance):
             request.getfixturevalue("one_thread")
             return methods.build(method, FIELDS[request.param])
         if request.param not in methods.names_of_one_volume():
-            return methods.build(method, {"sweeps": 5, "weight": 0.01})
+            return methods.build(
+                method, {"sweeps": 5, "weight": 0.01} | ({"moves": False} if request.param == methods.IN_TIME else {})
+            )
         short = {"iterations": 5, "steps": 40, "gaussians": 200, "finish": 2}
         return methods.build(method, {k: v for k, v in short.items() if methods.has_setting(method, k)})

@@ -1,5 +1,5 @@
 """Completion of commands and options in a shell."""
 
 COMMANDS = {
-    "completion": ("Print the completion script of a shell.", "NONE", False),
+    "completion": ("Print the completion script of a shell.", False),
 }

@@ -40,11 +40,10 @@ _WIDTH = 120  # Columns on a stdout that is no terminal
 @set_option
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per check to stdout, then the counts.")
 def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Check this computer: camera link, camera library, ports, disk, memory, packages. Nothing moves.
+    """Check this computer: camera link, camera library, ports, disk, memory. Nothing moves.
 
-    With CONFIG, each is compared with the needs of that scan: frames/s and MB/s beside what camera, link and disk
-    give, space, memory. The speed of the disk is measured for a few seconds with
-    a temporary file.
+    With CONFIG, each is compared with the needs of that scan: MB/s, space, memory. The speed of the disk is measured
+    for a few seconds with a temporary file.
 
     Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """

@@ -3,7 +3,6 @@ no byte is sent."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import re
 import socket
@@ -187,12 +186,8 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
 
 
 def version_of(file: Path | None) -> str:
-    """The version in the name of a library's file (after .so on Linux) or in its resource; "" if there is none."""
-    if file is None:
-        return ""
-    if sys.platform == "win32":
-        return _windows_version(file)
-    match = re.search(r"\.so\.(\d[\d.]*)$", file.resolve().name)
+    """The version in the name of a library's file (after .so on Linux); "" if there is none."""
+    match = None if file is None else re.search(r"\.so\.(\d[\d.]*)$", file.resolve().name)
     return match[1] if match else ""
 
 
@@ -223,19 +218,3 @@ def _loaded_file(path: Path | None) -> Path | None:
         loaded = (Path(file.path) for file in psutil.Process().memory_maps())
         return next((file for file in loaded if file.name.lower().startswith(("libdcamapi.", "dcamapi.dll"))), None)
     return None
-
-
-def _windows_version(file: Path) -> str:
-    """File version of the DLL's version resource (VS_FIXEDFILEINFO of verrsrc.h)."""
-    if sys.platform != "win32":
-        return ""
-    version = ctypes.WinDLL("version")
-    size = version.GetFileVersionInfoSizeW(str(file), None)
-    block = ctypes.create_string_buffer(max(size, 1))
-    at, length = ctypes.c_void_p(), ctypes.c_uint32()
-    if not size or not version.GetFileVersionInfoW(str(file), 0, size, block):
-        return ""
-    if not version.VerQueryValueW(block, "\\", ctypes.byref(at), ctypes.byref(length)) or not at.value:
-        return ""
-    fixed = (ctypes.c_uint32 * 4).from_address(at.value)
-    return ".".join(str(half) for word in (fixed[2], fixed[3]) for half in (word >> 16, word & 0xFFFF))

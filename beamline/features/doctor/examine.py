@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +19,6 @@ from beamline.config.beam import BeamMonitorSection, FoundFilter, FoundMonochrom
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, FilterConfig, MonochromatorConfig
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
-from beamline.core.installed import OWN_PACKAGES, clashing_distributions
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.features.doctor import devices
@@ -33,7 +31,6 @@ from beamline.scan.recorder import room as waiting_room
 from beamline.storage.writer_lock import no_locks
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
-from drivers.base.frame import FrameKind
 from drivers.serial.line import SerialPort, serial_ports
 
 SECONDS, MOST = 3.0, 4 << 30  # Longest time (s on the clock) and most bytes of a measurement
@@ -43,7 +40,7 @@ COMFORT = 1.25  # A disk faster than the need by this factor is good; a slower o
 SPEED, ROOM, LOCKS = "disk speed", "disk space", "file locks"
 Opens = Callable[[Path], IO[bytes]]
 """Opens a new file in a folder; the file is removed when it is closed or the process ends."""
-_MEMORY, _RATE = "memory", "frame rate"
+_MEMORY = "memory"
 
 
 @dataclass(frozen=True)
@@ -138,8 +135,6 @@ def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = te
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
-        if error.errno == errno.EINVAL:  # a file system without fsync
-            return diagnosis(Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.")
         expected = expected or "a folder in which files can be created"
         advice = "Choose another storage.folder, or correct its permissions or its disk"
         observed = f"{there} cannot be written to ({error.strerror or error})."
@@ -188,7 +183,7 @@ def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
 
 
 def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Diagnosis]:
-    """Check the camera's link and library, ports, disk, memory, packages. Nothing moves and nothing is overwritten.
+    """Check the camera's link and library, ports, disk and memory. Nothing moves and nothing is overwritten.
 
     Args:
         config: of the planned scan; None: no scan is planned.
@@ -202,7 +197,6 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     if config is not None:
         worked, cam = dry_run(config), config.devices.camera
         need = needs(worked, cam.ring_mb * 1_000_000 if isinstance(cam, DcamOrca) else 0)
-        yield frame_rate(worked)
     if cam is None or isinstance(cam, DcamOrca):
         yield devices.link(cam, usb)
         yield devices.library(cam, session)
@@ -222,43 +216,15 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     yield locks(folder)
     yield speed(folder, need, clock)
     yield memory(free_memory(), need)
-    yield packages(clashing_distributions())
 
 
-def packages(owners: Mapping[str, Sequence[str]]) -> Diagnosis:
-    """Whether other distributions have packages of our names. Where Python finds theirs, no command starts at all.
-
-    Args:
-        owners: their names for each distribution, as of `beamline.core.installed.clashing_distributions`.
-    """
-    if not owners:
-        return Diagnosis("packages", Grade.OK, f"No other distribution has a package named {', '.join(OWN_PACKAGES)}.")
-    others = " ".join(
-        f"The distribution {owner} also has packages named {' and '.join(names)}." for owner, names in owners.items()
-    )
-    advice = "It breaks splatline when it is installed again or removed: give splatline an environment of its own"
-    values = {"owners": {owner: list(names) for owner, names in owners.items()}}
-    return Diagnosis("packages", Grade.WARNING, others, "", advice, values)
-
-
-def frame_rate(worked: DryRun) -> Diagnosis:
-    """Frames/s and bytes/s of the scan's blocks against what camera and link give."""
-    frame, most = worked.timeline.frame_bytes, 1 / worked.camera.min_period
-
-    def in_hertz(rate: float) -> str:
-        return f"{rate:.3g} frames/s = {size(rate * frame)}/s"
-
-    rates = {
-        "views" if block.kind is FrameKind.PROJECTION else f"{block.kind.name.lower()}s": 1 / block.period
-        for block in worked.timeline.blocks
-    }
-    fastest = max(rates.values())
-    observed = "; ".join(f"{name} {in_hertz(rate)}" for name, rate in rates.items()) + f", frames of {size(frame)}."
-    expected = f"at most {in_hertz(most)}, which camera and link give"
-    values = {"frames_per_s": fastest, "bytes_per_s": fastest * frame, "most_frames_per_s": most}
-    if fastest <= most * (1 + 1e-9):
-        return Diagnosis(_RATE, Grade.OK, observed, expected, values=values)
-    return Diagnosis(_RATE, Grade.FAILED, observed, expected, "`beamline check` says which limits it breaks", values)
+def _read(name: str, expected: str, connect: Callable[[], Any], judge: Callable[[Any], Diagnosis]) -> Diagnosis:
+    """What a device says of itself, or why it says nothing."""
+    try:
+        with closing(connect()) as device:
+            return judge(device)
+    except DeviceError as error:
+        return of_error(name, error, expected)
 
 
 def _monitor(config: BeamMonitorConfig, connected: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
@@ -267,58 +233,49 @@ def _monitor(config: BeamMonitorConfig, connected: Sequence[SerialPort], clock: 
     if not isinstance(config, BeamMonitorSection):
         return
     if (at := getattr(config, "port", None)) is not None:
-        of_port = port(f"{name} port", at, connected)
-        yield of_port
+        yield (of_port := port(f"{name} port", at, connected))
         if of_port.verdict in (Grade.FAILED, Grade.NOT_APPLICABLE):
             return
-    try:
-        with closing(make_beam_monitor(config, clock)) as monitor:
-            reading = monitor.reading()
-    except DeviceError as error:
-        yield of_error(name, error, "a reading")
-        return
-    values = {"value": reading.value, "unit": reading.unit}
-    yield Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+    def judge(monitor: Any) -> Diagnosis:
+        reading = monitor.reading()
+        values = {"value": reading.value, "unit": reading.unit}
+        return Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+    yield _read(name, "a reading", lambda: make_beam_monitor(config, clock), judge)
 
 
 def _filter(config: FilterConfig, connected: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
     """A filter that is not moved by hand: its port, or the place at which it stands."""
-    name, expected = "filter", f"one of its places: {', '.join(config.places)}"
-    if isinstance(config, MotorFilter):
-        yield port(f"{name} port", config.stage.port, connected)
-    if not isinstance(config, FoundFilter):
-        return
-    try:
-        with closing(config.connect(clock)) as device:
-            place = device.place()
-    except DeviceError as error:
-        yield of_error(name, error, expected)
-        return
-    if place is None:
+    expected = f"one of its places: {', '.join(config.places)}"
+
+    def judge(device: Any) -> Diagnosis:
+        if (place := device.place()) is not None:
+            return Diagnosis("filter", Grade.OK, f"{place}.", expected, values={"place": place})
         advice = "Compare devices.filter.places with the values of status_pv; a scan that names its place moves it"
-        yield Diagnosis(name, Grade.WARNING, "It stands at no place that has a name.", expected, advice)
-    else:
-        yield Diagnosis(name, Grade.OK, f"{place}.", expected, values={"place": place})
+        return Diagnosis("filter", Grade.WARNING, "It stands at no place that has a name.", expected, advice)
+
+    if isinstance(config, MotorFilter):
+        yield port("filter port", config.stage.port, connected)
+    if isinstance(config, FoundFilter):
+        yield _read("filter", expected, lambda: config.connect(clock), judge)
 
 
 def _monochromator(config: MonochromatorConfig, clock: Clock) -> Iterator[Diagnosis]:
     """A monochromator with a connection of its own: the energy at which it stands."""
-    name, expected = "monochromator", "an energy"
     if not isinstance(config, FoundMonochromator):
         return
-    try:
-        with closing(config.connect(clock)) as connected:
-            energy = connected.energy()
-    except DeviceError as error:
-        yield of_error(name, error, expected)
-        return
     low, high = config.range_kev or (0.0, math.inf)
-    if energy > 0 and low <= energy <= high:
-        yield Diagnosis(name, Grade.OK, f"{energy:.7g} keV.", expected, values={"energy_kev": energy})
-    else:
+
+    def judge(connected: Any) -> Diagnosis:
+        energy = connected.energy()
+        legal, values = f"an energy above 0 and from {low:g} to {high:g} keV", {"energy_kev": energy}
+        if energy > 0 and low <= energy <= high:
+            return Diagnosis("monochromator", Grade.OK, f"{energy:.7g} keV.", legal, values=values)
         advice = "Compare devices.monochromator.unit and range_kev with what status_pv shows"
-        legal = f"{expected} above 0 keV" if config.range_kev is None else f"{expected} of {low:g} to {high:g} keV"
-        yield Diagnosis(name, Grade.WARNING, f"It stands at {energy:.7g} keV.", legal, advice)
+        return Diagnosis("monochromator", Grade.WARNING, f"It stands at {energy:.7g} keV.", legal, advice)
+
+    yield _read("monochromator", "an energy", lambda: config.connect(clock), judge)
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:

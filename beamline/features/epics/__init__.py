@@ -1,5 +1,5 @@
 """EPICS: the running scan as process variables."""
 
 COMMANDS = {
-    "ioc": ("Serve the running scan as EPICS process variables.", "NONE", False),
+    "ioc": ("Serve the running scan as EPICS process variables.", False),
 }

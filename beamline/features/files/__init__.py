@@ -1,7 +1,7 @@
 """Files of scans and volumes: what they hold, what is wrong with them, and a copy of any scan in our own layout."""
 
 COMMANDS = {
-    "info": ("Describe a scan file or a volume.", "FILES", False),
-    "validate": ("Check a scan file or a volume against the rules of its format.", "FILES", False),
-    "ingest": ("Copy any scan into one HDF5 scan, frame by frame.", "FILES"),
+    "info": ("Describe a scan file or a volume.", False),
+    "validate": ("Check a scan file or a volume against the rules of its format.", False),
+    "ingest": ("Copy any scan into one HDF5 scan, frame by frame.", True),
 }

@@ -47,8 +47,6 @@ _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.features.page") / "static"
 _KEPT = 64  # answers kept for the next client
 _NO_VERB = "do what is no verb"
-_PLACES = 200  # requests with a token that are answered at the same time; an open page is one, and a verb takes none
-MOST_STRANGERS = 100  # connections without a token: a browser shows its own within milliseconds
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'",
@@ -60,29 +58,6 @@ _HEADERS = {
 }
 
 
-class Strangers:
-    """Connections without a valid token so far. Each is closed in time, and the oldest first if there are many, so that
-    they do not displace authorised clients. All calls come from the server's thread.
-    """
-
-    def __init__(self) -> None:
-        self._ends: dict[object, Callable[[], None]] = {}
-
-    def enter(self, client: object, end: Callable[[], None]) -> None:
-        """Add a new connection, with the function that closes it."""
-        if len(self._ends) >= MOST_STRANGERS:
-            self.end(next(iter(self._ends)))
-        self._ends[client] = end
-
-    def leave(self, client: object) -> None:
-        """Remove a connection that has shown a token, or is closed."""
-        self._ends.pop(client, None)
-
-    def end(self, client: object) -> None:
-        """Close a connection if it still is without a token."""
-        self._ends.pop(client, lambda: None)()
-
-
 @dataclass(frozen=True)
 class Access:
     """Host names and tokens of a page: who may look, and who may act."""
@@ -91,7 +66,6 @@ class Access:
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
     act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
     ended: Event = field(default_factory=Event)  # set when the server ends
-    strangers: Strangers = field(default_factory=Strangers)
 
 
 class Guard:
@@ -100,7 +74,6 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
         self._cookie = COOKIE + access.hosts[0].rpartition(":")[2]
-        self._answering = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -117,8 +90,7 @@ class Guard:
         if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
         elif _same(request.cookies.get(self._cookie, ""), self._access.look):
-            self._access.strangers.leave(scope["client"])
-            await self._answer(request, scope, receive, send_with_headers)
+            await self._app(scope, receive, send_with_headers)
         elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie(self._cookie, self._access.look, httponly=True, samesite="strict")
@@ -126,17 +98,6 @@ class Guard:
         else:
             text = "This page needs the token in the address that was printed at its start.\n"
             await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
-
-    async def _answer(self, request: Request, scope: Scope, receive: Receive, send: Send) -> None:
-        may_act = self._access.act is not None and _same(request.headers.get(ACT_HEADER, ""), self._access.act)
-        if self._answering >= _PLACES and not may_act:
-            await Response("Too many pages are open.\n", 503, media_type="text/plain")(scope, receive, send)
-            return
-        self._answering += 1
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            self._answering -= 1
 
 
 def _same(given: str, expected: str) -> bool:

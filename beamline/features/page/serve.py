@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import os
 import secrets
 import socket
 import threading
@@ -24,11 +23,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import is_link
-from beamline.features.page.app import Access, Strangers, begins_with, guarded, page_routes
+from beamline.features.page.app import Access, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, cells, describe, runs_in
 
@@ -68,7 +65,6 @@ class RunBrowser:
             rows = [
                 {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(describe(run))}
                 for run in runs_in(self._folder)
-                if not _by_a_stranger(self._folder, run)
             ]
         return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows})
 
@@ -93,18 +89,6 @@ class RunBrowser:
             routes = page_routes(reader, self._access, lambda line: None)  # nobody may act from here
             self._opened[number] = _Opened(reader, begins_with("index.html", routes))
         return self._opened[number]
-
-
-def _by_a_stranger(folder: Path, run: Path) -> bool:
-    """Whether another user made a link on the way to a run, which could lead to any run that this program can read."""
-    if not hasattr(os, "geteuid"):
-        return False
-    way = [run, *run.parents]
-    links = [place for place in way[: way.index(folder)] if is_link(place)]
-    return any(link.lstat().st_uid not in (0, os.geteuid()) for link in links)
-
-
-TOKEN_WITHIN = 5.0  # s in which a connection shows a token
 
 
 @dataclass(frozen=True)
@@ -146,22 +130,6 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _connections(strangers: Strangers) -> type[asyncio.Protocol]:
-    """The protocol of a connection: a token comes within `TOKEN_WITHIN`. That of h11 reads 16 kB before a request."""
-
-    class Connection(H11Protocol):
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            strangers.enter(self.client, transport.abort)
-            self.loop.call_later(TOKEN_WITHIN, strangers.end, self.client)
-
-        def connection_lost(self, exc: Exception | None) -> None:
-            strangers.leave(self.client)
-            super().connection_lost(exc)
-
-    return Connection
-
-
 class PageServer:
     """A server bound to its port; `run` serves."""
 
@@ -173,7 +141,6 @@ class PageServer:
             uvicorn.Config(
                 app, log_level="warning", access_log=False, lifespan="off",
                 timeout_graceful_shutdown=1, server_header=False, proxy_headers=False,
-                http=_connections(access.strangers),
             ),
             access.ended,
         )  # fmt: skip

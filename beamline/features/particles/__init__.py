@@ -1,5 +1,5 @@
 """Particles: segments the particles of a volume, and measures them."""
 
 COMMANDS = {
-    "segment": ("Segment the particles of a volume: labels, sizes, places.", "FILES"),
+    "segment": ("Segment the particles of a volume: labels, sizes, places.", True),
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,7 +13,6 @@ import click
 
 from beamline.cli.options import (
     Declared,
-    dry_option,
     json_option,
     name_of,
     option,
@@ -35,8 +33,8 @@ if TYPE_CHECKING:
 
 _OF_A_VOLUME = frozenset(
     ("output", "report", "write-config", "log", "verbose", "json", "dry-run", "max-residual", "truth", "uncertainty",
-     "roi", "follow", "earlier", "memory", "cluster", "checkpoint", "resume", "budget",
-     "time", "beside-scan")
+     "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
+     "time", "moves", "beside-scan")
 )  # fmt: skip
 """Options of `beamline recon` that a slice has no use for."""
 
@@ -59,9 +57,8 @@ def sweepable() -> dict[str, click.Option]:
     help="The sheet, a .png; the table of scores is beside it, a .csv. Default: FILE's stem + _sweep.png, in this "
     "folder.",
 )
-@dry_option
 @json_option
-def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool) -> None:
+def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     """Reconstruct one slice of the scan in FILE with each value of an option of `beamline recon`, and draw them.
 
     NAME is the long name of the option; VALUES are A:B:STEP or a,b,c: tv-weight=0.5:4:0.5, rings=none,sort,vo,
@@ -81,9 +78,6 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
     refuse_not_utf8(common[0])
     refuse_existing(path)
     refuse_existing(table)
-    if dry:
-        _print_needs(trials, path, as_json)
-        return
     slices, scores = _run(trials, options, path, as_json)
     if not as_json and scores is not None and scores.best is not None:
         best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
@@ -193,25 +187,18 @@ def _remarks(
         return ["No score: the values change pixels or views, so the slices cannot be compared with the same views."]
     remarks = []
     if direct:
+        remarks.append(f"{BASELINE} leaves mostly the blur of its filter; -m fista-tv tells values apart better.")
+    if not scores.same_views:
         remarks.append(
-            f"What {BASELINE} leaves of views is mostly the blur of its filter; -m fista-tv tells values apart better."
-        )
-    if not scores.corrected_alike:
-        remarks.append(
-            "These values change the views that judge the slices: each is compared with the views of every value. "
-            "One that all others contradict loses, and the middle of a range is favoured. Look at the pictures first."
+            "These values change the views that judge the slices: each is compared with the views of every value, "
+            "which favours the middle of a range. Look at the pictures first."
         )
     if scores.best is None:
         low, high = scores.shares.min(), scores.shares.max()
-        remarks.append(
-            f"The residual of views held out is {low:.4g} to {high:.4g}, nearly the same for all values: it names none "
-            "of them. Look at the pictures."
-        )
-        return remarks
+        return [*remarks, f"All scores are nearly the same ({low:.4g} to {high:.4g}): they name no value."]
     best = slices[scores.best].values
-    for each in options if len(slices) == math.prod(len(each.values) for each in options) else ():
-        ends = (each.values[0], each.values[-1]) if each.numbers and len(each.values) > 2 else ()
-        if scores.corrected_alike and best[each.name] in ends:
+    for each in options if scores.same_views else ():
+        if len(each.values) > 2 and each.numbers and best[each.name] in (each.values[0], each.values[-1]):
             remarks.append(f"The best {each.name} is at the end of the range, {best[each.name]}: try further.")
     return remarks
 
@@ -223,28 +210,3 @@ def _rows(slices: Sequence[SweptSlice], scores: Scores | None) -> list[list[str]
     if scores is not None:
         judged = [(f"{share:.6g}", verdict) for share, verdict in zip(scores.shares, scores.verdicts, strict=True)]
     return [[*each.values.values(), *words, f"{each.seconds:.3g}"] for each, words in zip(slices, judged, strict=True)]
-
-
-def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
-    """Print the time and memory of the sweep."""
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import Need, busy
-    from beamline.core.text import count, size
-    from beamline.features.sweeps.sweep import sliced
-    from beamline.reconstruct.estimate import estimate
-    from recon.assess.time_model import duration_text
-
-    with answering(as_json) as answer:
-        speed = MachineSpeed()
-        needs = [estimate(each, speed, busy()) for each in sliced([each for _, each in trials])]
-        together = Need.in_turn(needs)
-        total = None if any(each.seconds is None for each in needs) else together.seconds
-        time, first = "not known" if total is None else f"about {duration_text(total)} at most", needs[0]
-        rows = count(first.shape[0], "row")
-        answer.done(
-            {"slices": len(needs), "memory": together.memory, "seconds": total, "output": str(path)},
-            f"slices    {len(needs)}, each of {rows} by {first.method}, from {first.views} views",
-            f"memory    {size(together.memory or 0)}",
-            f"time      {time}, reading and correction not counted",
-            f"sheet     {path}",
-        )

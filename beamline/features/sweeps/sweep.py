@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,7 @@ from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import WIDTH, finish, new_figure, png, show_image
-from beamline.report.metrics import METRICS
+from beamline.report.figures import WIDTH, new_figure, png, show_image
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import ONE_IN
@@ -32,10 +30,6 @@ from recon.base.volume import Grid
 from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 _FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
@@ -79,12 +73,12 @@ class Scores:
 
     Attributes:
         residuals: [slice, view] root mean square, as a share of that of all these views.
-        corrected_alike: all options give the same views; else each volume is compared with the views by all of them.
+        same_views: all options give the same views; else each volume is compared with the views by all of them.
         direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
     """
 
     residuals: F64
-    corrected_alike: bool
+    same_views: bool
     direct: bool = False
 
     @property
@@ -231,7 +225,7 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
     return Scores(residuals / scale, alike, direct)
 
 
-_COLUMNS, _CURVE = 4, 2.2  # pictures in a row; inches
+_COLUMNS = 4  # pictures in a row
 _COLOURS = {"best": "tab:red", "alike": "tab:orange", "": "black"}  # of frames and points, by verdict
 _CROP = 200  # pixels a side: of larger slices the part is shown that changes most, in proportion to its values
 
@@ -250,15 +244,11 @@ def sweep_sheet(
     window = matter_window(*images)
     tall, wide = images[0].shape
     height = WIDTH / across * tall / wide + 0.42
-    curve = _CURVE if scores is not None and len(options) == 1 else 0.0
-    figure = new_figure((WIDTH, curve + height * down + 0.3))
+    figure = new_figure((WIDTH, height * down + 0.3))
     figure.suptitle(title, fontsize=9)
-    panels = figure.add_gridspec(1 + down, across, height_ratios=[max(curve, 0.01), *[height] * down])
-    if scores is not None and curve:
-        _draw_curve(figure.add_subplot(panels[0, :]), slices, scores, options[0])
     verdicts = [""] * len(slices) if scores is None else scores.verdicts
     for n, (each, image) in enumerate(zip(slices, images, strict=True)):
-        axes = figure.add_subplot(panels[1 + n // across, n % across])
+        axes = figure.add_subplot(down, across, n + 1)
         show_image(axes, image, window)
         axes.set(xticks=[], yticks=[])
         if n == 0:
@@ -270,20 +260,6 @@ def sweep_sheet(
         for side in axes.spines.values():
             side.set(color=colour, linewidth=0.8 if colour == "black" else 2.5)
     return png(figure)
-
-
-def _draw_curve(axes: Axes, slices: Sequence[SweptSlice], scores: Scores, option: SweptOption) -> None:
-    numbers = option.numbers[: len(slices)]
-    at = numbers or range(len(slices))
-    axes.plot(at, scores.shares, "o-", ms=3, lw=1, color="tab:blue")
-    for place, share, verdict in zip(at, scores.shares, scores.verdicts, strict=True):
-        if verdict:
-            axes.plot([place], [share], "o", color=_COLOURS[verdict], ms=7)
-    if numbers and min(numbers) > 0 and max(numbers) / min(numbers) > 30:
-        axes.set_xscale("log")
-    if not numbers:
-        axes.set_xticks(range(len(slices)), option.values[: len(slices)])
-    finish(axes, option.name, METRICS["residual_held_out"].label, size=8)
 
 
 def _changes_most(images: Sequence[NDArray[np.float32]]) -> tuple[slice, slice]:

@@ -1,6 +1,6 @@
 """Trials: methods and settings compared on a scan, and what fewer views would cost."""
 
 COMMANDS = {
-    "tradeoff": ("Compare methods and settings on a scan: quality against time and memory.", "FITS"),
-    "study": ("Say what fewer views, narrower sectors, random angles or averaged views cost on a scan.", "FITS"),
+    "tradeoff": ("Compare methods and settings on a scan: quality against time and memory.", True),
+    "study": ("Say what fewer views, narrower sectors, random angles or averaged views cost on a scan.", True),
 }

@@ -19,7 +19,6 @@ from beamline.cli.options import (
     WholeRange,
     dry_option,
     json_option,
-    names_in,
     new_folder_option,
     others,
     parsed,
@@ -32,17 +31,15 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
 from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
-from beamline.cli.terminal import answering, events_shown
+from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
 from beamline.core.text import safe_name
 from beamline.features.trials.view_choices import STUDIES
-from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 
 if TYPE_CHECKING:
-    from beamline.features.trials.launch import ComparedScan
-    from beamline.features.trials.layout import Plan, TableLayout
+    from beamline.features.trials.runner import ComparedScan, Plan
 
 
 def listed(value: str) -> tuple[str, ...]:
@@ -53,48 +50,21 @@ def listed(value: str) -> tuple[str, ...]:
     return wanted
 
 
-_OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each energy."
-
-
 @dataclass(frozen=True, eq=False)
 class TradeoffRequest:
     """The arguments of `beamline tradeoff`."""
 
-    files: tuple[Path, ...] = set_by(
-        heading(DATA),
-        click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
-    )
+    file: Path = set_by(scan_argument)
     truth: str | None = set_by(
+        heading(DATA),
         "--truth",
-        excludes=dict.fromkeys(
-            ("time", "spectra"), "it is one volume; views in time, or of several energies, show several"
-        ),
         metavar="FILE[:A:B]",
         help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
         "held out.",
     )
     values: Mapping[str, Any] = others(light_options, selection_options)
-    volumes: int | None = set_by(
-        heading(METHOD),
-        "--time",
-        excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
-        type=WholeRange(min=2),
-        metavar="N",
-        help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
-    )
-    spectra: Path | None = set_by(
-        "--spectra",
-        type=click.Path(path_type=Path, dir_okay=False),
-        help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
-    )
-    states: str = set_by(
-        "--states",
-        needs=("spectra", _OF_MATERIALS),
-        metavar="NAME,NAME",
-        default="",
-        help="With --spectra: two materials that are two states of the same one.",
-    )
     methods: tuple[str, ...] | None = set_by(
+        heading(METHOD),
         "--methods",
         callback=parsed(listed),
         metavar="A,B,...",
@@ -138,66 +108,52 @@ class TradeoffRequest:
 def tradeoff(request: TradeoffRequest) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
-    With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
-    beside reconstructions of parts of them. With --seconds: each method once, all in the same time.
+    With --seconds: each method once, all in the same time.
 
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
-    resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
-    HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
+    resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, pictures and an HTML page.
+    Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
-    from beamline.core.sinks import Warnings
-    from beamline.energies import EnergyScans, read_spectra
-    from beamline.features.trials.front import TRADEOFF
-    from beamline.features.trials.launch import ComparedScan
     from beamline.features.trials.tradeoff import planned_tradeoff
-    from beamline.scan.energies import scans_of
 
-    context, files = click.get_current_context(), request.files
+    scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff", request.max_seconds)
+    plan = partial(planned_tradeoff, scan, depth="quick" if request.quick else "full")
+    _compare(scan, plan, dry=request.dry, as_json=request.as_json, begun=begun)
+
+
+def _compared(
+    request: TradeoffRequest | StudyRequest, methods: tuple[str, ...], folder: str, max_seconds: float | None = None
+) -> ComparedScan:
+    """The scan of a command, after its options were checked; `folder` is the usual one of its result."""
+    from beamline.features.trials.runner import ComparedScan
+
+    context, values = click.get_current_context(), request.values
     refuse_contradictions(context.command, names_given(context))
-    if request.spectra is None and len(files) > 1:
-        raise click.UsageError(f"A comparison of {len(files)} files {_OF_MATERIALS}")
-    folder = request.output or Path(f"{safe_name(files[0].stem)}_tradeoff")
-    with events_shown(request.as_json) as sink:
-        if request.spectra is not None:
-            files = scans_of(files, Warnings(sink, SystemClock()))
-        (source, selection), *others = (chosen(path, request.seed, request.values) for path in files)
-        every = (source, *(each for each, _ in others))
-        scans = None if request.spectra is None else EnergyScans(every, read_spectra(request.spectra))
-        scan = ComparedScan(
-            source, selection, folder, request.methods or (), request.truth,
-            light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds,
-            request.max_seconds, request.seed, repeating(context, files, folder),
-        )  # fmt: skip
-        plan = partial(
-            planned_tradeoff,
-            scan,
-            depth="quick" if request.quick else "full",
-            volumes=request.volumes or 0,
-            scans=scans,
-            states=names_in(request.states),
-        )
-    _compare(scan, TRADEOFF, plan, dry=request.dry, as_json=request.as_json, begun=begun)
+    source, selection = chosen(request.file, request.seed, values)
+    output = request.output or Path(folder)
+    return ComparedScan(
+        source, selection, output, methods, request.truth,
+        light_asked(values["photons_per_count"], values["dose_in"]), request.seconds, max_seconds, request.seed,
+        repeating(context, request.file, output),
+    )  # fmt: skip
 
 
-def _compare(
-    scan: ComparedScan, layout: TableLayout, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None
-) -> None:
+def _compare(scan: ComparedScan, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None) -> None:
     """Run a comparison and print its table, or print what it will take."""
-    from beamline.core.durations import MachineSpeed
-    from beamline.features.trials.layout import text
     from beamline.features.trials.runner import dry_run, run_comparison
+    from beamline.features.trials.table import page_of, text
 
     with answering(as_json) as answer:
         if dry:
-            expected = dry_run(plan, scan.folder, answer.warn, MachineSpeed())
-            answer.done(expected, *expected.lines())
+            facts, lines = dry_run(plan, scan.folder, answer.warn)
+            answer.done(facts, *lines)
             return
         table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
-        answer.lines = text(table, layout), f"\n{'report':<10}{scan.folder / layout.page}"
+        answer.lines = text(table), f"\n{'report':<10}{scan.folder / page_of(table)}"
     if table.stopped:
-        counts = f"{len(table.compared)} of {len(table.todo)} {layout.unit}"
-        raise ScanStopped(f"The {layout.name} was stopped after {counts}; their results are in {scan.folder}.")
+        counts = f"{len(table.compared)} of {len(table.todo)} trials"
+        raise ScanStopped(f"The {table.name} was stopped after {counts}; their results are in {scan.folder}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,23 +218,14 @@ def study(request: StudyRequest) -> None:
     with few views, flying and in steps, and each is compared with the truth.
 
     Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
-    the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
+    the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.features.trials.launch import ComparedScan
-    from beamline.features.trials.study import layout_of, planned_study
+    from beamline.features.trials.study import planned_study
 
-    methods = tuple(dict.fromkeys(request.methods))
-    context = click.get_current_context()
-    refuse_contradictions(context.command, names_given(context))
-    settings = row_settings(context.command, methods, dict(request.values))
-    source, selection = chosen(request.file, request.seed, request.values)
-    folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
-    scan = ComparedScan(
-        source, selection, folder, methods, request.truth,
-        light_asked(request.values["photons_per_count"], request.values["dose_in"]), request.seconds, seed=request.seed,
-        command=repeating(context, request.file, folder),
-    )  # fmt: skip
+    methods, command = tuple(dict.fromkeys(request.methods)), click.get_current_context().command
+    settings = row_settings(command, methods, dict(request.values))
+    scan = _compared(request, methods, f"{safe_name(request.file.stem)}_{request.which}")
     asked = STUDIES[request.which]
     plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
-    _compare(scan, layout_of(asked), plan, dry=request.dry, as_json=request.as_json)
+    _compare(scan, plan, dry=request.dry, as_json=request.as_json)

@@ -17,9 +17,10 @@ from beamline.config.load import load, plan_of, scene_mapping
 from beamline.core.errors import ConfigError
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
-from beamline.features.trials.launch import ComparedScan, TrialData, table_of
+from beamline.features.trials.runner import ComparedScan, table_of
 from beamline.features.trials.trial import TrialTable
 from beamline.features.trials.view_choices import DOSE, SCAN_TIME, ViewChoice
+from beamline.features.trials.worker import TrialData
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import axis_col_of, scene_of
 from beamline.projections.prepare import prepare_projections
@@ -122,11 +123,12 @@ class _Instrument:
         return prepared, ViewChoice(plan.label, views, facts=facts, arc=prepared.geometry.width.arc), truth
 
 
-def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, Sequence[ViewChoice]]:
+def taken_scans(scan: ComparedScan, title: str, warn: Warn) -> tuple[TrialData, TrialTable, Sequence[ViewChoice]]:
     """Scans by all plans as one set of views, with views held out that no plan took, and the views of each plan.
 
     Args:
         scan: its source is a configuration; a real instrument's is rehearsed.
+        title: of the table.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -171,7 +173,7 @@ def taken_scans(scan: ComparedScan, warn: Warn) -> tuple[TrialData, TrialTable, 
     prepared = joined([each for _, each, _ in taken])
     unseen = judge.projections.data, judge.geometry.seen_with(NO_WIDTH)
     data = TrialData(replace(prepared, held_out=unseen), truth)
-    return data, table_of(scan, {"configuration": str(scan.source.path)}, prepared), choices
+    return data, table_of(scan, "study", title, prepared, {"configuration": str(scan.source.path)}), choices
 
 
 def joined(parts: Sequence[PreparedProjections]) -> PreparedProjections:

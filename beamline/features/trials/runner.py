@@ -1,107 +1,166 @@
-"""Runner: runs each trial in a process of its own within the time there is, and writes the table; a dry run says how
-long that takes, by those that are done or by the work of each."""
+"""Runner: reads the scan once, runs each trial in a process of its own within the time there is, writes the table."""
 
 from __future__ import annotations
 
 import math
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-import numpy as np
 import psutil
 
-from beamline.core.durations import MachineSpeed
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
-from beamline.core.machine import Need, free_memory
+from beamline.core.events import Done, Event, Sink, TrialDone, TrialReached
+from beamline.core.files import refuse_existing, refuse_not_utf8
+from beamline.core.machine import machine
+from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.sinks import Warn, Warnings
-from beamline.core.text import count, size
-from beamline.features.trials.launch import DATA, ComparedScan, compile_kernels, run_trial, write_array
-from beamline.features.trials.layout import Plan, TableLayout, event_of, write_page, write_table
-from beamline.features.trials.trial import Outcome, Trial, TrialTable
+from beamline.core.text import size
+from beamline.features.trials.table import write_page, write_table
+from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
+from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.scan_statistics import LightAsked, light_in
+from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.scan_facts import facts_of
 from beamline.report.sheets import SliceSheet
+from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
 from recon.assess import metrics
-from recon.assess.time_model import duration_text
 from recon.base.arrays import F32
-from recon.base.geometry import Geometry
+from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
-from recon.base.work import Rates, costs_of, seconds_of
 from recon.methods import by_name
 
+COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
+_HELD_OUT_VIEWS = 16  # at most
 _PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
-_COMPILING = 0.5  # of the time left, at most: what is missing then is compiled by the trials, cheap ones first
-_SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the page shows
-
-
-Expected = Callable[[Trial], float | None]
-"""s of a trial; None: not known."""
-
-
-def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
-    """s that a trial on some of these views reconstructs, at most.
-
-    None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
-    """
-
-    @cache
-    def of_trial(trial: Trial) -> float | None:
-        limit, views = trial.seconds_asked, np.arange(trial.views)
-        if limit is not None and not by_name(trial.method).traits.own_length:
-            return limit
-        with suppress(ValueError):
-            method, coarse = (
-                trial.build(),
-                geometry.select(views * geometry.n_views // views.size).binned(trial.binning),
-            )
-            parts = [coarse.select(part) for part in np.array_split(views, trial.parts)]
-            if trial.halves:
-                parts += [coarse.select(slice(first, None, 2)) for first in (0, 1)]
-            costs = [costs_of(method, [(part, Grid.matching(part))]) for part in parts]
-            seconds = [seconds_of(each, rates).most for each in costs if each is not None]
-            return min(sum(seconds), limit or math.inf) if seconds else None
-        return None
-
-    return of_trial
-
-
-def trials_left(done: Sequence[Outcome], trials: Sequence[Trial], expected: Expected) -> float | None:
-    """s that the trials to come will take, from those done; None before the first.
-
-    Starting and measuring take the same time in each trial. The rest takes the expected time, scaled by how much longer
-    than expected the finished trials of its method took (or all finished trials). A trial without an expected time
-    takes as long as these did.
-    """
-    if not done:
-        return None
-    total = len(trials) * sum(each.wall - each.working for each in done) / len(done)
-    # a direct method is over too soon to tell how fast this machine is
-    pace = _pace([each for each in done if not by_name(each.trial.method).traits.direct], expected) or 1.0
-    for trial in trials:
-        same = [each for each in done if each.trial.method == trial.method and each.working > 0]
-        if trial.seconds_asked is not None:
-            total += trial.seconds_asked
-        elif (seconds := expected(trial)) is not None:
-            total += seconds * (_pace(same, expected) or pace)
-        else:
-            total += sum(each.working for each in same or done) / len(same or done)
-    return total
-
-
-def _pace(done: Sequence[Outcome], expected: Expected) -> float | None:
-    """What trials took over what was expected of them; None where nothing was."""
-    told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
-    return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None
 
 
 @dataclass(frozen=True)
-class _Rig:
+class ComparedScan:
+    """The scan of a trade-off or a study, and what holds for all of its reconstructions.
+
+    Attributes:
+        folder: for the results; must not exist.
+        methods: names in `recon.methods`; none: those that suit the comparison.
+        truth: FILE or FILE:first:end to compare with.
+        light: what the user knows of it; None: the dose is counted in frames.
+        seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
+        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
+            what remains is not begun, a running one is ended. None: no limit.
+        command: that repeats this, for the record.
+    """
+
+    source: SourceOptions
+    selection: Selection
+    folder: Path
+    methods: Sequence[str] = ()
+    truth: str | None = None
+    light: LightAsked | None = None
+    seconds: float | None = None
+    max_seconds: float | None = None
+    seed: int = 0
+    command: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Planned:
+    """What a comparison will do.
+
+    Attributes:
+        table: before any trial is done.
+        started: the event that announces it.
+        references: trials whose volumes others are compared with, in addition to the truth: each with those of its
+            method. Without a truth the first one has the dense and the empty regions.
+    """
+
+    data: TrialData
+    table: TrialTable
+    started: Event
+    references: tuple[Trial, ...] = ()
+
+
+Plan = Callable[[Warn], Planned]
+"""Reads and corrects the views of a scan, and says which trials to run. ConfigError, DataError: nothing was written."""
+
+
+def opened_scan(
+    asked: ComparedScan, name: str, title: str, warn: Warn, *, held_out: bool
+) -> tuple[TrialData, TrialTable]:
+    """Read and correct the views, after all inputs were checked; the table has no trials yet.
+
+    Args:
+        name, title: of the table.
+        held_out: views held out judge all trials where there is no truth.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    refuse_not_utf8(asked.source.path)
+    refuse_existing(asked.folder)
+    truth_given = None if asked.truth is None else read_truth(asked.truth)
+    with asked.source.open() as source:
+        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
+        prepared = prepare_projections(source, asked.selection, warn).without_warnings
+    if held_out and truth_given is None:
+        prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
+    truth = None
+    if truth_given is not None:
+        truth = fit_truth(truth_given, Grid.matching(prepared.geometry), asked.selection.binning).data
+    if light is not None:
+        facts["light"] = "; ".join(light.in_words())
+    table = replace(table_of(asked, name, title, prepared, facts), light=light)
+    return TrialData(prepared, truth), table if truth is None else replace(table, by="psnr")
+
+
+def table_of(
+    scan: ComparedScan, name: str, title: str, prepared: PreparedProjections, facts: dict[str, str]
+) -> TrialTable:
+    """A table without trials of these views; `facts` are of the scan, by name."""
+    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
+    return TrialTable(name, title, (), HELD_OUT, prepared.length_unit, machine(), known, scan.command)
+
+
+def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:
+    """Run one trial in a process of its own, which has ended when this returns or raises.
+
+    Args:
+        work: a folder with the data, `DATA`.
+        max_seconds: after which the process is killed.
+        keep: its volume [z, y, x] is written to the file `VOLUME` of the folder.
+
+    Raises:
+        DataError: the disk did not take the job or the volume: trials to come would fail, too.
+    """
+    event = dict[str, Any]()
+
+    def on_line(line: str) -> None:
+        nonlocal event
+        event = json_object(line) or event
+
+    dump(work / JOB, (trial, seed, keep))
+    ending, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line, seconds=max_seconds)
+    if event.pop("event", None) == "result":
+        return Outcome(trial, "done", **event)
+    if ending is ProcessEnd.OUT_OF_TIME:
+        return Outcome(trial, "out of time", message="ended: the time given with --max-seconds was over")
+    message = event.get("message", f"its process ended with code {code}" + (f": {reason}" if reason else ""))
+    if code == DataError.exit_code:
+        raise DataError(message)
+    return Outcome(trial, "failed", message=message)
+
+
+@dataclass(frozen=True)
+class _Run:
     """Where trials run, and how they report.
 
     Attributes:
@@ -111,28 +170,79 @@ class _Rig:
     """
 
     work: Path
+    folder: Path
     seed: int
     end: float
     now: Callable[[], float]
     emit: Callable[[Event], None]
-    expected: Expected
     slices: SliceSheet
 
-    @property
-    def seconds(self) -> float:
-        """That are left; inf: no limit."""
-        return self.end - self.now()
-
-    def run(self, trial: Trial, seconds: float, title: str = "") -> tuple[Outcome, F32 | None]:
-        """The outcome within so many seconds, and the volume [z, y, x] if its slice has a title and there is one."""
-        path, choice = self.work / "volume.npy", trial.choice
-        outcome = run_trial(trial, self.work, self.seed, seconds, keep=path if title else None)
-        if not (title and path.exists()):
+    def run(self, trial: Trial) -> tuple[Outcome, F32 | None]:
+        """The outcome within the time that remains, and the volume [z, y, x] of a trial that the page shows."""
+        path, shown = self.work / VOLUME, trial.group == "method"
+        outcome = run_trial(trial, self.work, self.seed, self.end - self.now(), keep=shown)
+        if not path.exists():
             return outcome, None
-        volume = np.load(path)
+        volume = load(path)
         path.unlink()
-        self.slices.add(title, volume, *(() if choice is None else (choice.family, trial.method)))
+        if trial.choice is None:
+            self.slices.add(by_name(trial.method).label, volume)
+        else:
+            self.slices.add(trial.label, volume, trial.choice.family, trial.method)
         return outcome, volume
+
+    def all(self, table: TrialTable) -> TrialTable:
+        """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
+
+        Raises:
+            KeyboardInterrupt: before any trial was done; nothing was written.
+        """
+        begin, todo, walls = self.now(), table.todo, dict[str, list[float]]()
+        try:
+            for n, index in enumerate(todo):
+                trial, started, whole = table.outcomes[index].trial, self.now(), table
+                expected, left = _mean(walls.get(trial.method, [])) or 0.0, self.end - started
+                if left <= expected:
+                    refusal = f"not begun: it would take about {expected:.0f} s, and {max(left, 0.0):.0f} s were left"
+                    table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
+                    continue
+                each = _mean([wall for some in walls.values() for wall in some])
+                eta = None if each is None else min(each * (len(todo) - n), left)
+                rate = 60 * n / max(started - begin, 1e-9)
+                self.emit(TrialReached(table.name, n, len(todo), trial.label, eta, rate))
+                table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
+                outcome, _ = self.run(trial)
+                walls.setdefault(trial.method, []).append(self.now() - started)
+                table = whole.with_outcome(index, outcome)
+                if table.compared:
+                    write_table(self.folder, table)
+                self.emit(_event_of(table, n + 1, len(todo), outcome))
+        except KeyboardInterrupt:
+            if not table.compared:
+                raise
+            table = replace(table, stopped=True)
+        write_table(self.folder, table)
+        return table
+
+
+def _mean(seconds: Sequence[float]) -> float | None:
+    return sum(seconds) / len(seconds) if seconds else None
+
+
+def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
+    """A trial that has ended, the n-th of so many; `gaussians` are those at its start, as in its settings."""
+    trial = outcome.trial
+    figures = {
+        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning")},
+        **trial.settings,
+        "cpu_seconds": outcome.cpu_seconds,
+        "gaussians_end": outcome.gaussians,
+        **outcome.metrics,
+    }
+    quality = outcome.quality(table.by)
+    return TrialDone(
+        n, of, trial.label, outcome.status, outcome.seconds, outcome.message, quality, outcome.peak_bytes, figures
+    )
 
 
 def run_comparison(
@@ -146,7 +256,7 @@ def run_comparison(
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
-    `stopped`. A folder without results is removed. The views lie in files of the folder while the trials run: this
+    `stopped`. A folder without results is removed. The views lie in a file of the folder while the trials run: this
     process does not keep them.
 
     Args:
@@ -166,76 +276,38 @@ def run_comparison(
 
     planned, slices = plan(Warnings(sink, clock)), SliceSheet()
     emit(planned.started)
-    table, layout, references, truth = planned.table, planned.layout, planned.references, planned.data.truth
-    expected = expected_seconds(planned.data.geometry, MachineSpeed())
+    data, table, references = planned.data, planned.table, planned.references
     with _result_folder(scan.folder) as work:
-        planned.data.save(work / DATA)
-        del planned
-        rig = _Rig(work, scan.seed, end, now, emit, expected, slices)
-        contrast = truth
-        for reference in references:
-            outcome, volume = rig.run(reference, rig.seconds, reference.title)
-            if volume is None:
-                raise DataError(f"{reference.title}, to compare with, failed: {outcome.message}. Nothing was written.")
-            write_array(work / DATA / f"reference.{reference.method}.npy", volume)
-            contrast = volume if contrast is None else contrast
-        if contrast is not None and "snr" in layout.figures:
-            with suppress(ValueError):  # it has no dense and empty regions
-                dense = metrics.kmeans_mask(metrics.sampled(contrast), rig.seed)
-                write_array(work / DATA / "data.regions.npy", dense)
-        if truth is not None:
-            slices.add("truth", truth)
-        emit(StateEntered("compiling", "Compiling kernels that are not in the cache"))
-        trials = [table.outcomes[n].trial for n in table.todo]
-        compile_kernels(trials, work, max(rig.seconds, 0.0) * _COMPILING)
-        table = _run_all(table, layout, rig, scan.folder)
-    write_page(scan.folder, table, layout, slices)
-    summary = {
-        "output": scan.folder,
-        layout.unit: len(table.todo),
-        "done": len(table.compared),
-        "stopped": table.stopped,
-    }
+        run = _Run(work, scan.folder, scan.seed, end, now, emit, slices)
+        dump(work / DATA, data)
+        if table.name == "study":
+            dump(work / DATA, _with_references(data, references, run))
+        if data.truth is not None:
+            slices.add("truth", data.truth)
+        del planned, data
+        table = run.all(table)
+    write_page(scan.folder, table, slices)
+    summary = {"output": scan.folder, "trials": len(table.todo), "done": len(table.compared), "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
 
-def _run_all(table: TrialTable, layout: TableLayout, rig: _Rig, folder: Path) -> TrialTable:
-    """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
+def _with_references(data: TrialData, references: Sequence[Trial], run: _Run) -> TrialData:
+    """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
 
     Raises:
-        KeyboardInterrupt: before any trial was done; nothing was written.
+        DataError: a reference could not be made.
     """
-    begin, timed, todo = rig.now(), list[Outcome](), table.todo
-    try:
-        for n, index in enumerate(todo):
-            trial, seconds = table.outcomes[index].trial, rig.seconds
-            if refusal := _no_time(trials_left(timed, [trial], rig.expected) or 0.0, seconds):
-                table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
-                continue
-            eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.expected)
-            rate = 60 * n / max(rig.now() - begin, 1e-9)
-            rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta and min(eta, seconds), rate))
-            started, whole = rig.now(), table
-            table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
-            outcome, _ = rig.run(trial, seconds, trial.title * (trial.group in _SHOWN))
-            timed.append(replace(outcome, wall=rig.now() - started))
-            table = whole.with_outcome(index, timed[-1])
-            if table.compared:
-                write_table(folder, table, layout)
-            rig.emit(event_of(table, layout, n + 1, len(todo), outcome))
-    except KeyboardInterrupt:
-        if not table.compared:
-            raise
-        table = replace(table, stopped=True)
-    write_table(folder, table, layout)
-    return table
-
-
-def _no_time(needed: float, remaining: float) -> str:
-    """Why a trial of so many seconds is not begun; empty: there is time."""
-    about = f"it would take about {needed:.0f} s, and only {remaining:.0f} s were left"
-    return "" if needed < remaining else f"not begun: {about if remaining > 0 else 'no time was left'}"
+    volumes, regions = dict[str, F32](), None
+    for reference in references:
+        outcome, volume = run.run(reference)
+        if volume is None:
+            raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
+        volumes[reference.method] = volume
+    contrast = data.truth if data.truth is not None else next(iter(volumes.values()))
+    with suppress(ValueError):  # it has no dense and empty regions
+        regions = metrics.kmeans_mask(metrics.sampled(contrast), run.seed)
+    return replace(data, references=volumes, regions=regions)
 
 
 @contextmanager
@@ -253,75 +325,30 @@ def _result_folder(folder: Path) -> Iterator[Path]:
             folder.rmdir()
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExpectedTrial(Need):
-    """What a trial will take, with the start of its process."""
-
-    label: str
-
-
-@dataclass(frozen=True)
-class ExpectedRun:
-    """What a comparison will take.
-
-    Attributes:
-        folder: that it would write.
-        disk, free: bytes for the views while it runs, and bytes on that disk.
-        allowed: bytes of memory that are free.
-    """
-
-    stage: str
-    folder: Path
-    trials: tuple[ExpectedTrial, ...]
-    disk: int
-    free: int
-    allowed: int
-
-    def lines(self) -> list[str]:
-        """For people."""
-        rows = [("trial", "s", "MB")]
-        for trial in self.trials:
-            seconds = "–" if trial.seconds is None else f"{trial.seconds:.3g}"
-            rows.append((trial.label, seconds, "–" if trial.memory is None else f"{trial.memory / 1e6:.0f}"))
-        width = max(len(label) for label, *_ in rows)
-        need, unknown = Need.in_turn(self.trials), sum(trial.seconds is None for trial in self.trials)
-        beside = f", beside {count(unknown, 'trial')} whose time is not known" if unknown else ""
-        return [
-            *(f"{label:<{width}}{seconds:>8}{memory:>8}" for label, seconds, memory in rows),
-            "",
-            f"{'trials':<10}{len(self.trials)}",
-            f"{'time':<10}about {duration_text(need.seconds or 0.0)}, with starts of processes{beside}",
-            f"{'memory':<10}{size(need.memory or 0)} in the largest process; {size(self.allowed)} are free",
-            f"{'disk':<10}{size(self.disk)} for the views meanwhile; {size(self.free)} free",
-            f"{'output':<10}{self.folder}: {self.stage}.csv, {self.stage}.json, page and pictures (not written now)",
-        ]
-
-
-def dry_run(plan: Plan, folder: Path, warn: Warn, rates: Rates) -> ExpectedRun:
-    """Plan a comparison; nothing is written, and nothing is run.
-
-    Args:
-        rates: of this machine.
+def dry_run(plan: Plan, folder: Path, warn: Warn) -> tuple[dict[str, Any], list[str]]:
+    """The trials of a comparison with the memory of each, as facts and as lines; nothing is written, and nothing run.
 
     Raises:
         ConfigError, DataError: the comparison would be refused.
     """
-    start, own_bytes = time.process_time(), int(psutil.Process().memory_info().rss)  # of a process that has begun
+    libraries = int(psutil.Process().memory_info().rss)
     planned = plan(warn)
     data, prepared = planned.data, planned.data.prepared
-    at_most = expected_seconds(data.geometry, rates)
-    arrays = (
-        prepared.projections.data, prepared.projections.weights, prepared.shares, data.truth,
-        prepared.held_out and prepared.held_out[0],
-    )  # fmt: skip
+    held_out = None if prepared.held_out is None else prepared.held_out[0]
+    arrays = (prepared.projections.data, prepared.projections.weights, data.truth, held_out)
     disk, weighted = sum(array.nbytes for array in arrays if array is not None), prepared.ray_factors() is not None
-
-    def expected(trial: Trial) -> ExpectedTrial:
-        coarse, works = data.geometry.binned(trial.binning), at_most(trial)
-        # of a process that has loaded the libraries, the views twice (in their file and those used), the rest
-        memory = own_bytes + 2 * disk + trial.build().memory(coarse, Grid.matching(coarse), weighted)
-        return ExpectedTrial(label=trial.label, seconds=None if works is None else start + works, memory=memory)
-
-    trials = [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]
+    needs = dict[str, int]()
+    for trial in [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]:
+        coarse = data.geometry.binned(trial.binning)
+        # the views twice: all of them, and those that the trial uses
+        needs[trial.label] = libraries + 2 * disk + trial.build().memory(coarse, Grid.matching(coarse), weighted)
     free = shutil.disk_usage(folder.absolute().parent).free
-    return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), disk, free, free_memory())
+    facts = {"trials": [{"label": label, "memory": memory} for label, memory in needs.items()], "disk": disk}
+    width = max(map(len, needs))
+    return {**facts, "output": folder}, [
+        *(f"{label:<{width}}  {size(memory):>9}" for label, memory in needs.items()),
+        "",
+        f"{'trials':<10}{len(needs)}; how long they take is said after the first",
+        f"{'disk':<10}{size(disk)} for the views meanwhile; {size(free)} free",
+        f"{'output':<10}{folder}: {planned.table.name}.csv, page and pictures (not written now)",
+    ]

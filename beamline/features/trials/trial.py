@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,10 +17,8 @@ from recon.methods import build, by_name, has_setting
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
-_NAMES = ("materials", "states")  # settings that are several names
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
-_WITH_HALVES = 3  # reconstructions of a trial with its half-set resolution
 _ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
@@ -33,10 +31,9 @@ class Trial:
         method: its name in `recon.methods`.
         views: how many, spread evenly over those of the scan, or as many as `choice` has.
         binning: of detector pixels, on top of the selection's.
-        settings: of the method, by name as `recon.methods.build` takes them; of names a text, with commas.
+        settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
-        parts: of the views, in time or by energy, each reconstructed by itself.
-        seconds_asked: after which a reconstruction ends; None: when its work is done.
+        seconds_asked: after which the reconstruction ends; None: when its work is done.
         choice: which views; None: `views` of them, evenly spread.
     """
 
@@ -44,15 +41,14 @@ class Trial:
     method: str
     views: int
     binning: int = 1
-    settings: Mapping[str, Plain | bool | None] = field(default_factory=dict, hash=False)
+    settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     halves: bool = False
-    parts: int = 1
     seconds_asked: float | None = None
     choice: ViewChoice | None = None
 
     @property
     def left_out(self) -> bool:
-        """The scan has not the views that it asks for."""
+        """The scan does not have the views that it asks for."""
         return self.choice is not None and self.choice.groups is None
 
     @property
@@ -62,7 +58,7 @@ class Trial:
 
     @property
     def facts(self) -> Mapping[str, float]:
-        """On how its views were taken, by heading."""
+        """How its views were taken, by heading."""
         return {} if self.choice is None else self.choice.facts
 
     def build(self) -> Method:
@@ -72,15 +68,14 @@ class Trial:
             ValueError: for a method or a setting that there is not.
         """
         method, seconds = by_name(self.method), self.seconds_asked
-        settings = {name: str(value).split(",") if name in _NAMES else value for name, value in self.settings.items()}
-        return build(method, {**settings, **({} if seconds is None else ended_by_time(method, seconds))})
+        return build(method, {**self.settings, **({} if seconds is None else _ended_by_time(method, seconds))})
 
     def in_time(self, seconds: float | None) -> Trial:
-        """The trial, to end when its seconds are over, if any; a direct method takes what it takes."""
+        """The trial, to end after these seconds, if any; a direct method takes what it takes."""
         method = by_name(self.method)
         if seconds is None or method.traits.direct:
             return self
-        by_time = ended_by_time(method, seconds)
+        by_time = _ended_by_time(method, seconds)
         kept = {name: value for name, value in self.settings.items() if name not in by_time}
         return replace(self, settings=kept, seconds_asked=seconds)
 
@@ -91,34 +86,12 @@ class Trial:
             return f"{self.choice.label}: {self.method}"
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
-        parts += [f"{self.parts} parts"] if self.parts > 1 else []
         parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
-        return ", ".join([*parts, *self._settings_in_words])
-
-    @property
-    def _settings_in_words(self) -> list[str]:
-        return [words for name, value in self.settings.items() if (words := _in_words(name, value))]
-
-    @property
-    def title(self) -> str:
-        """Of its slice in a picture."""
-        if self.choice is not None:
-            return self.label
-        if self.group == "method":
-            return by_name(self.method).label
-        parts = [f"{self.parts} parts"] if self.parts > 1 else []
-        return ", ".join(
-            [self.method, *parts, *(self._settings_in_words if by_name(self.method).traits.several else [])]
-        )
-
-    def as_record(self) -> dict[str, Any]:
-        """Plain values for a table, JSON or an event."""
-        record = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "choice"}
-        return {**record, **record.pop("settings"), "label": self.label}
+        return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
 
 
-def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
-    """The settings with which so many seconds, and nothing else, end a run of the method; see `Traits.own_length`."""
+def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
+    """The settings with which a time, and nothing else, ends a run of the method; see `Traits.own_length`."""
     if method.traits.own_length:
         return {}
     lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
@@ -128,9 +101,6 @@ def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
 _WORDS: Mapping[str, Callable[[Any], str]] = {
     "steps": lambda n: f"{n} steps",
     "gaussians": lambda n: f"{n / 1000:.3g}k Gaussians" if isinstance(n, int) and n >= 1000 else f"{n} Gaussians",
-    "volumes": lambda n: f"{n} volumes",
-    "states": lambda names: "smooth share",
-    "materials": lambda names: "",
     "iterations": lambda n: count(n, "iteration"),
     "fit.loss": lambda name: f"{name} loss",
     "fit.ssim_weight": lambda weight: f"ssim_weight {weight}" if weight else "no SSIM",
@@ -138,17 +108,11 @@ _WORDS: Mapping[str, Callable[[Any], str]] = {
 }
 
 
-def _in_words(name: str, value: Plain | None) -> str:
+def _in_words(name: str, value: Plain) -> str:
     return _WORDS[name](value) if name in _WORDS else f"{name.rsplit('.', 1)[-1]} {value}"
 
 
 HELD_OUT = "residual_held_out"
-QUALITIES = {
-    "psnr": ("PSNR", "PSNR (dB)"),
-    "psnr_all": ("PSNR", "PSNR (dB)"),
-    HELD_OUT: ("−20 log₁₀ of the held-out residual", "held-out residual (dB below the data)"),
-}
-"""The measures that trials are compared by, in words and as the label of an axis, by the name of the metric."""
 
 
 @dataclass(frozen=True)
@@ -158,16 +122,12 @@ class Outcome:
     Attributes:
         status: only "done" comes with figures.
         seconds: wall time of the reconstruction, without compilation and measuring.
-        peak_bytes: of its process; None where the system does not tell.
+        peak_bytes: of its process; None where the system does not say.
         metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), and with a reference psnr_all,
             ssim_all, snr, cnr; by name.
         gaussians: in the model at the end; None for voxel methods.
-        curve: (seconds, dB) of its own record of the residual.
-        curve_of: which views that record is of, in words.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         squared_residuals: of each view held out.
-        reached: how far it came, such as "212 steps, 8 sweeps"; empty for a direct method.
-        wall: s, from before its process began to after its end.
     """
 
     trial: Trial
@@ -176,56 +136,16 @@ class Outcome:
     peak_bytes: int | None = None
     metrics: Mapping[str, float] = field(default_factory=dict)
     gaussians: int | None = None
-    curve: Sequence[tuple[float, float]] = ()
-    curve_of: str = ""
     message: str = ""
     cpu_seconds: float = math.nan
     squared_residuals: Sequence[float] = ()
-    reached: str = ""
-    wall: float = math.nan
-
-    @property
-    def working(self) -> float:
-        """s of `wall` that grow with the work, half-set resolution included; 0 without figures."""
-        seconds = self.seconds * (_WITH_HALVES if self.trial.halves else 1)
-        return min(self.wall, seconds) if math.isfinite(seconds) else 0.0
 
     def quality(self, by: str) -> float:
-        """dB, more is better, by the metric of this name, of `QUALITIES`; NaN where it is not known."""
+        """dB, more is better, by the metric of this name; NaN where it is not known."""
         value = self.metrics.get(by, math.nan)
         if by != HELD_OUT:
             return value
         return -20 * math.log10(value) if value > 0 else math.nan
-
-    def as_record(self) -> dict[str, Any]:
-        """Plain values for a table or JSON."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"trial": self.trial.as_record()}
-
-
-@dataclass(frozen=True)
-class TrialCost:
-    """A cost of a trial, and how a picture shows it.
-
-    Attributes:
-        name: in file names; `words`: in titles and captions.
-        axis: label with its unit; `scale`: from the value to that unit; `unit`: alone.
-        of: the cost of an outcome; NaN where it is not known.
-    """
-
-    name: str
-    words: str
-    axis: str
-    scale: float
-    of: Callable[[Outcome], float]
-    unit: str
-
-
-TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds, "s")
-MEMORY = TrialCost(
-    "memory", "memory", "peak memory of the process (MB)", 1e-6,
-    lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
-    "MB",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -233,21 +153,27 @@ class TrialTable:
     """All trials of a scan, with the scan and the machine that they ran on.
 
     Attributes:
+        name: of the command: tradeoff or study.
+        title: of the page.
         outcomes: in the order of the plan, also of trials that are left out.
-        by: the measure of quality, of `QUALITIES`.
+        by: the metric of quality: psnr, psnr_all or residual_held_out.
         length_unit: of the resolution, "mm" or "px".
         scan: facts for people, by name.
+        question: that the table answers; empty: none.
         stopped: it was interrupted before all trials were done.
         light: of a frame; None: the dose is counted in frames.
         notes: sentences on what the figures mean.
     """
 
+    name: str
+    title: str
     outcomes: tuple[Outcome, ...]
     by: str
     length_unit: str
     machine: Mapping[str, str | int]
     scan: Mapping[str, str]
     command: str
+    question: str = ""
     stopped: bool = False
     light: Light | None = None
     notes: Sequence[str] = ()
@@ -255,16 +181,6 @@ class TrialTable:
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         """The table with this outcome in place of the one of this number."""
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
-
-    @property
-    def dose(self) -> TrialCost:
-        """The dose as a cost. Each frame of the scan that several views share is counted once."""
-        light, scale, axis, unit = self.light, 1.0, "dose: frames that were exposed", "frames"
-        if light is not None and light.gray is None:
-            scale, axis, unit = light.photons, "photons a pixel in the open beam", "photons"
-        elif light is not None and light.gray is not None:
-            scale, axis, unit = light.gray, f"dose in {light.material} (Gy)", "Gy"
-        return TrialCost("dose", "dose", axis, scale, lambda outcome: float(outcome.trial.frames), unit)
 
     @property
     def compared(self) -> tuple[Outcome, ...]:
@@ -276,19 +192,25 @@ class TrialTable:
         """Numbers of the trials that are not left out."""
         return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
 
-    def front(self, cost: TrialCost) -> list[Outcome]:
-        """The trials that no other one beats, by rising cost, and so by rising quality; of equal ones the first.
+    @property
+    def metrics(self) -> set[str]:
+        """Names of the figures that any row has."""
+        return {name for outcome in self.outcomes for name in outcome.metrics}
 
-        A trial is beaten by one of at most its cost and at least its quality. Costs are compared to 1 %: smaller
-        differences between two trials are chance. A trial that costs more is on the front where its gain is above
+    @property
+    def front(self) -> list[Outcome]:
+        """The trials that no other one beats, by rising time, and so by rising quality; of equal ones the first.
+
+        A trial is beaten by one of at most its time and at least its quality. Times are compared to 1 %: smaller
+        differences between two trials are chance. A trial that takes longer is on the front where its gain is above
         `chance`.
         """
-        kept: list[Outcome] = []
-        known = [o for o in self.compared if math.isfinite(cost.of(o)) and math.isfinite(o.quality(self.by))]
-        for each in sorted(known, key=lambda o: (rounded(cost.of(o)), -o.quality(self.by))):
-            if not kept or each.quality(self.by) - kept[-1].quality(self.by) > self.chance(each, kept[-1]):
-                kept.append(each)
-        return kept
+        front: list[Outcome] = []
+        known = [o for o in self.compared if math.isfinite(o.seconds) and math.isfinite(o.quality(self.by))]
+        for each in sorted(known, key=lambda o: (_rounded(o.seconds), -o.quality(self.by))):
+            if not front or each.quality(self.by) - front[-1].quality(self.by) > self.chance(each, front[-1]):
+                front.append(each)
+        return front
 
     def chance(self, one: Outcome, other: Outcome) -> float:
         """dB between two trials that chance may reach.
@@ -303,8 +225,30 @@ class TrialTable:
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
+    def record(self, outcome: Outcome) -> dict[str, Any]:
+        """A row of the CSV: all that is known of a trial, by name; None where it is known of another row only."""
+        trial = outcome.trial
+        every = [each.trial for each in self.outcomes]
+        values: dict[str, Any] = {
+            "row": trial.label if trial.choice is None else trial.choice.label,
+            **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "frames")},
+            "window": 1 if trial.choice is None else trial.choice.window,
+            **{name: trial.settings.get(name) for each in every for name in each.settings},
+            **({} if self.light is None else self.light.of(trial.frames)),
+            **{name: trial.facts.get(name) for each in every for name in each.facts},
+            "status": outcome.status,
+            "seconds_asked": trial.seconds_asked,
+            **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
+            "gaussians_end": outcome.gaussians,
+            **{name: outcome.metrics.get(name) for name in sorted(self.metrics)},
+            "quality_db": outcome.quality(self.by),
+            "message": outcome.message,
+        }
+        unknown = [name for name, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
+        return values | dict.fromkeys(unknown)
 
-def rounded(cost: float) -> float:
+
+def _rounded(cost: float) -> float:
     """The cost rounded to steps of 1 %, so that smaller differences count as equal."""
     if not cost > 0 or math.isinf(cost):
         return cost

@@ -1,9 +1,7 @@
-"""One trial in a process of its own, so that its peak memory is its own.
+"""The data that all trials of a scan share, and one trial in a process of its own, so that its peak memory is its own.
 
-`python -m beamline.features.trials.worker JOB` reads the job and its arrays, and prints the result as JSON. A job may
-also be to compile what trials will need, once for all of them: compiling takes memory that would otherwise count as
-the first trial's. Its stdin is a pipe that nothing is written to: when it ends, the parent process has ended, and this
-one ends, too.
+`python -m beamline.features.trials.worker FOLDER` reads the data and the job in the folder, and prints the result as
+JSON. Its stdin is a pipe that nothing is written to: it ends with the parent process, and so does this one.
 """
 
 from __future__ import annotations
@@ -11,38 +9,110 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import sys
 import time
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
+from beamline.core.files import named_on_failure
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
-from beamline.features.trials.launch import JOB, TrialData, VolumeAt, averaged, by_parts, write_array
 from beamline.features.trials.trial import Trial
+from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import binned, run_on
-from beamline.report.history import history_arrays, residual_curve
 from recon.assess import metrics
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.features.trials import fourier_shell_correlation, soft_cylinder
+from recon.prep.counts import weighted_lines
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution
 from recon.warm_up import warm_up
+
+DATA, JOB, VOLUME = "data", "job", "volume"
+"""Files of a folder of trials: the `TrialData`; trial, seed and whether to write the volume; that volume [z, y, x]."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrialData:
+    """What every trial of a scan shares.
+
+    Attributes:
+        prepared: the views that may be used, and those that no trial uses as its views held out, without what the
+            monitor says of views: trials are compared by all rays with the same weight.
+        truth: the volume [z, y, x] on Grid.matching(geometry).
+        references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
+        regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
+    """
+
+    prepared: PreparedProjections
+    truth: F32 | None
+    references: Mapping[str, F32] = field(default_factory=dict)
+    regions: NDArray[np.int8] | None = None
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of the views that may be used."""
+        return self.prepared.geometry
+
+
+def dump(path: Path, value: object) -> None:
+    """Write a value for another process of this program; of the views of a `TrialData` what their use needs.
+
+    Raises:
+        DataError: the disk did not take it.
+    """
+    if isinstance(value, TrialData):
+        bare = replace(value.prepared, axis=None, flags=None, done={}, laws={}, recorded={})
+        value = replace(value, prepared=bare)
+    with named_on_failure(path), path.open("wb") as file:
+        pickle.dump(value, file, protocol=5)
+
+
+def load(path: Path) -> Any:
+    """What `dump` of the same program wrote."""
+    with path.open("rb") as file:
+        return pickle.load(file)  # noqa: S301 - of this program's own temporary folder
+
+
+def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
+    """The views of a row of a study, each the mean of a window of views.
+
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
+    of an emission are added. A ray weighs as the least of its window.
+    """
+    groups = np.array(choice.groups)
+    middle = prepared.of_views(groups[:, choice.window // 2])
+    if choice.window == 1 and prepared.emission is None:
+        return middle
+    angles = prepared.geometry.angles[groups].mean(axis=1)
+    angles.setflags(write=False)
+    geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
+    emission = None if prepared.emission is None else prepared.emission.summed(groups, geometry)
+    weights: F32 | None = whole.weights
+    if emission is not None:
+        lines, weights = weighted_lines(emission)
+    else:
+        lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
+        weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
+    means = replace(middle.projections, data=lines, weights=weights)
+    return replace(middle, projections=means, geometry=geometry, emission=emission)
 
 
 def run(
@@ -51,83 +121,67 @@ def run(
     seed: int,
     now: Callable[[], float] = time.perf_counter,
     cpu: Callable[[], float] = time.process_time,
-    keep: Path | None = None,
-) -> dict[str, Any]:
-    """Make a trial's reconstruction and measure it; the fields of an Outcome.
-
-    Args:
-        keep: a .npy file to leave the volume in; None: it is measured and forgotten.
+) -> tuple[dict[str, Any], F32]:
+    """Make a trial's reconstruction and measure it: the fields of an Outcome, and the volume [z, y, x].
 
     Raises:
         ValueError: the reconstruction refuses these settings.
-        DataError: the disk did not take the volume.
     """
-    if trial.choice is not None:
-        prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
-        if arc := trial.choice.arc:
-            views = prepared.geometry
-            prepared = replace(prepared, geometry=views.seen_with(replace(views.width, arc=arc), views.skew))
-    else:
-        angles, period = data.geometry.angles, data.geometry.period
-        prepared = data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
-    grid, result, judged, warned = Grid.matching(data.geometry), None, None, list[warnings.WarningMessage]()
+    prepared = _views_of(trial, data)
+    grid = Grid.matching(data.geometry)
     warm_up(trial.build(), data.geometry)  # so that compilation is in no trial's time
     reset_peak_memory()
-    before, began = cpu(), now()
-    if trial.parts > 1:
-        volume_at = by_parts(trial.parts, data, lambda part: _alone(trial, part, grid, seed))
-    else:
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always", UserWarning)
-            result = reconstruct(trial, prepared, grid, seed, now)
-        one = on_grid(result.volume, grid).data
-        volume_at = result.at or (lambda view: one)
-        judged = residual_curve(history_arrays(result.history))
-    cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
-    peak = peak_memory()  # before measuring, which has needs of its own
-    figures, squared = measured(trial.method, volume_at, data, grid, keep)
+    before = cpu()
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
+        result = _reconstruct(trial, prepared, grid, seed, now)
+    volume = on_grid(result.volume, grid).data
+    cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
+    figures, squared = measured(trial.method, volume, data, grid)
     if trial.halves and trial.views >= 4:
-        figures["resolution"] = half_set_resolution(trial, prepared, grid, seed)
+        figures["resolution"] = _half_set_resolution(trial, prepared, grid, seed)
     return {
-        "seconds": seconds,
+        "seconds": result.seconds,
         "cpu_seconds": cpu_seconds,
         "peak_bytes": peak,
         "metrics": {name: float(value) for name, value in figures.items()},
-        "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
+        "gaussians": None if result.gaussians is None else result.gaussians.n,
         "squared_residuals": squared,
-        "curve": [] if judged is None else np.transpose(judged.decibels).tolist(),
-        "curve_of": "" if judged is None else judged.views,
-        "reached": "" if result is None else reached(result),
         "message": "; ".join(dict.fromkeys(str(one.message) for one in warned)),
-    }
+    }, volume
 
 
-def measured(
-    method: str, volume_at: VolumeAt, data: TrialData, grid: Grid, keep: Path | None
-) -> tuple[dict[str, float], list[float]]:
-    """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
-    n, figures, squared = data.geometry.n_views, dict[str, float](), list[float]()
-    middle = volume_at(float(np.sort(data.shown)[n // 2]))
-    if keep is not None:
-        write_array(keep, middle)
+def _views_of(trial: Trial, data: TrialData) -> PreparedProjections:
+    if trial.choice is None:
+        angles, period = data.geometry.angles, data.geometry.period
+        return data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
+    prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
+    if not trial.choice.arc:
+        return prepared
+    views = prepared.geometry
+    return replace(prepared, geometry=views.seen_with(replace(views.width, arc=trial.choice.arc), views.skew))
+
+
+def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dict[str, float], list[float]]:
+    """Figures of the volume [z, y, x], and the squared residual of each view held out."""
+    figures, squared = dict[str, float](), list[float]()
     if data.truth is not None:
-        figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
+        figures = {"psnr": metrics.psnr(data.truth, volume), "ssim3d": metrics.ssim3d(data.truth, volume)}
         if data.prepared.emission is not None:
-            figures |= metrics.contrast(data.truth, middle)
+            figures |= metrics.contrast(data.truth, volume)
     if (reference := data.references.get(method)) is not None:
-        figures["psnr_all"] = metrics.psnr(reference, middle)
-        figures["ssim_all"] = metrics.ssim3d(reference, middle)
+        figures["psnr_all"] = metrics.psnr(reference, volume)
+        figures["ssim_all"] = metrics.ssim3d(reference, volume)
     if data.regions is not None:
-        figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
+        figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(volume), data.regions)
     if data.prepared.held_out is not None:
         unseen, geometry = data.prepared.held_out
         rays = data.prepared.ray_weights(geometry.n_views)
-        of_view = np.zeros(geometry.n_views) if data.shown_held_out is None else data.shown_held_out
         left, own = squares_left(
-            shown(volume_at, of_view, geometry, grid),
+            project(Volume(volume, grid), geometry),
             unseen,
             ViewResolution.of(geometry, grid),
-            None if rays is None else np.asarray(rays[n:] > 0),
+            None if rays is None else np.asarray(rays[data.geometry.n_views :] > 0),
         )
         if not own.any():
             raise ValueError("all held-out views are zero, so no residual can be computed")
@@ -136,30 +190,17 @@ def measured(
     return figures, squared
 
 
-def _alone(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> F32:
-    """The volume [z, y, x] of these views alone, with no view held out."""
-    result = reconstruct(trial, replace(prepared, held_out=None), grid, seed)
-    return on_grid(result.volume, grid).data
-
-
-def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
-    """Line integrals [view, row, col] of the volume that each view shows, by its time or the number of its energy."""
-    lines = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
-    for key in np.unique(of_view):
-        at = np.flatnonzero(of_view == key)
-        lines[at] = project(Volume(volume_at(float(key)), grid), geometry.select(at))
-    return lines
-
-
-def half_set_resolution(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> float:
+def _half_set_resolution(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> float:
     """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
-    geometry = prepared.geometry
+    geometry, volumes = prepared.geometry, list[F32]()
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    even, odd = (_alone(trial, prepared.of_views(np.sort(order[n::2])), grid, seed) for n in (0, 1))
-    return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
+    for first in (0, 1):
+        half = replace(prepared.of_views(np.sort(order[first::2])), held_out=None)
+        volumes.append(on_grid(_reconstruct(trial, half, grid, seed).volume, grid).data)
+    return fourier_shell_correlation(volumes[0], volumes[1], grid.spacing, soft_cylinder(grid.shape)).resolution_mm
 
 
-def reconstruct(
+def _reconstruct(
     trial: Trial,
     prepared: PreparedProjections,
     grid: Grid,
@@ -168,22 +209,13 @@ def reconstruct(
 ) -> Reconstruction:
     """The volume of a trial, as every command makes one; it ends when the trial's seconds, if any, are over.
 
-    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel.
+    A model without voxels fills `grid` from binned views, too; others have one voxel a binned pixel.
     """
     method, views = trial.build(), binned(prepared, trial.binning)
     target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(views.geometry)
     control = RunControl(now=now)
     in_time = control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
     return run_on(method, views, target, seed, in_time)
-
-
-def reached(result: Reconstruction) -> str:
-    """Steps or iterations done, and sweeps on voxels after a fit; empty for a direct method."""
-    if not result.history:
-        return ""
-    word = next((each for each in ("iteration", "sweep") if f"{each}s" in result.settings), "step")
-    done = [(result.history[-1].step, word), (result.settings.get("finish", 0), "sweep")]
-    return ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in done if n or word != "sweep")
 
 
 def on_grid(volume: Volume, grid: Grid) -> Volume:
@@ -196,17 +228,14 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
     return Volume(data, grid)
 
 
-def main(job: Path) -> int:
-    """Do the `TrialJob` in the file `job`, and print an event; the exit code."""
-    work, code = JOB.validate_json(job.read_bytes()), 0
+def main(folder: Path) -> int:
+    """Do the job in the folder, and print an event; the exit code."""
+    (trial, seed, keep), code = load(folder / JOB), 0
     try:
-        data = TrialData.load(work.data)
-        for trial in work.compiled:
-            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                warm_up(trial.build(), data.geometry)
-        if work.trial is None:
-            return 0
-        event = {"event": "result", **run(work.trial, data, work.seed, keep=work.keep)}
+        fields, volume = run(trial, load(folder / DATA), seed)
+        if keep:
+            dump(folder / VOLUME, volume)
+        event = {"event": "result", **fields}
     except (ValueError, DataError) as error:  # DataError: the disk
         code = error.exit_code if isinstance(error, DataError) else 1
         event = {"event": "failed", "message": str(error)}

@@ -21,7 +21,6 @@ from beamline.storage.readers.stated import (
     EXCHANGE_LENGTH_UNITS,
     EXCHANGE_TIME_UNITS,
     in_use,
-    not_copied,
     stated_in,
 )
 from drivers.base.frame import FrameKind
@@ -62,7 +61,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
-        source.not_used = not_copied(file, TEXTS.values()) + stated_in(EXCHANGE, file, source)
+        source.not_used = stated_in(EXCHANGE, file, source)
         source.used = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:

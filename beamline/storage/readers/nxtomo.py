@@ -42,7 +42,7 @@ from beamline.storage.readers.nexus import (
     read_geometry,
     require_order,
 )
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, stated_in
 from beamline.storage.structure import drawn_on
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
@@ -102,7 +102,6 @@ class NXtomoSource(ScanSource):
             self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
-            self.not_used = not_copied(places.entry, TEXTS.values())
             if self._geometry is not None:
                 self._find_stated(found if data is None else [], self._geometry.turned)
                 self.energies, self.currents = read_energies(places.entry, self.n), self._currents()

@@ -7,7 +7,7 @@ and that nobody uses; `info` shows them, and `validate` warns where such a value
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +64,7 @@ def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
     unused = []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
-        if item is None or item.size == 0 or datasets.is_foreign(item):
+        if item is None or item.size == 0:
             continue
         if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
@@ -130,21 +130,6 @@ def _unknown_fields(fields: Sequence[Entry], root: h5py.Group, source: ScanSourc
 def _place(item: h5py.Dataset) -> tuple[int, int]:
     known = h5py.h5o.get_info(item.id)
     return known.fileno, known.addr
-
-
-def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
-    """The texts stored in another file without images, which are not copied."""
-    items = [(where, datasets.dataset(root, where)) for where in texts]
-    return tuple(
-        NotUsed(
-            where,
-            f"in the file {datasets.file_of(item)}",
-            "that holds no images, and its text is not a scan's",
-            True,
-        )
-        for where, item in items
-        if item is not None and datasets.is_foreign(item)
-    )
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:

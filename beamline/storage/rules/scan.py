@@ -16,8 +16,8 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angle_order import angles_shown
 from beamline.storage.rules.angles import angles_known, angles_spread
+from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.exposures import one_energy
 from beamline.storage.rules.light import exposures_agree, views_scaled
 from beamline.storage.rules.unlit import light_one

@@ -26,7 +26,6 @@ from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.disk_file import ToDisk
 from beamline.storage.flag_legend import mark_of, place_of
-from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
@@ -36,9 +35,9 @@ from beamline.storage.writers.rows import (
     Record,
     Rows,
     ScanEnding,
+    put_exchange_view,
     state_ending,
     state_words,
-    with_exchange_view,
 )
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame
@@ -206,7 +205,7 @@ class NXtomoWriter:
         """Finish the file: how and when the scan ended, then `finished`, then the /exchange view. A second call does
         nothing.
 
-        After a failed write the file only gets status "failed" and `finished`, and is not closed.
+        After a failed write the file only gets status "failed" and `finished`, and keeps the mark of a writer.
 
         Args:
             status, missing, reason: see ScanEnding.
@@ -264,7 +263,7 @@ class NXtomoWriter:
         self._to_disk.finish(self._committed)
         try:
             self._file.close()
-            if (head := superblock(self.path)) is None or not head.intact or head.missing:
+            if (head := superblock(self.path)) is None or head.missing:
                 raise _TouchedError(errno.EIO, "its content was changed")
         except FAILURES:
             self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
@@ -280,8 +279,10 @@ class NXtomoWriter:
             self._last[layout.FINISHED][()] = 1
             for path in (layout.REASON, layout.STATUS, layout.FINISHED):
                 self._last[path].flush()
-        finally:
-            hdf5.never_close(self._file)
+        finally:  # HDF5 would write once more what the disk did not take, now and at the end of the process
+            with Path(os.devnull).open("r+b") as nowhere, suppress(*FAILURES):
+                os.dup2(nowhere.fileno(), self._handle)
+                self._file.close()
 
     def _require_untouched(self) -> None:
         """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
@@ -328,7 +329,7 @@ class NXtomoWriter:
             )
             return
         try:
-            with_exchange_view(Overlay(self.path)).carry_out()
+            put_exchange_view(self.path)
         except DataError as error:
             self.remarks.append(
                 f"{self.path} has no /exchange view: {error} Its {self._committed} frames are safe in /entry; "

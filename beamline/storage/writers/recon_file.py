@@ -202,13 +202,13 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
         series = VolumeSeries(np.asarray(data["time"][:]), stored)
         stored = series.each()[at]
     grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
-    parameters = {name: _own_value(node) for name, node in process["parameters"].items()}
+    parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
         volume=Volume(stored, grid),
         length_unit=str(data["x"].attrs["units"]),
         raw_file=str(parameters.pop("raw_file")),
-        title=str(_own_value(entry["title"])),
-        sample=str(_own_value(entry["sample/name"])),
+        title=str(value_of(entry["title"])),
+        sample=str(value_of(entry["sample/name"])),
         time=datetime.fromisoformat(str(value_of(process["date"]))).timestamp(),
         parameters=parameters,
         metrics={name: float(datasets.values_of(node)) for name, node in process["metrics"].items()},
@@ -223,10 +223,6 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
 def _pitch(axis: NDArray[np.floating]) -> float | None:
     """From voxel to voxel; None of one voxel."""
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
-
-
-def _own_value(node: h5py.Dataset) -> Value:
-    return "" if datasets.is_foreign(node) else value_of(node)
 
 
 def value_of(node: h5py.Dataset, most: float = datasets.BRIEF) -> Value:

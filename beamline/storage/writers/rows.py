@@ -9,9 +9,11 @@ without a copy.
 from __future__ import annotations
 
 import math
+import shutil
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -19,14 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import size
 from beamline.monitor.checks import ALARMS
 from beamline.monitor.digest import FrameDigest
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark
-from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
+ROOM = 2**24  # bytes on the disk, far more than the /exchange view takes
 PER_FLUSH = 64  # rows that are written before a flush where nobody reads yet
 
 _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED])
@@ -196,10 +199,7 @@ def add_exchange_view(file: h5py.File) -> None:
     """Add to /exchange the rows recorded so far. Kinds without a frame get no dataset; invalid frames are omitted."""
     source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
     units = file["/entry/record/quantity"].asstr()[()]
-    there = {*group}  # of a recovery that was stopped
     for name, rows in _rows(file).items():
-        if {name, THETA[name]} <= there:
-            continue
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)
         filled = 0
         for first, last in datasets.runs(rows):
@@ -217,21 +217,19 @@ def has_exchange_view(file: h5py.File) -> bool:
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 
-def with_exchange_view(overlay: Overlay) -> Overlay:
-    """A closed scan file with the view, as an overlay still to be written.
-
-    What changes are the group, which frames do not hang on, and the head; all else is added at the end.
+def put_exchange_view(path: Path) -> None:
+    """Add the view to a closed scan file. No block that frames hang on is written.
 
     Raises:
-        DataError: the file cannot be read.
+        DataError: the disk does not take it, or has less than ROOM free.
     """
-    made = overlay.copy()
+    if (free := shutil.disk_usage(path.parent).free) < ROOM:
+        raise DataError(f"{path}: its disk has {size(free)} free, of {size(ROOM)} for the view. Nothing was changed.")
     try:
-        with h5py.File(made, "r+", libver=layout.LIBVER) as file:
+        with hdf5.changed(path, layout.LIBVER) as file:
             add_exchange_view(file)
     except hdf5.ALTERED as error:
-        raise DataError(f"{made.path} does not take the view ({hdf5.reason(error)}). Nothing was changed.") from error
-    return made
+        raise DataError(f"{path} does not take the view ({hdf5.reason(error)}).") from error
 
 
 def _rows(file: h5py.File) -> dict[str, NDArray[np.intp]]:

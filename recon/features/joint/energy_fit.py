@@ -15,6 +15,7 @@ from recon.base.decisions import Decisions
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry, require_views
 from recon.base.volume import Grid
+from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
 from recon.voxels.field_edges import busiest_rows, slab_of
@@ -23,6 +24,7 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
+_ROUNDS = 6  # of power iteration
 _LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
 _NOTHING = 1e-20  # singular value of materials that attenuate nothing
 
@@ -125,6 +127,7 @@ class EnergyFit:
     """The volumes of `fit_materials`, and the steps of the fit.
 
     Attributes:
+        motion: of the volume at each energy; None: it does not move.
         z: float32 [component, y, x, z].
         subsets: of the views; each has all energies.
         _to, _back: from densities to components, and back.
@@ -136,6 +139,7 @@ class EnergyFit:
     views: EnergyViews
     grid: Grid
     rng: np.random.Generator
+    motion: Motion | None = None
     stop: Callable[[], bool] = lambda: False
     z: F32 = field(init=False)
     subsets: list[list[_Part]] = field(init=False)
@@ -166,9 +170,35 @@ class EnergyFit:
             )
         nz, ny, nx = self.grid.shape
         self.z = np.zeros((values.size, ny, nx, nz), np.float32)
+        if self.motion is not None:
+            self.move(self.motion)
+            return
         largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
         heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
         self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
+
+    def move(self, motion: Motion) -> None:
+        """Use this motion of the volume from now on."""
+        self.motion = motion
+        self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
+
+    def _curvature(self, subset: list[_Part]) -> float:
+        """`largest_eigenvalue` for a volume that moves."""
+        x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
+        for _ in range(_ROUNDS):
+            product = np.zeros_like(x)
+            for part in subset:
+                u = None if self.motion is None else self.motion.at(part.energy)
+                lines = part.projector.forward_lines(moved(x, u))
+                lines *= np.float32((self._u[part.energy] ** 2).sum())
+                product += moved_back(part.projector.adjoint_lines(weighed(lines, part.weight)), u)
+            bound = min(bound, float(np.divide(product, x, out=np.zeros_like(x), where=x > 0).max()))
+            x = product / product.max()
+        return bound
+
+    def image(self, energy: int) -> F32:
+        """The volume [y, x, z] at an energy, before it is displaced."""
+        return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
         """Write minus the gradient of the views of a subset at z into `out`. Returns their weighted sum of squares.
@@ -184,10 +214,11 @@ class EnergyFit:
             image[...] = 0
             for share, component in zip(self._u[part.energy], self.z, strict=True):
                 combine(1.0, image, float(share), component, image)
-            residual = part.data - part.projector.forward_lines(image)
-            weighted = residual if part.weight is None else part.weight * residual
+            u = None if self.motion is None else self.motion.at(part.energy)
+            residual = part.data - part.projector.forward_lines(moved(image, u))
+            weighted = weighed(residual, part.weight)
             squares += float(np.vdot(residual, weighted))
-            back = part.projector.adjoint_lines(weighted, image)
+            back = moved_back(part.projector.adjoint_lines(weighted, image), u)
             for share, component in zip(self._u[part.energy], out, strict=True):
                 combine(1.0, component, float(share), back, component)
         return squares

@@ -17,11 +17,12 @@ from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, 
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.base.work import Costs, SizedRun, Work
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
+from recon.features.joint.motion import Motion
 from recon.features.joint.proportions import SOLUTION_STEPS, STEPS, TRIAL_STEPS, fit_share
 from recon.features.joint.series import MOMENTS, SWEEPS, TimedViews, fit_series, of_moments, series_costs
 from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
 
-_VOLUMES = 8  # volumes in memory, for each of the result
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
 _OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
 _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
 
@@ -32,6 +33,7 @@ class TimeSeries(Checked):
 
     Attributes:
         volumes: 2 or more, from the first view to the last; each needs twelve views or more.
+        moves: matter moves, and not only its density changes; None: what views held out prefer.
         sweeps: of the fit.
         weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
 
@@ -44,6 +46,7 @@ class TimeSeries(Checked):
     traits: ClassVar[Traits] = Traits(in_time=True)
 
     volumes: Annotated[int, Bound(2)] = 2
+    moves: bool | None = None
     sweeps: Count = SWEEPS
     weight: NonNegative | None = None
 
@@ -60,25 +63,30 @@ class TimeSeries(Checked):
         made = fit_series(
             TimedViews(data, problem.geometry, times, weights),
             self.volumes,
+            motion=self.moves,
             tv_weight=self.weight,
             sweeps=self.sweeps,
             seed=problem.seed,
             go_on=history.heard,
             stop=control.stop,
         )
-        series = VolumeSeries(made.times - times.min(), made.volumes, made.residual)
-        settings: dict[str, Any] = {"volumes": self.volumes, "sweeps": self.sweeps}
+        series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
+        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
         settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
-        return history.result(series, made.grid, settings, made.at)
+        if made.unseen_residuals is None:
+            return history.result(series, made.grid, settings, made.at)
+        because = _because(*made.unseen_residuals, moves=made.motion is not None)
+        settings["chosen_because"] = because
+        return replace(history.result(series, made.grid, settings, made.at), chosen=because)
 
     def toy(self) -> Self:
-        return replace(self, volumes=2, sweeps=1)
+        return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return series_costs(geometry, self.volumes, self.sweeps)
+        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return _VOLUMES * self.volumes * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
 
 
 @dataclass(frozen=True)
@@ -255,22 +263,31 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     return data, weights
 
 
+def _because(still: float, moved: float, moves: bool) -> str:
+    """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
+    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    if moves or moved >= still:
+        return f"{'motion' if moves else 'no motion'}, as {judged}"
+    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+
+
 def timed(which: str) -> tuple[SizedRun, ...]:
-    """Sweeps of so many volumes, as of "still 3"."""
+    """Sweeps of so many volumes, as of "moving 3"."""
     from recon.machine_speed import views_of_disc
 
     kind, count = which.split()
     volumes, sized = int(count), list[SizedRun]()
     for cols in (32, 80):
         geometry, grid, data = views_of_disc("parallel", 16, cols, 12 * volumes)
-        n = geometry.n_views
+        n, motion = geometry.n_views, None
         if kind == "energies":
             views = EnergyViews(data, geometry, np.arange(n) * volumes // n, np.eye(volumes) + 0.5)
         else:
-            times = np.arange(n, dtype=np.float64)
+            times, (nz, ny, nx) = np.arange(n, dtype=np.float64), grid.shape
             knots = np.linspace(0, times[-1], volumes)
-            views = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
-        fit = EnergyFit(views, grid, np.random.default_rng(0))
+            views, past = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
+            motion = Motion.none((ny, nx, nz), past, 3, 3) if kind == "moving" else None
+        fit = EnergyFit(views, grid, np.random.default_rng(0), motion)
         sized.append(SizedRun(n, n * math.prod(grid.shape), partial(_sweep, fit, volumes)))
     return tuple(sized)
 

@@ -23,6 +23,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyViews, trial_rows
+from recon.features.joint.motion import conjugate_gradients
 from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
@@ -260,24 +261,3 @@ def _smoothness(views: EnergyViews, found: Materials, states: tuple[int, int], s
     first, problem = _even(problem), replace(problem, stop=steps.stop)
     fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
     return smoothness(fit, judge, first, steps)[0]
-
-
-def conjugate_gradients(
-    normal: Callable[[F32], F32], left: F32, found: F32, steps: int, go_on: Callable[[], bool] = lambda: True
-) -> None:
-    """Steps of conjugate gradients (Hestenes & Stiefel 1952) that improve `found` in place.
-
-    Args:
-        left: the right side less `normal` of what was found so far; overwritten.
-        go_on: asked before each step. False ends it.
-    """
-    towards, squares = left.copy(), float(np.vdot(left, left))
-    for _ in range(steps):
-        if squares == 0 or not go_on():
-            break
-        image = normal(towards)
-        length = np.float32(squares / float(np.vdot(towards, image)))
-        found += length * towards
-        left -= length * image
-        before, squares = squares, float(np.vdot(left, left))
-        towards = left + np.float32(squares / before) * towards

@@ -21,14 +21,28 @@ from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
+from recon.features.joint.learnt_motion import (
+    JUDGED,
+    JUDGED_SWEEPS,
+    SWEEPS_OF_TURN,
+    OfMoments,
+    learnt_motion,
+    levels,
+    unseen_squares,
+)
+from recon.features.joint.motion import Motion, moved
 from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.features.joint.spectral import weight_of, weights_by_views
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
-_LESS = 0.95  # of the squares that volumes leave of views held out: factors that leave less are there
+_MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
+_SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
+_LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24 * 16 at most
+_TURN = 4  # sweeps that the steps of a motion take, beside its own
 _FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
 SWEEPS = 60
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
@@ -68,13 +82,17 @@ class TimedViews:
 
 @dataclass(frozen=True, eq=False)
 class TimedVolumes:
-    """A changing volume, linear between knots in time.
+    """A changing volume, linear between knots in time, with motion.
 
     Attributes:
         times: float64 [knot], in the unit of the views' times, evenly from the first view to the last.
-        volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px where the pitch is 1), 0 or more.
+        volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px where the pitch is 1), 0 or more; before it moves.
+            `at` has what is seen.
         grid: of each volume.
         residual: norm of what the volumes leave of the views, over the norm of the views.
+        motion: from where each place takes its value; None: nothing moves.
+        unseen_residuals: what coarse volumes without and with motion leave of views held out, as `residual`; None where
+            the motion was not chosen by them.
         smooth: of the module `proportions`: each volume is the mean of all, times factors smooth within matter. None:
             each is fitted by itself.
     """
@@ -83,11 +101,18 @@ class TimedVolumes:
     volumes: F32
     grid: Grid
     residual: float
+    motion: Motion | None = None
+    unseen_residuals: tuple[float, float] | None = None
     smooth: float | None = None
 
     def at(self, time: float) -> F32:
         """The volume [z, y, x] at a time; before the first and after the last knot it is constant."""
-        return np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
+        before = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
+        if self.motion is None:
+            return before
+        past = np.clip((time - self.times[0]) / np.ptp(self.times), 0, 1)
+        now = self.motion.on(self.motion.shape, np.array([past]))
+        return volume_slices(moved(volume_lines(before), now.at(0)))
 
 
 def hats(at: ArrayLike, knots: F64) -> F64:
@@ -100,6 +125,7 @@ def fit_series(
     views: TimedViews,
     knots: int,
     *,
+    motion: bool | None = None,
     tv_weight: float | None = None,
     sweeps: int = SWEEPS,
     seed: int = 0,
@@ -108,17 +134,21 @@ def fit_series(
 ) -> TimedVolumes:
     """Volumes at evenly spaced times that explain all views in one least-squares fit with total variation.
 
-        min ½ Σ_v |A_v Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
+        min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
 
-    h_k are hats: the volume is linear in time between knots. This is the problem of `fit_materials`, with knots for
-    materials and the hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they
-    have in common. Where views held out are predicted better so, the volumes become factors of their mean that are
+    h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
+    middle of the scan (module `motion`). This is the problem of `fit_materials`, with knots for materials and the
+    hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
+    Where nothing moves, and views held out are predicted better so, the volumes become factors of their mean that are
     smooth within matter: bodies that take up or lose something, each at its time.
-    Steps, memory, `go_on` and `stop` are as there. Trials of weights and of factors each count down to 0. After the
-    sweeps, the steps of the factors count down; if they are ended, the volumes are those without.
+    Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
+    each count down to 0. After the sweeps, the steps of the
+    factors count down; if they are ended, the volumes are those without.
 
     Args:
         knots: volumes, 2 or more.
+        motion: learn how the sample moves, too; None: where views held out are predicted better with it. It helps a
+            sample that settles; one that only changes its densities gets motions that are not there.
         tv_weight: μ of all components, so that a sample that does not change has the weight of one volume of all views;
             None: the one with which views held out are predicted best.
 
@@ -130,14 +160,17 @@ def fit_series(
     warn_of_other_quantity(views.projections)
     times = np.linspace(*views.span, knots)
     _refuse_gaps(views.times, times)
-    energies = of_moments(views, times, MOMENTS * (knots - 1))
+    energies, past = of_moments(views, times, MOMENTS * (knots - 1))
     grid = Grid.matching(views.geometry)
     if tv_weight is None:
         weights = weights_by_views(energies, grid, seed, go_on, stop, alike=True)
     else:
-        weights = np.full(knots, tv_weight / math.sqrt(len(energies.cross_sections)))
-    smooth = smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
-    fit = EnergyFit(energies, grid, np.random.default_rng(seed), stop)
+        weights = np.full(knots, tv_weight / math.sqrt(past.size))
+    few, few_past = of_moments(views, times, _MOTION_MOMENTS)
+    coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
+    learnt, unseen = _motion(coarse, OfMoments(energies, past, weights), motion, go_on, stop)
+    smooth = None if learnt is not None else smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
+    fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
     going = True
 
     def heard(sweep: int, residual: float) -> bool:
@@ -146,7 +179,7 @@ def fit_series(
         return going
 
     volumes, residual = fitted(fit, weights, sweeps, heard)
-    made = TimedVolumes(times, volumes, grid, residual)
+    made = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
     return made if smooth is None or not going or stop() else _as_factors(made, fit, smooth, go_on)
 
 
@@ -160,6 +193,27 @@ def _refuse_gaps(times: F64, knots: F64) -> None:
             f"{np.diff(knots)[0] / 2:g}, expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views "
             "before and after a gap apart"
         )
+
+
+def _motion(
+    coarse: OfMoments,
+    fine: OfMoments,
+    wanted: bool | None,
+    go_on: Callable[[int, float], bool],
+    stop: Callable[[], bool],
+) -> tuple[Motion | None, tuple[float, float] | None]:
+    """The motion of the sample, and residuals of views held out without and with motion, where these chose."""
+    unseen = None
+    if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
+        wanted = _moves(*squares)
+        unseen = math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean())
+    learnt = learnt_motion(coarse, go_on, stop) if wanted else None
+    return learnt and learnt.on(learnt.shape, fine.times), unseen
+
+
+def _moves(still: F64, moved: F64) -> bool:
+    """Whether matter moves, by squared residuals [block] of views held out without and with motion."""
+    return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
@@ -199,7 +253,7 @@ def smooth_factors(
     """
     rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
-    fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop)
+    fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
     going = True
 
     def heard(sweep: int, residual: float) -> bool:
@@ -229,32 +283,41 @@ def refuse_few(knots: int, n: int) -> None:
         )
 
 
-def series_costs(geometry: Geometry, knots: int, sweeps: int = SWEEPS) -> Costs:
-    """The work of `fit_series`.
+def series_costs(geometry: Geometry, knots: int, motion: bool | None, sweeps: int = SWEEPS) -> Costs:
+    """The work of `fit_series`: without motion, and with it, where that is undecided.
 
     Raises:
         ValueError: the views do not suffice for so many volumes.
     """
     refuse_few(knots, geometry.n_views)
-    grid = Grid.matching(geometry)
+    cols, grid = geometry.detector_shape[1], Grid.matching(geometry)
     voxels = math.prod(grid.shape)
     few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
 
-    def swept(sweeps: float, share: float = 1.0) -> Work:
+    def swept(moves: bool, sweeps: float, share: float = 1.0) -> Work:
         views = sweeps * geometry.n_views
-        return Work.of(f"series, still {knots}", views, views * share * voxels)
+        return Work.of(f"series, {'moving' if moves else 'still'} {knots}", views, views * share * voxels)
 
-    fit = swept(sweeps + _FACTORS[1]) + swept(sweeps + _FACTORS[0], few)
-    return Costs({"series": fit}, swept(_TRIALS, few))
+    learning = sum((swept(True, n * (SWEEPS_OF_TURN + _TURN), wide**-3) for wide, n in levels(cols)), Work())
+    rest = swept(False, sweeps + _FACTORS[1]) + swept(False, sweeps + _FACTORS[0], few)
+    volumes = {"rest": rest, "moving": learning + swept(True, sweeps)}
+    choice = swept(False, _TRIALS, few)
+    if motion is not None:
+        return Costs({"moving" if motion else "rest": volumes["moving" if motion else "rest"]}, choice)
+    coarse = max(1, round(cols / JUDGED)) ** -3
+    judging = learning + swept(False, JUDGED_SWEEPS, coarse) + swept(True, JUDGED_SWEEPS, coarse)
+    return Costs(volumes, choice + judging)
 
 
-def of_moments(views: TimedViews, times: F64, most: int) -> EnergyViews:
-    """The views as of so many moments at most, of equal numbers of views."""
+def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
+    """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
     n = views.geometry.n_views
     moments = min(most, n)
     moment = np.empty(n, np.intp)
     moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
+    at = np.bincount(moment, views.times) / np.bincount(moment)
     shares = np.zeros((moments, times.size))
     np.add.at(shares, moment, hats(views.times, times))
     shares /= np.bincount(moment)[:, None]
-    return EnergyViews(views.projections, views.geometry, moment, shares, views.weight)
+    past = (at - times[0]) / np.ptp(times)
+    return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past

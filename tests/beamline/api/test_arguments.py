@@ -26,7 +26,7 @@ def test_a_function_names_the_argument(call: Callable[..., Any]) -> None:
     [
         ({"method": 5}, "method must be text or a Method, got 5"),
         ({"method": None}, "method must be text or a Method, got None"),
-        ({"rows": 3}, "rows must be a slice, 2 whole numbers or None, got 3"),
+        ({"rows": 3}, "rows must be a slice or 2 values, each a whole number or None, got 3"),
         ({"binning": "2"}, "binning must be a whole number or None, got '2'"),
         ({"views": 3}, "views must be text or None, got 3"),
         ({"selection": {"views": "all"}}, "selection must be a Selection or None, got {'views': 'all'}"),

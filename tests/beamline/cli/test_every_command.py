@@ -7,20 +7,20 @@ from pathlib import Path
 import click
 import pytest
 
-from beamline.cli.commands import commands
+from beamline.cli.commands import own_commands
 from beamline.cli.main import main
 from tests.beamline.cli.small_scan import beamline, left
 
 CONTEXT = click.Context(main)
-COMMANDS = {name: command for name in commands() if (command := main.get_command(CONTEXT, name)) is not None}
+COMMANDS = {name: command for name in own_commands() if (command := main.get_command(CONTEXT, name)) is not None}
 TAKES_FILE = {
-    "archive": "FILE -o out.h5", "batch": "FILE -o out", "export": "FILE -o out.nrrd", "ingest": "FILE out.h5",
+    "batch": "FILE -o out", "export": "FILE -o out.nrrd", "ingest": "FILE out.h5",
     "materials": "FILE FILE --spectra FILE -o out.h5", "render": "FILE -o out.h5", "study": "fixed-views FILE",
     "simulate": "FILE -o out.h5", "surface": "FILE -o out.stl", "sweep": "FILE axis=1:3:1",
     "voxelise": "FILE -o out.h5", "xafs": "FILE --from 8.30 --to 8.42",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
-NO_FILE = {"completion", "config", "demo", "ioc", "tango", "pause", "resume", "stop", "abort", "runs"}
+NO_FILE = {"completion", "config", "demo", "ioc", "pause", "resume", "stop", "abort", "runs"}
 OTHERWISE = {("batch", "text"), ("batch", "cut"), ("watch", "cut")}
 """The next scan is made; it may become a scan file."""
 KINDS = {

@@ -45,13 +45,6 @@ def test_a_reader_that_wants_no_more_is_no_error(folder: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_only_results_reach_stdout_by_whatever_way_a_plug_in_writes() -> None:
-    code = "import os, sys; from beamline.cli.main import Outputs; outputs = Outputs(); os.write(1, b'one '); "
-    code += "print('two', file=sys.__stdout__, flush=True); os.system('echo three'); print('{}'); outputs.lost()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr.split()) == ("{}\n", ["one", "two", "three"])
-
-
 @POSIX
 def test_a_name_acts_on_no_terminal_whoever_prints_it(tmp_path: Path) -> None:
     name = os.fsdecode(b"\x1b[2J\x07\xff\xe2\x80\xaea.h5")

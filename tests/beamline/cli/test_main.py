@@ -183,7 +183,7 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
         return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
 
     assert completed("doctor", "--se") == ["--session", "--set"]
-    monkeypatch.setattr(module, "import_module", None)
+    monkeypatch.setattr("beamline.cli.commands.import_module", None)
     assert completed("re") == ["resume", "recon", "recover", "render"]
     assert completed("--v") == ["--version"]
 
@@ -192,19 +192,6 @@ def test_an_interruption_that_went_through_a_text_of_code_has_its_exit_code_too(
     """Python would end by the signal: dataclasses, which modules make while they load, run such texts."""
     code = "import beamline.cli.main as m; m.main = lambda **_: exec('raise KeyboardInterrupt'); m.run()"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == INTERRUPTED
-
-
-def test_under_a_limit_of_addresses_compiled_kernels_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`recon` chooses them only while numba is not there: else a fit compiles for minutes, and LLVM may end it."""
-    loaded: list[str] = []
-
-    def imported(name: str) -> SimpleNamespace:
-        loaded.append(name)
-        return SimpleNamespace(njit=lambda function: function)
-
-    monkeypatch.setattr(module, "import_module", imported)
-    module._load_early(("scipy.linalg",))
-    assert loaded == ["recon", "scipy.linalg", "numba"]
 
 
 def test_figures_do_not_depend_on_the_back_end_of_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:

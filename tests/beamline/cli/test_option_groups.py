@@ -9,6 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from beamline.cli.commands import own_commands
 from beamline.cli.main import main
 from beamline.cli.recipe import GROUPS, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.terminal import Terminal
@@ -16,7 +17,7 @@ from beamline.core.events import FitReached
 from beamline.core.process import with_our_path
 
 CONTEXT = click.Context(main)
-COMMANDS = {name: command for name in main.list_commands(CONTEXT) if (command := main.get_command(CONTEXT, name))}
+COMMANDS = {name: command for name in own_commands() if (command := main.get_command(CONTEXT, name))}
 GROUPED = {name: command for name, command in COMMANDS.items() if isinstance(command, Grouped)}
 
 

@@ -21,24 +21,25 @@ from beamline.reconstruct.region import Region
 from beamline.storage.readers.open import SourceOptions
 from recon.base.method import Method, Traits
 from recon.methods import DEFAULT, build, by_name, has_setting
+from recon.voxels.enough_views import Goal
 
 OPTIONS = {name_of(param): param for param in declared(recon).values()}
 TYPED = {
     "steps": "5", "seconds": "5", "budget": "30s", "quality": "best", "gaussians": "9", "start": "tv", "loss": "l2",
     "kernel": "gaussian", "device": "cuda", "early-stop": "", "finish": "2", "checkpoint": "c.h5", "resume": __file__,
-    "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "allow-negative": "", "time": "3",
-    "plain-splatting": "", "uncertainty": "", "truth": "t.npy", "follow": "", "earlier": "e.h5",
-    "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1",
+    "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "allow-negative": "", "time": "3", "moves": "",
+    "plain-splatting": "", "uncertainty": "", "truth": "t.npy", "follow": "", "earlier": "e.h5", "enough-loss": "1",
+    "enough-gain": "1", "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1",
     "dry-run": "",
 }  # fmt: skip
 """A value of each option that has a rule; "" of a flag."""
 VALUES = {
     "steps": 5, "seconds": 5.0, "gaussians": 9, "start": "tv", "fit.loss": "l2", "fit.kernel": "gaussian",
     "early_stop": True, "finish": 2, "iterations": 3, "tv_weight": 0.1, "patch_threshold": 0.1, "allow_negative": True,
-    "volumes": 3, "fit.rays.rectified": False, "budget": 30.0, "quality": "best", "device": "cuda",
+    "volumes": 3, "moves": True, "fit.rays.rectified": False, "budget": 30.0, "quality": "best", "device": "cuda",
     "checkpoints.path": CheckpointOptions(Path("c.h5")), "checkpoints.resume": CheckpointOptions(None, Path(__file__)),
-    "uncertainty": True, "truth": "t.npy", "unfinished": True,
-    "memory": 8_000_000_000, "cluster": "local:1", "partial": Path("p.h5"),
+    "uncertainty": True, "truth": "t.npy", "enough.psnr_loss": Goal(None, 1.0), "unfinished": True,
+    "enough.psnr_gain_per_10_views": Goal(1.0), "memory": 8_000_000_000, "cluster": "local:1", "partial": Path("p.h5"),
     "region": Region((0, 1), (0, 1), (0, 1)), "follow": FollowTiming(),
 }  # fmt: skip
 """The same in Python, by the path of the setting or of the value."""
@@ -92,7 +93,7 @@ def test_a_rule_names_what_is_there(name: str) -> None:
     if rule.value:
         first, *rest = rule.value.split(".")
         assert first in {each.name for each in fields(ReconOptions)}
-        kind = {"checkpoints": CheckpointOptions}.get(first)
+        kind = {"checkpoints": CheckpointOptions, "enough": Goal}.get(first)
         assert not rest or (kind is not None and rest[0] in {each.name for each in fields(kind)})
     assert set(rule.excludes) | ({rule.needs[0]} if rule.needs else set()) <= {*OPTIONS, SLABS_RESUMED}
 

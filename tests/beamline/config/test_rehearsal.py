@@ -183,6 +183,7 @@ def test_a_real_device_among_simulated_ones_is_named_with_its_line(tmp_path: Pat
         ("scan.filter=Cu", "--set scan.filter=Cu"),
         ("scan.energy=8.3", "--set scan.energy=8.3"),
         ("devices.stage.low_deg=400", "--set devices.stage.low_deg=400"),
+        ("recon.stop_when={psnr_loss: null}", "--set recon.stop_when={psnr_loss: null}"),
         ("devices.camera.binning=true", "--set devices.camera.binning=true"),
         ("simulation={}", "--set simulation={}"),
     ],

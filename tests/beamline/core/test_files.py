@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.core import files
-from beamline.core.errors import DataError
-from beamline.core.files import bytes_below, parts_of, refuse_existing, require_regular, text_in
+from beamline.core.files import bytes_below, parts_of, require_regular, text_in
 
 
 def test_what_is_not_there_or_a_link_to_a_file_is_fine(tmp_path: Path) -> None:
@@ -57,14 +55,9 @@ _WAYS_OUT = {
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links and pipes take rights on Windows")
-@pytest.mark.parametrize("as_windows", [False, True])
 @pytest.mark.parametrize("within", ["", "c/0"])
 @pytest.mark.parametrize("way", _WAYS_OUT)
-def test_only_a_regular_file_below_the_folder_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str, within: str, as_windows: bool
-) -> None:
-    if as_windows:
-        monkeypatch.setattr(files, "STEP_BY_STEP", False)
+def test_only_a_regular_file_below_the_folder_is_read(tmp_path: Path, way: str, within: str) -> None:
     (tmp_path / "secret").write_bytes(b"secret")
     (tmp_path / "linked").symlink_to("run")  # the folder itself may be one
     folder = tmp_path / "run" / within
@@ -85,11 +78,3 @@ def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(OSError, match="the folder itself"):
         bytes_below(tmp_path / "run", name)
     assert parts_of(tmp_path / "run") == [tmp_path / "run"]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="it counts in letters there")
-@pytest.mark.parametrize("letters", [212, 226, 246, 251, 300])
-def test_a_name_too_long_for_what_lies_beside_it_is_refused_before_the_work(tmp_path: Path, letters: int) -> None:
-    refuse_existing(tmp_path / f"{'x' * 208}.h5")
-    with pytest.raises(DataError, match=f"too long: it has {letters + 3} bytes, and 211 are possible"):
-        refuse_existing(tmp_path / f"{'x' * letters}.h5")

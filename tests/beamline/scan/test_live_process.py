@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from beamline.core.errors import ScanStopped
+from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
@@ -239,6 +239,49 @@ def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> No
     assert not ends() and late.seconds == 0
     late.stop()
     assert ends()
+
+
+def test_a_scan_with_enough_views_waits_for_its_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.0)
+    fits = """
+import json, sys, time
+time.sleep(0.5)
+print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=True)
+"""
+    stop = StopRequest()
+    instrument = FakeInstrument(at={10: lambda: stop.stop_as_enough("enough")})
+    ran = Ran(tmp_path, instrument, stop=stop, live=script(fits))
+    assert type(ran.error) is ScanStopped and "enough" in str(ran.error)
+    assert len(ran.of("recon_done")) == 1 and stop.enough
+    stop.abort()
+    assert not stop.enough
+    asked = StopRequest()
+    asked.stop()
+    asked.stop_as_enough("too late")
+    assert not asked.enough
+
+
+def test_what_the_live_reconstruction_finds_enough_is_passed_on(tmp_path: Path) -> None:
+    said = """
+import json
+print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1, "low": 0.0, "high": 0.2}))
+"""
+    reasons: list[str] = []
+    command = script(said)(tmp_path / "scan.h5", tmp_path / "recon.h5")
+    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, reasons.append)
+    process.finish(stop=lambda: False, hurry=lambda: False)
+    assert reasons == ["90 of 180 views are enough, the others would add 0.10 dB (0.00 to 0.20)"]
+    words = follow_command(small("recon.live=true", "recon.stop_when={psnr_loss: 0.5}"))(tmp_path, tmp_path)
+    assert words[words.index("--enough-loss") + 1] == "0.5" and "--enough-gain" not in words
+    for wrong, says in (
+        ("{}", "needs psnr_gain_per_10_views or psnr_loss"),
+        ("{psnr_loss: 0}", "expected a number > 0"),
+        ("{psnr_loss: 0.5}", "as r2; got fbp"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            small("recon.live=true", "recon.method=fbp", f"recon.stop_when={wrong}")
+    with pytest.raises(ConfigError, match="needs live: true"):
+        small("recon.stop_when={psnr_loss: 0.5}")
 
 
 @pytest.mark.parametrize("stopped", [False, True])

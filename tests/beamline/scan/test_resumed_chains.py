@@ -17,7 +17,7 @@ from beamline.cli.main import main
 from beamline.core.errors import BeamlineError, DataError
 from beamline.core.files import JOINED, parts_of
 from beamline.core.stop import StopRequest
-from beamline.features.archive.archive import archive
+from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
@@ -248,7 +248,6 @@ def test_every_command_refuses_a_joined_file_that_lacks_a_part(stale: Path, tmp_
         ["recon", stale, "-m", "fbp", "-o", out],
         ["recon", stale, "-m", "fbp", "--dry-run"],
         ["monitor", stale],
-        ["archive", stale, "-o", out],
         ["ingest", stale, out],
         ["study", "fixed-views", stale, "-o", tmp_path / "study"],
     ):
@@ -325,14 +324,14 @@ def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
         assert source.image_key.size == _frames(recovered.parent)
 
 
-def test_a_run_is_copied_as_a_whole_and_an_archive_needs_no_part(recovered: Path, tmp_path: Path) -> None:
+def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, tmp_path: Path) -> None:
     shutil.copytree(recovered.parent, tmp_path / "copy")
     _assert_whole(tmp_path / "copy" / JOINED)
     (tmp_path / "alone").mkdir()
     shutil.copy(recovered, tmp_path / "alone")
     with pytest.raises(DataError, match="as a whole"):
         open_scan(tmp_path / "alone" / JOINED)
-    archive(recovered, tmp_path / "archive.h5")
+    ingest(recovered, tmp_path / "archive.h5")
     shutil.copy(tmp_path / "archive.h5", recovered.parent / "archive.h5")
     shutil.copy(tmp_path / "archive.h5", tmp_path / "alone" / JOINED)
     with open_scan(recovered) as source:

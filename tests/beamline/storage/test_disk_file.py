@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import errno
-import os
 import sys
 from io import FileIO
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage import disk_file, hdf5
-from beamline.storage.disk_file import DiskFile
 from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 
 FACTS = 12
@@ -83,33 +80,6 @@ def test_ctrl_c_within_a_write_is_passed_on(tmp_path: Path, disk: type[Failing])
         write(tmp_path / "out.h5")
 
 
-def test_what_h5py_can_only_print_is_raised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An exception that a method of the file could not keep, while a dataset goes."""
-    with pytest.raises(OSError, match="lost"), hdf5.created(tmp_path / "out.h5"):
-        where = "h5py._objects.ObjectID.__dealloc__"
-        sys.unraisablehook(SimpleNamespace(exc_value=OSError("lost"), object=where))  # type: ignore[arg-type]
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize("at", ["voxels", "end"])
-def test_a_disk_that_holds_something_else_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
-    to_disk = disk_file.to_disk
-
-    def spoilt(handle: int) -> None:
-        to_disk(handle)
-        data = (tmp_path / "out.h5").read_bytes()
-        if at == "end":
-            os.truncate(tmp_path / "out.h5", len(data) - 1)
-        else:
-            with (tmp_path / "out.h5").open("r+b") as file:
-                file.seek(data.index(CUBE[3].tobytes()) + 5)
-                file.write(b"?")
-
-    monkeypatch.setattr(disk_file, "to_disk", spoilt)
-    with pytest.raises(OSError, match="not those that were written" if at == "voxels" else "bytes of"):
-        write(tmp_path / "out.h5")
-
-
 def test_a_disk_that_takes_no_more_is_seen_while_much_is_written(tmp_path: Path, disk: type[Failing]) -> None:
     disk.at, disk.goes_on, disk.error = 30, True, OSError(errno.ENOSPC, "full")
     with pytest.raises(OSError, match="full"), hdf5.created(tmp_path / "out.h5") as file:
@@ -118,17 +88,6 @@ def test_a_disk_that_takes_no_more_is_seen_while_much_is_written(tmp_path: Path,
             data[n] = 1
             file.require_taken()
     assert disk.n < 300
-
-
-def test_a_part_that_was_written_again_is_compared_as_it_is_last(tmp_path: Path) -> None:
-    disk = DiskFile(tmp_path / "out", "x")
-    for at, data in ((0, b"a" * 10), (5, b"b" * 10), (20, b"c"), (20, b"d"), (12, b"e" * 4)):
-        disk.seek(at)
-        disk.write(data)
-    assert [(at, n) for at, n, _ in disk._unchanged()] == [(12, 4), (20, 1)]
-    disk.finish()
-    disk.close()
-    assert (tmp_path / "out").read_bytes() == b"a" * 5 + b"b" * 7 + b"e" * 4 + bytes(4) + b"d"
 
 
 def test_a_snapshot_that_fails_leaves_the_older_file(tmp_path: Path, disk: type[Failing]) -> None:

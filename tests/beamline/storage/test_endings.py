@@ -15,7 +15,6 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
-from beamline.features.archive.archive import archive
 from beamline.features.files.ingest import ingest
 from beamline.monitor.digest import digest
 from beamline.storage.parts import join
@@ -48,11 +47,10 @@ def _in_place(scan: Path, out: Path) -> None:
 COPIES: dict[str, Callable[[Path, Path], object]] = {
     "ingest": ingest,
     "ingest some columns": lambda scan, out: ingest(SourceOptions(scan, cols=(2, 14)), out),
-    "archive": archive,
     "join": lambda scan, out: join([scan], out),
     "recover": _in_place,
 }
-REFUSED = {("archive", "killed"), ("join", "killed")}
+REFUSED = {("join", "killed")}
 
 
 @pytest.fixture
@@ -108,6 +106,6 @@ def test_a_copy_states_how_its_scan_ended(scan: Callable[[str], Path], tmp_path:
     if end != "failed":  # which states the most
         return
     again = tmp_path / "again.h5"
-    archive(out, again) if command != "join" else ingest(out, again)
+    ingest(out, again)
     with open_scan(again) as source:
         assert source.ending == ENDINGS[end]

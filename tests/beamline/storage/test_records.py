@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.archive.archive import archive
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import replay
@@ -48,20 +47,15 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: 
         ingest(path, path.with_name("copy.h5"))
 
 
-def test_recover_and_archive_say_it(path: Path, frames: list[Frame]) -> None:
+def test_recover_says_it(path: Path, frames: list[Frame]) -> None:
     _flip(path, layout.ANGLE, ROW, 3)
-    before, small = path.read_bytes(), path.with_name("small.h5")
+    before = path.read_bytes()
     done = recover(path)
     assert (done.changed, done.altered) == (False, (ROW,))
     assert (
         f"cannot be mended, with {len(frames)} frames; what it says of frames {ROW} is not as it was" in done.in_words()
     )
-    with pytest.raises(DataError, match=rf"it: {ROW}\..*--keep-damaged."):
-        archive(path, small)
-    assert path.read_bytes() == before and not small.exists()
-    assert archive(path, small, keep_damaged=True).altered == (ROW,)
-    with open_scan(small) as source:
-        assert source.altered == {ROW}
+    assert path.read_bytes() == before
 
 
 def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: list[Frame]) -> None:

@@ -23,7 +23,7 @@ import pytest
 import serial
 
 from beamline.config.load import Config, config_folder, load
-from beamline.core.events import Event, Sink
+from beamline.core.events import Event
 from beamline.core.run_result import RunResult
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
@@ -426,9 +426,9 @@ class Rig:
             self.pause.release(cause)
 
     @contextmanager
-    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest, sink: Sink) -> Iterator[None]:
+    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
         self.pause = pause
-        with verbs_taken(folder, stop, pause, sink):
+        with verbs_taken(folder, stop, pause):
             yield
 
     def _wait_in_pause(self, recorder: Recorder) -> bool:

@@ -1,21 +1,34 @@
-"""Wrong types of arguments: every public function and class names the argument, the value and what is expected."""
+"""Wrong values of settings and arguments: the sentence names the setting, its value and what is expected."""
 
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
 import recon
-from recon.base.declared_types import check_arguments, is_of_type, refusal, types_of
+from recon.base.declared_types import (
+    Bound,
+    Checked,
+    Count,
+    Natural,
+    NonNegative,
+    Positive,
+    is_of_type,
+    refusal,
+    types_of,
+)
 from recon.base.kernel import Kernel
 from recon.base.method import Method
+from recon.base.volume import Grid
 from recon.methods import METHODS, by_name
 
 NO_VALUES = {"AxisEstimate", "Kernel", "Materials", "Progress", "Projections", "Reconstruction", "TimedVolumes"} | {
@@ -24,51 +37,78 @@ NO_VALUES = {"AxisEstimate", "Kernel", "Materials", "Progress", "Projections", "
 """What functions return, and an enumeration: nobody makes these."""
 
 
-def example(
-    a: int | None, b: float, c: tuple[int, int], d: Sequence[str | Path], e: Mapping[str, int], f: Callable[[], int],
-    g: ArrayLike | None, h: NDArray[np.float32], i: Literal["fbp", "sirt"], j: Kernel, k: str | Method, m: bool,
-) -> None:  # fmt: skip
-    check_arguments(example, locals())
+@dataclass(frozen=True)
+class Some(Checked):
+    steps: Natural | None = None
+    level: Annotated[int, Bound(1, 16)] = 3
+    weight: NonNegative = 0.0
+    rate: Positive | None = None
+    start: Literal["fbp", "tv"] = "fbp"
+    shape: Kernel = Kernel.COMPACT
+    size: tuple[int, int] | None = None
+    names: Sequence[str | Path] = ()
+    part: Grid | Count = 1
+    table: Mapping[str, int] | None = None
+    call: Callable[[], int] | None = None
+    values: ArrayLike | None = None
+    array: NDArray[np.float32] | None = None
+    method: str | Method = "fbp"
+    flag: bool = False
 
 
-LEGAL: tuple[Any, ...] = (3, 0.5, [1, 2], ("x",), {}, len, [[1.0]], np.zeros(2), "fbp", "gaussian", recon.Fbp(), True)
-GIVEN = dict(zip(inspect.signature(example).parameters, LEGAL, strict=True))
-
-
-OTHERS = (
-    {"a": None}, {"a": np.int8(3)}, {"b": 3}, {"c": np.array([1, 2])}, {"d": [Path()]}, {"g": None}, {"g": 3},
-    {"j": Kernel.COMPACT}, {"k": "sirt"}, {"m": np.True_}, {"a": np.array(3)}, {"b": np.array(0.5)},
+@pytest.mark.parametrize(
+    "values",
+    [
+        {}, {"steps": np.int64(4)}, {"level": 16}, {"weight": 0}, {"rate": 1e-300}, {"start": "tv"}, {"size": [1, 2]},
+        {"shape": "gaussian"}, {"size": np.array([1, 2])}, {"names": [Path()]}, {"part": Grid((1, 1, 1))},
+        {"table": {}}, {"call": len}, {"values": [[1.0]]}, {"values": 3}, {"array": np.zeros(2)},
+        {"method": recon.Fbp()}, {"flag": np.True_},
+    ],
 )  # fmt: skip
+def test_what_is_declared_is_taken(values: dict[str, Any]) -> None:
+    Some(**values)
 
 
-@pytest.mark.parametrize("more", OTHERS)
-def test_what_is_declared_is_taken(more: dict[str, Any]) -> None:
-    example(**GIVEN | more)
+def test_a_number_in_an_array_without_axes_is_the_number() -> None:
+    some = Some(**{"steps": np.array(4), "weight": np.array(0.5)})  # type: ignore[arg-type]
+    assert (type(some.steps), type(some.weight)) == (int, float)
+    assert some == Some(4, weight=0.5)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("a", "3", "a must be a whole number or None, got '3'"),
-        ("a", True, "a must be a whole number or None, got True"),
-        ("b", float("nan"), "b must be a number, got nan"),
-        ("c", (1, 2, 3), "c must be 2 whole numbers, got (1, 2, 3)"),
-        ("c", 3, "c must be 2 whole numbers, got 3"),
-        ("d", "text", "d must be a list or tuple of texts or Paths, got 'text'"),
-        ("e", [], "e must be a mapping, got []"),
-        ("f", 3, "f must be a function, got 3"),
-        ("g", "x", "g must be an array of numbers or None, got 'x'"),
-        ("h", [1.0], "h must be an array, got [1.0]"),
-        ("i", "fpb", "i 'fpb' is unknown; legal: fbp, sirt (did you mean fbp?)"),
-        ("j", 3, "j 3 is unknown; legal: gaussian, compact:1.5"),
-        ("k", recon.Fbp, "k must be text or a Method, got the class Fbp; give an object, such as Fbp()"),
-        ("m", np.zeros(2), "m must be True or False, got ndarray of shape (2,)"),
+        ("steps", -1, "must be a whole number of 0 or more or None, got -1"),
+        ("steps", 1.5, "must be a whole number of 0 or more or None, got 1.5"),
+        ("steps", True, "must be a whole number of 0 or more or None, got True"),
+        ("level", 17, "must be a whole number from 1 to 16, got 17"),
+        ("weight", math.nan, "must be a number of 0 or more, got nan"),
+        ("weight", "0", "must be a number of 0 or more, got '0'"),
+        ("rate", 0.0, "must be a number above 0 or None, got 0.0"),
+        ("rate", math.inf, "must be a number above 0 or None, got inf"),
+        ("start", "tvs", "'tvs' is unknown; legal: fbp, tv (did you mean tv?)"),
+        ("shape", 3, "3 is unknown; legal: gaussian, compact:1.5"),
+        ("size", (1, 2, 3), "must be 2 values, each a whole number or None, got (1, 2, 3)"),
+        ("size", 3, "must be 2 values, each a whole number or None, got 3"),
+        ("names", "ab", "must be a list or tuple, each value text or a Path, got 'ab'"),
+        (
+            "part",
+            Grid,
+            "must be a Grid or a whole number of 1 or more, got the class Grid; give an object, such as Grid()",
+        ),
+        ("part", "x" * 200, f"must be a Grid or a whole number of 1 or more, got '{'x' * 76}..."),
+        ("table", [], "must be a mapping or None, got []"),
+        ("call", 3, "must be a function or None, got 3"),
+        ("values", "x", "must be an array of numbers or None, got 'x'"),
+        ("array", [1.0], "must be an array or None, got [1.0]"),
+        ("method", recon.Fbp, "must be text or a Method, got the class Fbp; give an object, such as Fbp()"),
+        ("flag", np.zeros(2), "must be True or False, got ndarray of shape (2,)"),
     ],
 )
-def test_others_are_refused(name: str, value: Any, sentence: str) -> None:
+def test_others_are_refused_with_what_was_expected(name: str, value: Any, sentence: str) -> None:
     with pytest.raises(ValueError) as refused:
-        example(**GIVEN | {name: value})
-    assert str(refused.value) == sentence
+        Some(**{name: value})
+    assert str(refused.value) == f"{name} {sentence}"
 
 
 class Unread:
@@ -81,7 +121,7 @@ class Unread:
 
 
 def test_a_data_set_is_not_read_for_its_type() -> None:
-    example(**GIVEN | {"g": Unread(), "h": Unread()})
+    Some(values=Unread(), array=Unread())  # type: ignore[arg-type]
 
 
 def public() -> list[Any]:

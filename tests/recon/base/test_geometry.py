@@ -96,7 +96,7 @@ def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
 def test_a_grid_takes_any_list_of_whole_numbers() -> None:
     assert Grid([2, 3, 4], centre=np.zeros(3)) == Grid((2, 3, 4))  # type: ignore[arg-type]
     for arguments, message in (
-        ({"shape": (2.5, 3, 4)}, "3 whole numbers"),
+        ({"shape": (2.5, 3, 4)}, "3 values, each a whole number"),
         ({"shape": (0, 3, 4)}, "shape"), ({"voxel_size": 0.0}, "voxel_size"), ({"centre": (0, np.nan, 0)}, "centre"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):

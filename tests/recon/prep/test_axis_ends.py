@@ -72,13 +72,6 @@ def test_steps_too_wide_for_the_sample_leave_it_uncertain_and_noise_too() -> Non
         assert not axis_from_ends(noise, half_turn(90)).confident
 
 
-def test_a_search_range_without_the_axis_is_an_error() -> None:
-    views = grains(3, 1.5, half_turn(120), 47.5)
-    assert axis_from_ends(views, half_turn(120), (44, 51)).value == pytest.approx(47.5, abs=0.1)
-    with pytest.raises(AxisError, match="give the axis"):
-        axis_from_ends(views, half_turn(120), (52, 60))
-
-
 @pytest.mark.parametrize("part", [slice(0, 100), np.delete(np.arange(120), range(40, 44)), slice(0, 31)])
 def test_a_sector_a_gap_and_few_views_have_no_ends_that_join(part: slice | NDArray[np.int_]) -> None:
     views, angles = grains(4, 1.5, half_turn(120), 47.5), half_turn(120)

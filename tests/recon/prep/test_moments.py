@@ -27,7 +27,6 @@ def test_angles_of_another_scale(seed: int, stretch: float) -> None:
         assert shown.stretch_sigma < 0.01
     if stretch == 1:
         assert shown.axis_col == pytest.approx(AXIS, abs=0.1)
-        assert not shown.flipped.any()
         assert np.ptp(shown.down) < 8 * shown.down_sigma
 
 
@@ -39,12 +38,6 @@ def test_heights_of_views() -> None:
     shown = moments_of(noisy(views), ANGLES, AXIS)
     expected = sinks / 2 - (sinks / 2).mean()
     np.testing.assert_allclose(shown.down, expected, atol=0.25)
-
-
-def test_views_upside_down() -> None:
-    views = noisy(Balls(ANGLES, SHAPE, AXIS).views())
-    views[1::2] = views[1::2, ::-1]
-    assert np.array_equal(np.flatnonzero(moments_of(views, ANGLES, AXIS).flipped), np.arange(1, ANGLES.size, 2))
 
 
 def test_what_few_rows_and_views_do_not_tell() -> None:

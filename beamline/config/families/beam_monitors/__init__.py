@@ -31,18 +31,16 @@ class ElectrometerConfig(BeamMonitorSection):
     """An electrometer or picoammeter on a serial port that answers a query with a line containing a number."""
 
     kind: Literal["electrometer"]
-    port: Annotated[str, Field(min_length=1)]
-    """A serial port, socket://host:port, or sim://electrometer."""
+    port: Annotated[str, Field(min_length=1)] = Field(
+        description="A serial port, socket://host:port, or sim://electrometer."
+    )
     query: Annotated[str, Field(min_length=1)] = QUERY
-    pattern: Pattern = PATTERN
-    """Regular expression whose first group is the number."""
+    pattern: Pattern = Field(default=PATTERN, description="Regular expression whose first group is the number.")
     unit: str = "A"
-    setup: tuple[str, ...] = ()
-    """Commands without a reply, sent once at the start."""
+    setup: tuple[str, ...] = Field(default=(), description="Commands without a reply, sent once at the start.")
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
     baudrate: PositiveInt = 9600
-    transcript: str | None = None
-    """As the stage's."""
+    transcript: str | None = Field(default=None, description="As the stage's.")
 
     @property
     def counterpart(self) -> str:
@@ -73,10 +71,8 @@ class RingCurrentConfig(BeamMonitorSection):
     """The ring current from a page or a text file."""
 
     kind: Literal["ring_current"]
-    url: Annotated[str, without(url_problem)]
-    """http://..., https://... or file:///..."""
-    pattern: Pattern
-    """Regular expression whose first group is the number."""
+    url: Annotated[str, without(url_problem)] = Field(description="http://..., https://... or file:///...")
+    pattern: Pattern = Field(description="Regular expression whose first group is the number.")
     unit: str = "mA"
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:
@@ -88,8 +84,7 @@ class EpicsBeamConfig(BeamMonitorSection):
     """The ring current, or an intensity, from an EPICS process variable."""
 
     kind: Literal["epics"]
-    pv: PvUrl
-    """pva://NAME or ca://NAME."""
+    pv: PvUrl = Field(description="pva://NAME or ca://NAME.")
     unit: str = "mA"
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:

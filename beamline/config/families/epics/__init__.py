@@ -32,8 +32,7 @@ class EpicsShutter(section_of("EpicsShutterKeys", FoundShutter, declared(Shutter
 class EpicsFilter(section_of("EpicsFilterKeys", FoundFilter, _KIND | declared(FilterPvs))):  # type: ignore[misc]
     """Filters behind EPICS process variables, each as pva://NAME or ca://NAME."""
 
-    places: Annotated[dict[Name, float | str], Field(min_length=1)]
-    """Name: value."""
+    places: Annotated[dict[Name, float | str], Field(min_length=1)] = Field(description="Name: value.")
 
     @model_validator(mode="after")
     def _one_value_a_place(self) -> Self:

@@ -42,7 +42,6 @@ def test_a_simulated_instrument_has_only_a_computer(tmp_path: Path) -> None:
     *checks, done = events(result)
     verdicts = {check["name"]: check["verdict"] for check in checks}
     assert verdicts == {
-        "frame rate": "ok",
         "camera link": "not applicable",
         "camera library": "not applicable",
         "stage port": "not applicable",
@@ -50,15 +49,12 @@ def test_a_simulated_instrument_has_only_a_computer(tmp_path: Path) -> None:
         "file locks": "ok",
         "disk speed": "ok",
         "memory": "ok",
-        "packages": "ok",
     }
-    assert (done["event"], done["ok"], done["failed"], done["not_applicable"]) == ("done", 6, 0, 3)
+    assert (done["event"], done["ok"], done["failed"], done["not_applicable"]) == ("done", 4, 0, 3)
     speed = next(check for check in checks if check["name"] == "disk speed")
     # demo.yaml: frames of 144 x 160 with previews of 36 x 40, of which flats and darks come fastest
     per_frame, fastest = 144 * 160 * 2 + 36 * 40 * 4, 0.037 + (72 + 5) * 7.2e-6
     assert speed["values"]["needed_bytes_per_s"] == pytest.approx(per_frame / fastest, rel=1e-3)  # type: ignore[index]
-    rate = f"{1 / fastest:.3g} frames/s = {144 * 160 * 2 / fastest / 1e6:.3g} MB/s"
-    assert rate in str(checks[0]["observed"]) and f"at most {rate}" in str(checks[0]["expected"])
     assert list(tmp_path.iterdir()) == []
 
 

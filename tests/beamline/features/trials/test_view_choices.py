@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.trials.launch import averaged
 from beamline.features.trials.study import clearest
 from beamline.features.trials.view_choices import STUDIES, ViewChoice, ViewSet
+from beamline.features.trials.worker import averaged
 from recon.base.geometry import Geometry
 from tests.beamline.prepared_views import prepared_views
 

@@ -247,7 +247,7 @@ def test_virtual_frames_that_cannot_be_read_are_no_zeros(tmp_path: Path, lose: C
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
     lose(tmp_path / "pixels.h5")
-    with pytest.raises(DataError, match=r"draws on itself" if lose is ITSELF else r"frames from.*pixels\.h5"):
+    with pytest.raises(DataError, match=r"frames from.*pixels\.h5"):
         open_scan(path)
 
 
@@ -302,7 +302,7 @@ def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
         pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"),
     ):
         datasets.require_possible(file["exchange/data"])
-    with pytest.raises(DataError, match=r"claims 6e\+09 GB"):
+    with pytest.raises(DataError, match="expected at most"):
         open_scan(tmp_path / "f.h5")
 
 

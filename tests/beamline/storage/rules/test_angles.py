@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angle_order import angles_in_order, angles_stand
-from beamline.storage.rules.angles import angles_seen, coarse_views
+from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, angles_stand, coarse_views
 from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
@@ -113,9 +112,8 @@ GOLDEN = np.arange(64) * 111.246
         (EVEN, EVEN[MIXED], "error", "not in the order of the frames"),
         (EVEN, np.r_[EVEN[:54], np.zeros(10)], "error", "not in the order of the frames"),
         (EVEN, np.where(np.arange(64) == 40, 0, EVEN), "warning", "not between those of their neighbours: frames 48"),
-        (EVEN[PASSES], EVEN, "warning", "look more alike than neighbours"),
     ],
-    ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
+    ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong"],
 )
 def test_angles_in_another_order_than_the_frames_are_told(
     balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], severity: str, says: str

@@ -40,7 +40,7 @@ def _halved(values: np.ndarray) -> np.ndarray:
 def _write(
     path: Path, version: int, codec: str, lead: int = 0, shards: bool = False, unit: str | None = "micrometer"
 ) -> None:
-    zarr = pytest.importorskip("zarr", reason="extra oracle")
+    zarr = pytest.importorskip("zarr", reason="extra zarr")
     group = zarr.create_group(str(path), zarr_format=version)
     names = "tczyx"[2 - lead :]
     axes = [{"name": name, "type": "space" if name in "zyx" else "time"} for name in names]
@@ -123,7 +123,7 @@ def test_one_with_a_large_coarsest_scale_is_copied_as_other_files_are(tmp_path: 
 
 
 def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    zarr = pytest.importorskip("zarr", reason="extra oracle")
+    zarr = pytest.importorskip("zarr", reason="extra zarr")
     zarr.create_group(str(tmp_path / "bare.zarr"))
     zarr.create_array(str(tmp_path / "channels.zarr"), shape=(3, 4, 4, 4), dtype="u1", chunks=(1, 4, 4, 4))
     _write(tmp_path / "cut.zarr", 3, "zstd")
@@ -137,7 +137,7 @@ def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     with opened_volume(tmp_path / "cut.zarr") as record, pytest.raises(DataError, match="cannot be read"):
         _ = record.volume.data[:]
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(DataError, match="pip install zarr"), opened_volume(tmp_path / "bare.zarr"):
+    with pytest.raises(DataError, match=r"pip install splatline\[zarr\]"), opened_volume(tmp_path / "bare.zarr"):
         pass
 
 

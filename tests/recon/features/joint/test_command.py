@@ -24,7 +24,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flag
 
 VIEWS, SPAN = 36, 3.5  # s from the first view to the last
 SCAN = TwoCylinders(np.radians(np.arange(VIEWS) * 111.246), (2, 40), axis_col=19.5)
-ASKED = "--time", "2", "--set", "sweeps=30"
+ASKED = "--time", "2", "--no-moves", "--set", "sweeps=30"
 FADED = 0.5  # of the attenuation of all, at the last view
 
 
@@ -99,9 +99,9 @@ def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path:
 
 
 def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: Path, tmp_path: Path) -> None:
-    method, wanted = recon.TimeSeries(volumes=2, sweeps=30), Selection(axis_col=19.5)
+    method, wanted = recon.TimeSeries(volumes=2, moves=False, sweeps=30), Selection(axis_col=19.5)
     held = api.reconstruct(scan, method, selection=wanted, say=None)
-    assert held.output is None and held.report is None and held.units == "1/mm"
+    assert held.output is None and held.report is None and not held.parameters["moves"] and held.units == "1/mm"
     assert held.seconds_of_volumes == pytest.approx((0, SPAN)) and held.axis_col == 19.5
     with h5py.File(series) as file:
         np.testing.assert_array_equal(held.series.data, file["entry/data/data"][()])
@@ -149,9 +149,10 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
         (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "a box is of one volume"),
         (("--time", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--time", "1"), 2, "--time"),
-        (("--time", "4"), 5, "12 views or more for each"),
+        (("--moves",), 2, "give --time N"),
+        (("--time", "4", "--no-moves"), 5, "12 views or more for each"),
         (("--time", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
-        (("--time", "2", "--memory", "250K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
+        (("--time", "2", "--memory", "300K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
         (("--time", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 2 volumes or more, and 12 views or more"),
         (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
     ],

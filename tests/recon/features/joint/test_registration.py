@@ -11,7 +11,7 @@ import pytest
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.features.joint.energy_fit import EnergyViews
-from recon.features.joint.registration import STEPS, register_energies
+from recon.features.joint.learnt_motion import STEPS, register_energies
 from recon.features.joint.spectral import fit_materials
 from tests.bench.quality_cases import seen_by_simulator
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import recon
 from recon.base.arrays import F32, F64
@@ -65,7 +66,7 @@ def test_shares_are_those_of_linear_interpolation() -> None:
 @pytest.mark.slow
 def test_the_residual_is_that_of_the_series_in_the_views() -> None:
     views = views_of(60, noise=0.05)
-    found = fit_series(views, 3, tv_weight=0.15)
+    found = fit_series(views, 3, motion=True, tv_weight=0.15)
     projector = Projector(views.geometry, found.grid)
     model = np.stack([projector.subset([v]).forward(found.at(t))[0] for v, t in enumerate(views.times)])
     left = np.linalg.norm(model - views.projections) / np.linalg.norm(views.projections)
@@ -81,7 +82,9 @@ def test_a_linear_change_is_found_from_views_without_noise() -> None:
     truth = np.stack([discs(0.0), discs(10.0)])
     whole = Projector(geometry, Grid.matching(geometry))
     data = np.einsum("vk,kvrc->vrc", hats(times, np.array([0.0, 10.0])), np.stack([whole.forward(x) for x in truth]))
-    found = fit_series(TimedViews(data.astype(np.float32), geometry, times), 2, tv_weight=0.01, sweeps=120)
+    found = fit_series(
+        TimedViews(data.astype(np.float32), geometry, times), 2, motion=False, tv_weight=0.01, sweeps=120
+    )
     assert psnr(found.volumes, truth) > 50
     assert psnr(found.at(5.0), truth.mean(0)) > 50
 
@@ -91,7 +94,7 @@ def test_a_scan_counts_at_most_so_many_moments_and_learns_the_same(monkeypatch: 
     views, found = views_of(60, noise=0.05), list[F32]()
     for most in (16, 64):
         monkeypatch.setattr("recon.features.joint.series.MOMENTS", most)
-        found.append(fit_series(views, 3, tv_weight=0.5, sweeps=20).volumes)
+        found.append(fit_series(views, 3, motion=False, tv_weight=0.5, sweeps=20).volumes)
     assert psnr(found[0], found[1]) > 35
 
 
@@ -123,7 +126,7 @@ def test_one_fit_beats_sub_scans_and_one_volume_of_all_views() -> None:
     for parts in (2, 3, 4, 6):
         apart = of_sub_scans(views, parts)
         others.append(mean_psnr({t: apart.at(t) for t in times}))
-    found = fit_series(views, 4, tv_weight=0.35)
+    found = fit_series(views, 4, motion=False, tv_weight=0.35)
     assert found.smooth is not None  # each disc changes by a factor of its own
     assert mean_psnr({t: found.at(t) for t in times}) > max(others) + 1
 
@@ -135,31 +138,65 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
         heard.append(sweep)
         return sweep < 3
 
-    first = fit_series(views, 3, tv_weight=0.05, sweeps=6, go_on=go_on)
-    again = fit_series(views, 3, tv_weight=0.05, sweeps=6, go_on=lambda sweep, _: sweep < 3)
+    first = fit_series(views, 3, motion=False, tv_weight=0.05, sweeps=6, go_on=go_on)
+    again = fit_series(views, 3, motion=False, tv_weight=0.05, sweeps=6, go_on=lambda sweep, _: sweep < 3)
     assert np.array_equal(first.volumes, again.volumes)
     assert heard[-3:] == [1, 2, 3]
     assert first.volumes.dtype == np.float32
 
 
+def blobs() -> F32:
+    """A cylinder [z, y, x] with discs of other densities."""
+    rng = np.random.default_rng(2)
+    y, x = (np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2) * 2 / SIDE
+    slice_ = 0.4 * (np.hypot(x, y) < 0.6).astype(np.float32)
+    for _ in range(12):
+        at_x, at_y = rng.uniform(-0.45, 0.45, 2)
+        slice_[np.hypot(x - at_x, y - at_y) < rng.uniform(0.06, 0.15)] = rng.choice([0, 0.7, 1.0])
+    return np.ascontiguousarray(np.repeat(slice_[None], ROWS, 0))
+
+
 @pytest.mark.slow
-def test_trials_count_down_to_zero_in_each_stage() -> None:
-    """Weights; then factors of the mean."""
+@pytest.mark.parametrize("moves", [True, False])
+def test_views_held_out_tell_a_sample_that_moves_from_one_that_fades_where_angles_rise(moves: bool) -> None:
+    """By five columns of forty in half a turn: views before and after one held out predict it, too."""
+    times, geometry = np.linspace(0, 10, 48), Geometry.parallel(np.pi * np.arange(48) / 48, (ROWS, SIDE))
+    still, projector = blobs(), Projector(geometry, Grid.matching(geometry))
+
+    def at(seconds: float) -> F32:
+        if moves:
+            return np.asarray(ndimage.shift(still, (0, 0, seconds / 2 - 2.5), order=1), np.float32)
+        return still - np.float32(seconds / 20) * np.maximum(still - np.float32(0.4), 0)
+
+    seen = np.stack([projector.subset([v]).forward(at(t))[0] for v, t in enumerate(times)])
+    seen += 0.02 * seen.max() * np.random.default_rng(1).standard_normal(seen.shape).astype(np.float32)
+    found = fit_series(TimedViews(seen, geometry, times), 2, tv_weight=2.3, sweeps=2)
+    assert found.unseen_residuals is not None
+    without, with_motion = found.unseen_residuals
+    assert (found.motion is not None) == (with_motion < without) == moves
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("motion", "stages"), [(None, 3), (False, 2), (True, 2)])
+def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: int) -> None:
+    """Weights, whether it moves (here not), or the motion itself; then factors of the mean, if it does not move."""
     heard = list[int]()
 
     def go_on(sweep: int, residual: float) -> bool:
         heard.append(sweep)
         return True
 
-    fit_series(views_of(48, noise=0.05), 3, sweeps=2, go_on=go_on)
+    fit_series(views_of(48, noise=0.05), 3, motion=motion, sweeps=2, go_on=go_on)
     end = heard.index(2)
     assert heard[end - 1 : end + 1] == [1, 2]
     assert heard[end + 1 :] in ([], [*range(1 - SOLUTION_STEPS, 1)])
     trials = np.array(heard[: end - 1])
     parts = np.split(trials, np.flatnonzero(np.diff(trials) < 1) + 1)
-    assert len(parts) == 2
+    assert len(parts) == stages
     for part in parts:
         assert part[-1] == 0 and len(part) <= 1 - part[0]
+    for fixed in parts[1:2] if motion is not False else ():
+        np.testing.assert_array_equal(fixed, np.arange(1 - len(fixed), 1))
 
 
 def test_an_end_of_the_factors_gives_the_volumes_without() -> None:
@@ -169,9 +206,9 @@ def test_an_end_of_the_factors_gives_the_volumes_without() -> None:
         past.append(sweep)
         return not (sweep <= 0 and 10 in past)
 
-    kept = fit_series(views, 3, tv_weight=0.35, sweeps=10, go_on=go_on)
+    kept = fit_series(views, 3, motion=False, tv_weight=0.35, sweeps=10, go_on=go_on)
     assert past[-1] == 1 - SOLUTION_STEPS and kept.smooth is None
-    whole = fit_series(views, 3, tv_weight=0.35, sweeps=10)
+    whole = fit_series(views, 3, motion=False, tv_weight=0.35, sweeps=10)
     assert whole.smooth is not None and psnr(kept.volumes, whole.volumes) > 20
 
 
@@ -213,9 +250,9 @@ def test_each_part_of_a_scan_with_a_moment_a_view_sees_all_times_and_directions(
     """Also the views held out, of which there are eight parts."""
     views = views_of(72)
     for parts in (8, 9):
-        timed = of_moments(views, np.array([0.0, 10.0]), 72)
+        timed, past = of_moments(views, np.array([0.0, 10.0]), 72)
         part = timed.parted(parts)
-        assert len(timed.cross_sections) == 72
+        assert past.size == 72
         for number in range(parts):
             own = np.flatnonzero(part == number)
             assert own.size == 72 // parts

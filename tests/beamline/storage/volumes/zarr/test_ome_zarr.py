@@ -65,32 +65,12 @@ def test_grey_values_and_thin_volumes_have_scales(tmp_path: Path) -> None:
     np.testing.assert_allclose(second[0, 0], first[0, :2].reshape(2, 265, 2).mean(axis=(0, 2)), atol=0.5 + 1e-6)
 
 
-def test_the_library_of_the_format_reads_it(tmp_path: Path) -> None:
-    zarr = pytest.importorskip("zarr", reason="extra oracle")
-    write_volume(tmp_path / "v.ome.zarr", LARGE)
-    group = zarr.open_group(str(tmp_path / "v.ome.zarr"), mode="r")
-    np.testing.assert_array_equal(group["0"][:], VALUES)
-    np.testing.assert_allclose(group["1"][:], _halved(VALUES), atol=1e-6)
-    assert group.attrs["ome"]["version"] == "0.5"
-
-
-def test_one_of_ours_that_was_compressed_is_refused_with_what_is_read(tmp_path: Path) -> None:
-    write_volume(tmp_path / "v.zarr", LARGE)
-    said = (tmp_path / "v.zarr/0/zarr.json").read_text()
-    (tmp_path / "v.zarr/0/zarr.json").write_text(said.replace('"codecs": [', '"codecs": [{"name": "blosc"}, '))
-    with (
-        pytest.raises(DataError, match="only raw ones"),
-        opened_volume(tmp_path / "v.zarr"),
-    ):
-        pass
-
-
 def test_a_folder_that_lost_chunks_is_refused(tmp_path: Path) -> None:
     write_volume(tmp_path / "v.zarr", LARGE)
     (tmp_path / "v.zarr/0/c/1/0/2").unlink()
-    with opened_volume(tmp_path / "v.zarr") as read, pytest.raises(DataError, match="or was changed"):
-        read.volume.data[10:20]
+    with pytest.raises(DataError, match="lacks 1 of"), opened_volume(tmp_path / "v.zarr"):
+        pass
     assert [finding.severity for finding in validate(tmp_path / "v.zarr")] == ["error"]
     (tmp_path / "v.zarr/0/zarr.json").unlink()
-    with pytest.raises(DataError, match="as a volume"), opened_volume(tmp_path / "v.zarr"):
+    with pytest.raises(DataError, match="as a Zarr"), opened_volume(tmp_path / "v.zarr"):
         pass

@@ -1,5 +1,0 @@
-"""Tango: the running scan as a Tango device."""
-
-COMMANDS = {
-    "tango": ("Serve the running scan as a Tango device.", "NONE", False),
-}

@@ -1,0 +1,267 @@
+"""A table of trials as text, CSV, pictures and a page, and what follows from it in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from beamline.core.files import REPORT, write_whole
+from beamline.core.machine import machine_line
+from beamline.core.text import csv_text
+from beamline.features.trials.trial import HELD_OUT, LEAST_GAIN, Outcome, TrialTable
+from beamline.features.trials.view_choices import DOSE, SCAN_TIME
+from beamline.report.figures import WIDTH, new_figure, png
+from beamline.report.html import Picture, render
+from beamline.report.metrics import METRICS
+from beamline.report.sheets import SliceSheet
+from recon.methods import by_name
+
+if TYPE_CHECKING:
+    pass
+
+FIGURES = {
+    "psnr": ("PSNR", "dB against the truth"),
+    "ssim3d": ("SSIM", "mean over the slices of three directions, against the truth"),
+    "psnr_all": ("PSNR all", "dB against the volume of all views by the same method"),
+    "ssim_all": ("SSIM all", "against the same volume"),
+    "snr": ("SNR rims", "dB, of the whole dense and empty region, with their rims"),
+    "cnr": ("CNR rims", "dB, of the same regions"),
+    "rmse": ("RMSE", "of the activity"),
+    "signal_to_background": ("S/B", "hot regions over the body"),
+    "sbr_error": ("S/B err", "its largest error, of a hot region, relative"),
+    "recovery": ("hot", "contrast of hot regions over the truth's"),
+    "spillover": ("cold", "level of cold regions over the body's"),
+    "variation": ("noise", "standard deviation of the body over its level"),
+    HELD_OUT: ("held out", METRICS[HELD_OUT].label),
+    "resolution": ("FSC", "period in {} to which two halves of the views agree"),
+}
+"""Heading of each metric of a trial, and what it is; `{}` is the unit of length."""
+_DIGITS_OF = {"psnr_all": "psnr", "ssim_all": "ssim3d"}
+_QUALITY = {
+    "psnr": "PSNR (dB)",
+    "psnr_all": "PSNR all views (dB)",
+    HELD_OUT: "−20 log₁₀ of the held-out residual (dB)",
+}
+_FSC = (
+    "FSC: a smaller period is better among settings of one method only. Two halves with the same regularisation agree "
+    "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
+    "at the slices."
+)
+_NEAR = 1.0  # dB below the best figure: a tenth more error
+_SHOWN_DB = 12.0  # below the best; worse trials are not drawn
+_WIDTH = 120  # characters
+
+
+def page_of(table: TrialTable) -> str:
+    """File name of the page."""
+    return "tradeoff.html" if table.name == "tradeoff" else REPORT
+
+
+def columns(table: TrialTable) -> list[str]:
+    """Headings of the table."""
+    facts = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.facts))
+    return [*facts, "s", "CPU s", "MB", *(words for name, (words, _) in FIGURES.items() if name in table.metrics)]
+
+
+def cells(table: TrialTable, outcome: Outcome) -> list[str]:
+    """The values of a row under `columns`, as text."""
+    facts = [f"{value:.4g}" for value in outcome.trial.facts.values()]
+    memory = "–" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
+    shown = [name for name in FIGURES if name in table.metrics]
+    figures = [_figure(name, outcome.metrics[name]) if name in outcome.metrics else "–" for name in shown]
+    return [*facts, _seconds(outcome.seconds), _seconds(outcome.cpu_seconds), memory, *figures]
+
+
+def _figure(name: str, value: float) -> str:
+    """With its digits; "equal" for the PSNR of two equal volumes."""
+    name = _DIGITS_OF.get(name, name)
+    if name == "resolution":
+        return f"{value:.3g}" if math.isfinite(value) else "none"
+    if math.isfinite(value):
+        return f"{value:.{METRICS[name].digits}f}"
+    return "equal" if name == "psnr" and value > 0 else "undefined"
+
+
+def _seconds(seconds: float) -> str:
+    """Three significant digits; whole seconds from a hundred on."""
+    if not math.isfinite(seconds):
+        return "n/a"
+    return f"{seconds:.0f}" if seconds >= 100 else f"{seconds:.3g}"
+
+
+def _status(outcome: Outcome) -> str:
+    return f"{'left out' if outcome.trial.left_out else outcome.status}: {outcome.message}".rstrip(": ")
+
+
+def text(table: TrialTable) -> str:
+    """The table for people; * marks the rows on the front of time and quality."""
+    head, front = columns(table), _marked(table)
+    width = max(len(outcome.trial.label) for outcome in table.outcomes)
+    wide = [max(8, len(name) + 2) for name in head]
+
+    def row(mark: str, label: str, words: Sequence[str]) -> str:
+        return f"{mark} {label:<{width}}{''.join(f'{w:>{n}}' for w, n in zip(words, wide, strict=True))}"
+
+    lines = [table.question] if table.question else []
+    lines += [machine_line(dict(table.machine)), "", row(" ", "trial", head)]
+    for outcome in table.outcomes:
+        if outcome.status == "done":
+            lines.append(row("*" if outcome in front else " ", outcome.trial.label, cells(table, outcome)))
+        else:
+            lines.append(f"  {outcome.trial.label}  {_status(outcome)}")
+    legends = [f"{words}: {legend}" for name, (words, legend) in FIGURES.items() if name in table.metrics]
+    notes = ["; ".join(legends).format(table.length_unit) + "."] if legends else []
+    notes += ["*: on the front of time and quality."] if front else []
+    notes += [*sentences(table), *(f"{o.trial.label}: {o.message}." for o in table.compared if o.message)]
+    return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
+
+
+def write_table(folder: Path, table: TrialTable) -> None:
+    """Write NAME.csv, a line for each trial, in place of an earlier one; a value that is not known is empty."""
+    rows = [table.record(outcome) for outcome in table.outcomes]
+    content = csv_text([list(rows[0]), *(row.values() for row in rows)])
+    write_whole(folder / f"{table.name}.csv", content, replace=True)
+
+
+def write_page(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
+    """Write the pictures that have data, and the page."""
+    pictures = dict(_pictures(table, slices))
+    for name, picture in pictures.items():
+        write_whole(folder / name, picture.png, replace=True)
+    write_whole(folder / page_of(table), to_html(table, list(pictures.values())), replace=True)
+
+
+def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
+    """The table and its pictures as an HTML page."""
+    front = _marked(table)
+    counts = f"{len(table.compared)} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
+    return render(
+        "trials.html",
+        title=table.title,
+        summary=f"{table.question} {counts}".strip(),
+        sentences=sentences(table),
+        pictures=pictures,
+        columns=columns(table),
+        rows=[
+            {
+                "label": outcome.trial.label,
+                "marked": outcome in front,
+                "cells": cells(table, outcome) if outcome.status == "done" else [],
+                "reason": _status(outcome),
+            }
+            for outcome in table.outcomes
+        ],
+        bold=bool(front),
+        scan=table.scan,
+        command=table.command,
+    )
+
+
+def _marked(table: TrialTable) -> list[Outcome]:
+    """The rows of a trade-off that are on the front."""
+    return table.front if table.name == "tradeoff" else []
+
+
+def sentences(table: TrialTable) -> list[str]:
+    """What follows from the table, and what its figures mean."""
+    if table.name == "tradeoff":
+        return _conclusions(table)
+    return [*_draws(table), *table.notes]
+
+
+def _conclusions(table: TrialTable) -> list[str]:
+    """The trial that is best for its time, and the time of each further dB along the front."""
+    by, front = table.by, table.front
+    if not front:
+        return ["No trial has both a time and a quality."]
+    best = front[-1]
+    pick = next(outcome for outcome in front if outcome.quality(by) >= best.quality(by) - _NEAR)
+    out = [f"Best for its time: {pick.trial.label}: {pick.quality(by):.2f} dB in {_seconds(pick.seconds)} s."]
+    out += [f"Quality: {_QUALITY[by]}. Fastest: {front[0].trial.label}, {front[0].quality(by):.2f} dB."]
+    for before, after in pairwise(front):
+        rise, cost = after.quality(by) - before.quality(by), after.seconds - before.seconds
+        chance = f" ± {table.chance(after, before):.2f}" * (by == HELD_OUT)
+        price = f"{_seconds(cost)} s more ({_seconds(cost / rise)} s a dB)"
+        out.append(f"+{rise:.2f}{chance} dB for {price}: {after.trial.label}.")
+    highest = max((o for o in table.compared if math.isfinite(o.quality(by))), key=lambda o: o.quality(by))
+    if (gain := highest.quality(by) - best.quality(by)) >= LEAST_GAIN:
+        chance = f"+{gain:.2f} dB by {highest.trial.label}, is within chance (± {table.chance(highest, best):.2f} dB)."
+        out.append(f"There it ends: the best figure, {chance}")
+    return [*out, _FSC] if "resolution" in table.metrics else out
+
+
+def _draws(table: TrialTable) -> Iterator[str]:
+    """Mean and range of the figures over the draws of one choice."""
+    families: dict[tuple[str, str], list[Outcome]] = {}
+    for outcome in table.compared:
+        if outcome.trial.choice is not None and outcome.trial.choice.family:
+            families.setdefault((outcome.trial.method, outcome.trial.choice.family), []).append(outcome)
+    for (method, family), rows in families.items():
+        parts = []
+        for name in [name for name in FIGURES if name in table.metrics]:
+            values = [row.metrics[name] for row in rows if name in row.metrics]
+            mean, low, high = (_figure(name, float(of(values))) for of in (np.mean, min, max))
+            parts.append(f"{FIGURES[name][0]} {mean} ({low} to {high})")
+        yield f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}."
+
+
+def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Picture]]:
+    """Quality against each cost, and the slices of baselines or of all rows, by file name."""
+    if any(math.isfinite(outcome.quality(table.by)) for outcome in table.compared):
+        caption = "Each point is a trial, a colour a method. The line is the best quality at each time."
+        yield "quality.png", Picture("Quality against its costs", caption, quality_plot(table))
+    if labels := slices.labels():
+        caption = "The same slice by each method with its usual settings, all in the grey window of the first."
+        yield "slices.png", Picture("Slices", caption, slices.png(labels))
+    for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
+        caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
+        title = f"{by_name(method).label}, slice by slice"
+        yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))
+
+
+def quality_plot(table: TrialTable) -> bytes:
+    """Quality against time, memory and dose as PNG: a colour a method, and a line along the front of time."""
+    costs = _costs(table)
+    shown = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
+    figure = new_figure((WIDTH, 4.2))
+    panels = figure.subplots(1, len(costs), sharey=True)
+    for axes, (label, cost) in zip(panels, costs.items(), strict=True):
+        for n, method in enumerate(dict.fromkeys(outcome.trial.method for outcome in shown)):
+            points = [(cost(o), o.quality(table.by)) for o in shown if o.trial.method == method]
+            axes.plot(*zip(*points, strict=True), "os^vD"[n // 10 % 5], ms=4, color=f"C{n % 10}", label=method)
+        values = [cost(outcome) for outcome in shown]
+        if min(values) > 0 and max(values) > 4 * min(values):
+            axes.set_xscale("log")
+        axes.set_xlabel(label)
+        axes.grid(alpha=0.3)
+    front = [(outcome.seconds, outcome.quality(table.by)) for outcome in _marked(table)]
+    if front:
+        panels[0].step(*zip(*front, strict=True), where="post", color="black", lw=1.1, alpha=0.5)
+    finite = [outcome.quality(table.by) for outcome in shown]
+    panels[0].set_ylim(bottom=max(min(finite), max(finite) - _SHOWN_DB) - 0.5)
+    panels[0].set_ylabel(_QUALITY[table.by])
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    return png(figure)
+
+
+def _costs(table: TrialTable) -> dict[str, Callable[[Outcome], float]]:
+    """The costs that a picture shows, by the label of their axis. Frames that several views share are counted once."""
+    if any(outcome.trial.facts for outcome in table.compared):
+        return {
+            "dose (photons a pixel)": lambda outcome: outcome.trial.facts[DOSE],
+            "scan time (s)": lambda outcome: outcome.trial.facts[SCAN_TIME],
+        }
+    light, unit, each = table.light, "frames", 1.0
+    if light is not None:
+        unit, each = ("photons a pixel", light.photons) if light.gray is None else ("Gy", light.gray)
+    return {
+        "time (s)": lambda outcome: outcome.seconds,
+        "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
+        f"dose ({unit})": lambda outcome: outcome.trial.frames * each,
+    }

@@ -1,0 +1,335 @@
+"""Angles that views show: those of the same rays, by the angles that the file states, look alike, and no others do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules import Finding
+from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups
+from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
+from drivers.base.frame import FrameKind
+from recon.base.views import spread
+from recon.prep.align import mirror_mismatch
+
+_LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
+OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
+# Of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses; minutes; thousandths of rad.
+_FACTORS = 1 / 0.9, 2.0, 0.5, 60.0, 1000 * math.pi / 180
+PAIRS = 6  # of views that are stated half a turn apart, which are compared
+UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
+_FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
+_AROUND = 9  # views about the best of some that are looked at
+_LEAST_LIGHT = 1e-3  # of the beam
+_FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
+_SINGLE = 0.1  # of the views: so few wrong angles are named one by one
+_BESIDE, _RETRACED = 3, 1.5  # pairs about such frames; times a step: symmetric samples 0.1 to 1.2, two sides 1.75 to 3
+_STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
+_EQUAL = 1e-6  # 1 minus the correlation of equal frames, which rounding makes a little more or less than 0
+ORDER = "angle-order"
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseViews:
+    """Coarse line integrals of views of a scan, each read once.
+
+    Attributes:
+        rows: views that have an angle and can be read, in the order of the file.
+        degrees: float64 [frame], as stated.
+    """
+
+    source: ScanSource
+    light: ViewLight
+    rows: NDArray[np.int64]
+    degrees: NDArray[np.float64]
+    _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
+
+    def depth(self, row: int) -> NDArray[np.float64]:
+        """Line integrals [row, col] of a view, each row less its mean, smoothed along its rows, so that it has two
+        columns less."""
+        if row not in self._depths:
+            lines = self._lines(row)
+            lines = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
+            self._depths[row] = lines - lines.mean(axis=1, keepdims=True)
+        return self._depths[row]
+
+    def _lines(self, row: int) -> NDArray[np.float64]:
+        cells = reference_frame(self.source, row).cells
+        assert cells is not None
+        if self.light.dark is None or self.light.flat is None:
+            return np.nan_to_num(cells.astype(np.float64))
+        beam = np.nan_to_num(self.light.flat - self.light.dark)
+        least = _LEAST_LIGHT * max(float(beam.max()), 1e-30)
+        seen = np.nan_to_num(cells - self.light.dark)
+        return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
+
+    def _is_lit(self, row: int) -> bool:
+        cells, dark, flat = reference_frame(self.source, row).cells, self.light.dark, self.light.flat
+        if cells is None or dark is None or flat is None:
+            return bool(np.ptp(self._lines(row)))
+        return brightness(cells, dark, flat) > LEAST * self.light.usual
+
+    def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether views have light and show a sample [view]."""
+        return np.array([self._is_lit(row) for row in rows.tolist()], np.bool_)
+
+    def lit_pairs(self, first: NDArray[np.int64], second: NDArray[np.int64]) -> list[Pair]:
+        """A few pairs of views, evenly spread, both with light."""
+        some = spread(np.arange(first.size), PAIRS)
+        some = some[self.lit(first[some]) & self.lit(second[some])]
+        return list(zip(first[some].tolist(), second[some].tolist(), strict=True))
+
+    def unlike(self, pair: Pair, mirrored: bool = False) -> float:
+        """1 minus the correlation of two views; of mirror images about the column of best agreement, which is sought
+        in the middle half, and in the whole field where it lies at the edge of that."""
+        one, other = self.depth(pair[0]), self.depth(pair[1])
+        if not mirrored:
+            power = float(np.linalg.norm(one) * np.linalg.norm(other))
+            return 1 - float((one * other).sum()) / power if power > 0 else 1.0
+        places = np.arange(0, one.shape[1] - 0.9, 0.5)  # half columns, since edges are sharp
+        one, other = (np.stack([np.interp(places, places[::2], row) for row in image]) for image in (one, other))
+        cols = one.shape[1]
+        for reach in (cols // 4, cols // 2):
+            curve = mirror_mismatch(one, other, (cols - 1 + np.arange(-reach, reach + 1)) / 2)
+            at = int(np.argmin(curve))
+            if 0 < at < 2 * reach:
+                below, here, above = curve[at - 1 : at + 2]
+                return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
+        return float(curve.min())
+
+    def typical(self, pairs: Sequence[Pair], mirrored: bool = False) -> float:
+        """Median of `unlike`."""
+        return float(np.median([self.unlike(pair, mirrored) for pair in pairs]))
+
+
+def coarse_views(source: ScanSource) -> CoarseViews | None:
+    """The coarse views of a scan, if it has enough views, and their line integrals are known."""
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    kinds = set(source.image_key.tolist())
+    counts = source.quantity == "counts"
+    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+        return None
+    if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
+        return None
+    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
+    views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
+    return CoarseViews(source, light, views, np.degrees(source.angles)) if views.size >= _LEAST_SEEN else None
+
+
+def angles_shown(source: ScanSource) -> Iterator[Finding]:
+    """Views show the turns, and the order of angles, that the file states."""
+    if (seen := coarse_views(source)) is not None:
+        yield from angles_stand(seen)
+        yield from angles_seen(seen)
+        yield from angles_in_order(seen)
+
+
+def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
+    """Frames in a row that are stated at one angle look alike, as those that are averaged do.
+
+    Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
+    """
+    degrees = seen.degrees[seen.rows]
+    starts = np.flatnonzero(np.diff(degrees, prepend=np.nan) != 0)
+    lengths = np.diff(starts, append=degrees.size)
+    runs = spread(np.flatnonzero(lengths >= _STANDS), PAIRS)
+    first, second, last = (seen.rows[starts[runs] + later] for later in (0, 1, lengths[runs] - 1))
+    if not runs.size or not (seen.lit(first) & seen.lit(last)).all():
+        return
+    beside, across = (
+        max(_EQUAL, seen.typical(list(zip(first.tolist(), later.tolist(), strict=True)))) for later in (second, last)
+    )
+    if across > _TURNED * beside:
+        n = int(np.median(lengths[lengths >= _STANDS]))
+        first_of_each = f" Or --frames 0::{n} takes the first view of each angle." if (lengths[:-1] == n).all() else ""
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"Angles stand for {n} frames each, which differ (frames {first[0]} and {last[0]}, both stated at "
+            f"{seen.degrees[first[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were "
+            f"read back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} "
+            f"views by --angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly."
+            f"{first_of_each}",
+        )
+
+
+def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
+    """Views half a turn apart by their angles are mirror images (a whole turn: alike), and no others are.
+
+    Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
+    sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
+    does: a round sample shows no angle.
+    """
+    views = seen.rows[np.argsort(seen.degrees[seen.rows], kind="stable")]
+    some = _some_lit(seen, views)
+    stated = seen.degrees[some]
+    if np.unique(stated).size < _LEAST_SEEN:
+        return
+    apart = max(np.ptp(stated) / _FINE, float(np.median(np.diff(np.unique(seen.degrees[views])))))
+    beside = _nearest(seen, views, stated + apart)
+    chosen = spread(np.flatnonzero(beside != some), PAIRS)
+    if not chosen.size:
+        return
+    near = seen.typical(list(zip(some[chosen].tolist(), beside[chosen].tolist(), strict=True)))
+    for mirrored in (True, False) if seen.source.cone is None else (False,):
+        turn = _turn_seen(seen, views, some, near, mirrored)
+        if turn is not None:
+            yield _angles_finding(seen.source, seen.degrees[views], turn, mirrored)
+            return
+
+
+def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
+    some = spread(views, VIEWS)
+    return some[seen.lit(some)]
+
+
+def _nearest(seen: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The view that is stated nearest to each of these angles."""
+    return views[np.abs(seen.degrees[views] - degrees[:, None]).argmin(axis=1)]
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Two frames that look half a turn apart (or a whole turn), and two that are stated to be; None: none are."""
+
+    alike: Pair
+    degrees: float
+    stated: Pair | None
+
+
+def _turn_seen(
+    seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float, mirrored: bool
+) -> _Turn | None:
+    """Views that are alike after another angle than they should be, where those that should be are not.
+
+    Args:
+        views, some: all, and some of them, by ascending angle.
+        near: how much neighbours of these some differ.
+    """
+    degrees, period = seen.degrees, (180.0 if mirrored else 360.0)
+    step = float(np.ptp(degrees[some])) / (some.size - 1)
+    partner = _nearest(seen, views, degrees[some] + period)
+    within = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
+    pairs = np.abs(degrees[partner] - degrees[some] - period) <= within
+    stated = seen.lit_pairs(some[pairs], partner[pairs])
+    # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
+    off = min((seen.unlike(pair, mirrored) for pair in stated), default=np.inf)
+    if off < 2 * UNLIKE * near or (not stated and not mirrored):
+        return None
+    first, last, quarter = int(some[0]), int(some[-1]), some.size // 4
+    ends = [(first, row) for row in some[quarter:].tolist()] + [(last, row) for row in some[1:-quarter].tolist()]
+    differences = np.array([seen.unlike(pair, mirrored) for pair in ends])
+    usual, (end, moved) = float(np.median(differences)), ends[int(np.argmin(differences))]
+    around = spread(views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != end)], _AROUND).tolist()
+    best, nearest = min((seen.unlike((end, row), mirrored), row) for row in around)
+    turned, right = abs(float(degrees[nearest] - degrees[end])), max(OTHER * period, 2 * step)
+    apart = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
+    off = min([off, *differences[np.abs(apart - period) <= right]])
+    if abs(turned - period) <= right or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
+        return None
+    return _Turn((min(end, nearest), max(end, nearest)), turned, stated[len(stated) // 2] if stated else None)
+
+
+def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:
+    half, whole = ("half a turn", 180.0) if mirrored else ("a turn", 360.0)
+    known = [factor for factor in _FACTORS if abs(turn.degrees - whole * factor) < np.ptp(degrees) / VIEWS]
+    counted = np.allclose(degrees, np.arange(degrees.size))
+    if counted:
+        unit = "they are 0, 1, 2 and so on, and count the views"
+    elif known == [_FACTORS[0]]:
+        unit = f"they look like gradians: {half} is {whole / 0.9:g}"
+    else:
+        unit = f"they look {whole / turn.degrees:.3g} times as large as stated"
+    pairs = (
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are {'mirror images' if mirrored else 'alike'}, as views {half} "
+        f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
+    )
+    if turn.stated is not None:
+        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
+    # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
+    # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
+    sure = not source.plan and turn.stated is not None and (counted or bool(known))
+    which = "The" if sure else "Unless the sample moved or is symmetric, the"
+    return Finding(
+        "error" if sure else "warning",
+        "angle-spread",
+        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+    )
+
+
+def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
+    """Consecutive frames look alike only if their angles are close, and close angles look alike.
+
+    A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
+    it where the list is shifted, so the places are looked at where angles jump.
+    """
+    rows, degrees = seen.rows, seen.degrees[seen.rows] % 360
+    order = np.argsort(degrees, kind="stable")
+    gaps = np.diff(degrees[order])
+    if not (gaps > 0).any():
+        return
+    step = float(np.median(gaps[gaps > 0]))
+    jumps = np.flatnonzero(np.abs((np.diff(degrees) + 180) % 360 - 180) > _FAR * step)
+    beside = np.flatnonzero((gaps <= _NEXT * step) & (np.abs(np.diff(order)) > 1))
+    far = seen.lit_pairs(rows[jumps], rows[jumps + 1])
+    near = seen.lit_pairs(rows[order[beside]], rows[order[beside + 1]])
+    if far and near and seen.typical(near) > UNLIKE * seen.typical(far):
+        yield _in_another_order(seen, jumps, far[0], near[0])
+    elif seen.source.cone is None and (pair := _mirrored_neighbours(seen, rows[order])) is not None:
+        yield Finding(
+            "warning",
+            ORDER,
+            f"{_stated(seen, pair)} are mirror images, as views half a turn apart are. Unless the sample moved, "
+            "the angles were taken modulo 180 degrees, or frames lie in another order than their angles. Give one for "
+            "each projection, in their order, with --angles FILE.",
+        )
+
+
+def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> Pair | None:
+    """Two frames that are stated side by side and look half a turn apart; None where none are. Rows by their angles.
+
+    A sample that is symmetric looks alike both ways, and one that moved looks unlike both ways. One with a plane of
+    symmetry retraces its views beyond it, mirrored, which frames of two sides do not.
+    """
+    some = _some_lit(seen, rows)
+    if some.size <= PAIRS:
+        return None
+    pairs = list(zip(some[:-1].tolist(), some[1:].tolist(), strict=True))
+    apart = np.diff(seen.degrees[some] % 360)
+    allowed = np.maximum(apart / np.median(apart[apart > 0]), 1) ** 2  # views differ by the square of a small turn
+    unlike = np.array([seen.unlike(pair) for pair in pairs])
+    rate = np.pad(unlike / allowed, 2, mode="edge")
+    near = np.median(np.lib.stride_tricks.sliding_window_view(rate, 5), axis=1)  # some directions change faster
+    usual = np.maximum(near, np.median(rate))
+    for at in np.flatnonzero(unlike > UNLIKE * usual * allowed)[:PAIRS].tolist():
+        around = list(zip(some[at::-1].tolist(), some[at + 1 :].tolist(), strict=False))[:_BESIDE]
+        mirrored = [seen.unlike(pair, mirrored=True) for pair in around]
+        retraced = len(around) == _BESIDE and np.mean(mirrored) < _RETRACED * usual[at]
+        if not retraced and mirrored[0] < min(2 * usual[at] * allowed[at], unlike[at] / UNLIKE):
+            return pairs[at]
+    return None
+
+
+def _stated(seen: CoarseViews, pair: Pair) -> str:
+    first, second = seen.degrees[list(pair)]
+    return f"Frames {pair[0]} and {pair[1]}, stated at {first:.6g} and {second:.6g} degrees,"
+
+
+def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
+    text = f"{_stated(seen, far)} look alike, and f{_stated(seen, near)[1:]} do not. "
+    single = np.intersect1d(jumps, jumps + 1)  # between two jumps
+    if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
+        wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
+        text += f"The angles of {single.size} views are not between those of their neighbours: frames {wrong}. "
+        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one a line).")
+    text += (
+        "The angles are not in the order of the frames. Give one for each projection, in their order, with "
+        "--angles FILE."
+    )
+    return Finding("warning" if seen.source.plan else "error", ORDER, text)

@@ -1,0 +1,1 @@
+"""Compressed copies of scan files, compared with them frame by frame."""

@@ -1,0 +1,146 @@
+"""Processes on this machine or on others that reconstruct slabs, by dask.distributed."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from threading import Event
+from typing import Any
+
+import dask
+import numpy as np
+from distributed import Client, Future, KilledWorker, LocalCluster
+from numpy.typing import NDArray
+
+import recon
+from beamline.core.errors import BeamlineError, ConfigError
+from recon import Geometry, Reconstruction, RunControl
+from recon.base.method import Method
+
+_CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
+_PATIENCE = 60.0  # s that work goes without any worker
+LOOK_EVERY = 2.0  # s between two checks for a worker
+_TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}  # modules in the current folder are not imported
+
+
+class WorkersLostError(BeamlineError):
+    """Workers did not come back with a slab."""
+
+    exit_code = 5
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Workers that reconstruct; another worker repeats the work of a lost one.
+
+    Attributes:
+        patience: s after which work without any worker is given up.
+    """
+
+    workers: int
+    client: Client
+    patience: float = _PATIENCE
+
+    def reconstruct(
+        self,
+        projections: NDArray[np.float32],
+        geometry: Geometry,
+        method: Method,
+        *,
+        control: RunControl,
+        **settings: Any,
+    ) -> Reconstruction:
+        """Reconstruct on a worker with as many threads as this process has; without progress and stop.
+
+        Raises:
+            WorkersLostError: several workers were lost with this work, or all workers, or the scheduler.
+        """
+        import numba  # here: beamline loads it after recon's compiled kernels
+
+        work = (np.array(projections), geometry, method, settings, control.decide)
+        future = self.client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
+        try:
+            self._wait_for(future)
+            made: Reconstruction = future.result()
+        except (KilledWorker, CancelledError) as error:
+            raise WorkersLostError(
+                f"The scheduler, or several workers with the same slab, were lost ({error}). They may lack memory: "
+                "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
+            ) from error
+        return made
+
+    def _wait_for(self, future: Future) -> None:
+        """Return when it is done; raises WorkersLostError after `patience` without a worker."""
+        look, alone, done = min(LOOK_EVERY, self.patience), 0.0, Event()
+        # Not result(look): each TimeoutError of it is in a cycle with its frames, and these hold the partial volume.
+        future.add_done_callback(lambda _: done.set())
+        while not (done.wait(look) or future.done()):
+            alone = 0.0 if _count(self.client) else alone + look
+            if alone >= self.patience:
+                raise WorkersLostError(
+                    f"All workers have left, and none came for {self.patience:g} s. Start some again; slabs that "
+                    "are finished stay: see --resume."
+                )
+
+
+def _count(client: Client) -> int:
+    try:
+        return len(client.scheduler_info(n_workers=-1)["workers"])
+    except OSError:  # the scheduler does not answer
+        return 0
+
+
+def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
+    """On a worker. The same number of threads gives the same bits."""
+    import numba
+
+    data, geometry, method, settings, decide = work
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    made = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
+    return replace(made, gaussians=None, checkpoint=None, settings=dict(made.settings))
+
+
+@contextmanager
+def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
+    """The cluster that `spec` names; workers on this machine end with the block.
+
+    Args:
+        spec: `local:N` for N workers on this machine, or `tcp://HOST:PORT` of a scheduler.
+        first_worker_s: s to wait for the first worker.
+
+    Raises:
+        ConfigError: no scheduler answers, or no worker comes in time.
+    """
+    with ExitStack() as closing:
+        closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
+        address: Any = spec
+        try:
+            if spec.startswith("local:"):
+                os.environ.update(_SAFE_PATH)  # in ours, since multiprocessing starts a helper of its own with it
+                # Without a page on a port, and without a limit of its own: --memory is that of a slab.
+                address = LocalCluster(
+                    n_workers=int(spec.removeprefix("local:")),
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    memory_limit=0,
+                    silence_logs=logging.ERROR,
+                )
+                closing.enter_context(address)
+            client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ConfigError(
+                f"--cluster {spec}: no scheduler answers ({' '.join(str(error).split())}). Nothing was read."
+            ) from error
+        try:
+            client.wait_for_workers(1, first_worker_s)
+        except TimeoutError:
+            raise ConfigError(
+                f"--cluster {spec}: the scheduler has no workers, and none came in {first_worker_s:g} s. Start some: "
+                f"dask worker {spec}."
+            ) from None
+        yield Cluster(max(1, _count(client)), client)

@@ -1,0 +1,1 @@
+"""The running scan as a Tango device."""

@@ -1,0 +1,195 @@
+"""Motion: how matter moves while a sample is scanned, smooth in space and time, learnt from the views themselves.
+
+    x(r, t) = Σ_k h_k(t) d_k(r + u(r, t)),    u(r, t) = Σ_m s_m(t) Σ_c B_c(r) a_mc
+
+h_k are hats in time, s_m and B_c natural cubic splines through a few knots. u is 0 in the middle of the scan: there d
+is where it is. The control points a follow from Gauss-Newton steps. In each, the projected slopes of the volume along u
+explain what it leaves of the views. (Zang et al. 2018, ACM Trans. Graph. 37, 138, take optical flow between volumes.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from recon.base.arrays import F32, F64
+from recon.kernels.cpu.warp import pull, push, slopes
+from recon.voxels.projector import Projector
+
+A = TypeVar("A", F32, F64)
+
+MIDDLE = 0.5  # of the scan: u is 0
+_STEPS = 8  # of conjugate gradients
+_SMOOTH = 0.03  # weight of differences between neighbouring control points, over the typical curvature of one
+_SMALL = 1e-3  # likewise of the control points themselves
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Displacements of a volume [y, x, z] at some times.
+
+    Attributes:
+        shape: of the volume.
+        times: [time] within the scan, 0 ... 1.
+        control: a, float64 [knot in time, 3, control y, x, z], in voxels along y, x, z.
+    """
+
+    shape: tuple[int, int, int]
+    times: F64
+    control: F64
+
+    @classmethod
+    def none(cls, shape: tuple[int, int, int], times: F64, knots: int, controls: int) -> Motion:
+        """No motion, with so many knots in time and control points along each axis."""
+        return cls(shape, times, np.zeros((knots, 3, *(min(controls, n) for n in shape))))
+
+    def on(self, shape: tuple[int, int, int], times: F64) -> Motion:
+        """The same motion on voxels of another size, at other times."""
+        return Motion(shape, times, self.control * (shape[1] / self.shape[1]))
+
+    @cached_property
+    def _space(self) -> list[F64]:
+        return [_spline(np.linspace(0, 1, n), c) for n, c in zip(self.shape, self.control.shape[2:], strict=True)]
+
+    @cached_property
+    def _shares(self) -> F64:
+        """s_m [time, knot]."""
+        knots = len(self.control)
+        return _spline(self.times, knots) - _spline(np.array([MIDDLE]), knots)
+
+    def at(self, time: int, control: F64 | None = None) -> F32:
+        """u [3, y, x, z] at a time, from other control points if given."""
+        y, x, z = (part.astype(np.float32) for part in self._space)
+        some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
+        wide = np.einsum("yp,dpqr->dyqr", y, some)
+        wide = np.einsum("xq,dyqr->dyxr", x, wide)
+        return np.ascontiguousarray(wide @ z.T)
+
+    def back(self, time: int, field: F32) -> F64:
+        """The transpose of `at`: from a field [3, y, x, z] to control points."""
+        y, x, z = self._space
+        some = np.einsum("xq,dyxr->dyqr", x, (field @ z.astype(np.float32)).astype(np.float64))
+        some = np.einsum("yp,dyqr->dpqr", y, some)
+        return np.asarray(np.multiply.outer(self._shares[time], some))
+
+
+def _spline(at: F64, knots: int) -> F64:
+    """Natural cubic splines through so many even knots in 0 ... 1, [place, knot]; straight lines for two, 1 for one."""
+    if knots == 1:
+        return np.ones((at.size, 1))
+    even = np.linspace(0, 1, knots)
+    if knots == 2:
+        return np.stack([1 - at, at], 1)
+    from scipy.interpolate import CubicSpline  # half a second
+
+    return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(at))
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Views at one time, as lines [view, col, row]; `weight` None: all weights 1."""
+
+    time: int
+    projector: Projector
+    data: F32
+    weight: F32 | None
+
+
+def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
+    """Minus the gradient of half the weighted squares by the control points, and the derivatives of W x by u at each
+    time.
+    """
+    right, slope = np.zeros_like(motion.control), list[F32]()
+    for part in seen:
+        u, x = motion.at(part.time), image(part.time)
+        left = part.data - part.projector.forward_lines(moved(x, u))
+        slope.append(np.empty_like(u))
+        slopes(x, u, slope[-1])
+        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(weighed(left, part.weight)))
+    return right, slope
+
+
+def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
+    """The motion after a Gauss-Newton step on the views, with differences between control points kept small.
+
+    Args:
+        image: the volume [y, x, z] at a time, before it moves.
+    """
+    right, slope = descent(motion, seen, image)
+
+    def curved(control: F64) -> F64:
+        out = np.zeros_like(control)
+        for part, own in zip(seen, slope, strict=True):
+            along = np.einsum("dyxz,dyxz->yxz", own, motion.at(part.time, control))
+            lines = weighed(part.projector.forward_lines(along), part.weight)
+            out += motion.back(part.time, own * part.projector.adjoint_lines(lines))
+        return out
+
+    some = np.random.default_rng(0).standard_normal(motion.control.shape)
+    typical = float(np.vdot(some, curved(some)) / np.vdot(some, some))
+
+    def normal(control: F64) -> F64:
+        return curved(control) + typical * _rough(control)
+
+    step = np.zeros_like(right)  # a few steps find the large motions first
+    conjugate_gradients(normal, right - typical * _rough(motion.control), step, _STEPS)
+    return Motion(motion.shape, motion.times, motion.control + step)
+
+
+def weighed(lines: F32, weight: F32 | None) -> F32:
+    """The lines multiplied by the weights of their rays, if there are any."""
+    return lines if weight is None else weight * lines
+
+
+def _rough(control: F64) -> F64:
+    """Gradient of half the weighed squares of differences between neighbours in space, and of the values."""
+    out = _SMALL * control
+    for axis in (2, 3, 4):
+        wide = [(0, 0)] * 5
+        wide[axis] = (1, 1)
+        out -= _SMOOTH * np.diff(np.pad(np.diff(control, axis=axis), wide), axis=axis)
+    return out
+
+
+def conjugate_gradients(
+    normal: Callable[[A], A], left: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
+) -> None:
+    """Steps of conjugate gradients (Hestenes & Stiefel 1952) that improve `found` in place.
+
+    Args:
+        left: the right side less `normal` of what was found so far; overwritten.
+        go_on: asked before each step. False ends it.
+    """
+    of_kind = found.dtype.type
+    towards, squares = left.copy(), float(np.vdot(left, left))
+    for _ in range(steps):
+        if squares == 0 or not go_on():
+            break
+        image = normal(towards)
+        length = of_kind(squares / float(np.vdot(towards, image)))
+        found += length * towards
+        left -= length * image
+        before, squares = squares, float(np.vdot(left, left))
+        towards = left + of_kind(squares / before) * towards
+
+
+def moved(x: F32, u: F32 | None) -> F32:
+    """W x (see `recon.kernels.cpu.warp`); x itself without motion."""
+    if u is None:
+        return x
+    out = np.empty_like(x)
+    pull(x, u, out)
+    return out
+
+
+def moved_back(y: F32, u: F32 | None) -> F32:
+    """Wᵀ y; y itself without motion."""
+    if u is None:
+        return y
+    out = np.empty_like(y)
+    push(y, u, out)
+    return out
