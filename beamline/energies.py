@@ -204,8 +204,6 @@ def _attenuation(scans: EnergyScans, scan: ScanSource, selection: Selection) -> 
             f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which chooses "
             "the line of the spectra. Nothing was written."
         )
-    if scan.emission is not None:
-        raise ConfigError(f"{scan.path} is of an emission, whose sample absorbs nothing. Nothing was written.")
     if scans.registered and cone_of(scan, selection) is not None:
         raise ConfigError(
             f"--register: {scan.path} is of a cone, whose rays a shift of the sample turns. Leave it out. Nothing was "

@@ -28,7 +28,6 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_held_out import axis_by_views
-    from recon.features.emission.methods import Mlem, Osem, attenuation_factors, mlem
     from recon.features.iterative.methods import AsdPocs as AsdPocs
     from recon.features.iterative.methods import Cgls as Cgls
     from recon.features.iterative.methods import Sart as Sart
@@ -39,14 +38,11 @@ if TYPE_CHECKING:
     from recon.features.joint.proportions import fit_share
     from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
     from recon.features.joint.spectral import Materials, fit_materials
-    from recon.features.neural.methods import NAF as NAF
-    from recon.features.neural.methods import IntraTomo as IntraTomo
-    from recon.features.neural.methods import SaxNerf as SaxNerf
     from recon.features.published.r2_published import R2Published as R2Published
     from recon.features.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
-    from recon.prep.counts import Counts, Emission, weighted_lines
+    from recon.prep.counts import Counts
     from recon.reconstruction import reconstruct
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.r2 import R2
@@ -66,7 +62,6 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
-    "Emission",
     "Energies",
     "EnergySeries",
     "EnergyViews",
@@ -78,9 +73,7 @@ __all__ = [
     "Grid",
     "Kernel",
     "Materials",
-    "Mlem",
     "OsSirtTv",
-    "Osem",
     "PnpDct",
     "Progress",
     "Projections",
@@ -97,7 +90,6 @@ __all__ = [
     "TimedVolumes",
     "Volume",
     "WithoutRings",
-    "attenuation_factors",
     "axis_by_views",
     "correct",
     "find_axis",
@@ -105,14 +97,12 @@ __all__ = [
     "fit_series",
     "fit_share",
     "geometry_of_vectors",
-    "mlem",
     "project",
     "reconstruct",
     "register_energies",
     "remove_rings",
     "vectors_of",
     "voxelize",
-    "weighted_lines",
 ]
 
 _LAZY = {
@@ -131,8 +121,6 @@ _LAZY = {
     "fit_share": "recon.features.joint.proportions",
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
-    **dict.fromkeys(("Emission", "weighted_lines"), "recon.prep.counts"),
-    **dict.fromkeys(("attenuation_factors", "mlem"), "recon.features.emission.methods"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),

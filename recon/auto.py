@@ -25,7 +25,6 @@ from recon.base.method import (
     Traits,
 )
 from recon.base.volume import Grid
-from recon.base.work import CostedMethod, Costs, Work
 from recon.splatting.finish import FIRST_SHARE, Candidates, beyond_voxels, level_of
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
@@ -43,7 +42,6 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines
-from recon.voxels.work import trial_part
 
 LEFT = "root mean square left of views held out, in line integrals"
 """What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
@@ -294,20 +292,6 @@ class Auto:
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """Work of the single trial that compares all candidates, or of a trial of each."""
-        methods = [_candidate(method) for method in self.candidates]
-        costed = [method for method in methods if isinstance(method, CostedMethod)]
-        part = trial_part(geometry, grid, ROWS)
-        if part is None:
-            return costed[-1].costs(geometry, grid)
-        volumes = {name: work for method in costed for name, work in method.costs(geometry, grid).volumes.items()}
-        fit = self._fit
-        if isinstance(fit, CostedMethod):
-            return Costs(volumes, fit.costs(geometry, grid).choice)
-        trials = [work for method in costed for work in method.costs(*part).volumes.values()]
-        return Costs(volumes, sum(trials, Work()))
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)

@@ -65,11 +65,9 @@ def names_of_one_scan() -> tuple[str, ...]:
     return tuple(name for name, entry in METHODS.items() if entry.several != "materials")
 
 
-def names_compared(emission: bool = False) -> tuple[str, ...]:
-    """Names of the methods that a trade-off tries by default, more for an emission scan; imports no module of this
-    project.
-    """
-    return tuple(name for name, entry in REGISTRY.items() if entry.compared or (emission and entry.emission))
+def names_compared() -> tuple[str, ...]:
+    """Names of the methods that a trade-off tries by default; imports no module of this project."""
+    return tuple(name for name, entry in REGISTRY.items() if entry.compared)
 
 
 def streams(name: str) -> bool:

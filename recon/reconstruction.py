@@ -15,13 +15,12 @@ from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
-from recon.base.method import DataUse, Method, ReconProblem, RunControl, setting
+from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of, setting
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
-from recon.prep.counts import Counts, Emission, line_integrals, weighted_lines
+from recon.prep.counts import Counts, line_integrals
 from recon.voxels.beyond_field import run_in_box_of_sample
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ _LOOKED_AT, _LARGEST = 2**16, 1e15  # values; of line integrals, whose true ones
 
 
 def reconstruct(
-    projections: ArrayLike | Tensor | Counts | Emission,
+    projections: ArrayLike | Tensor | Counts,
     geometry: Geometry,
     method: str | Method = DEFAULT,
     *,
@@ -47,8 +46,7 @@ def reconstruct(
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
             finite, or masked, are filled from their neighbours and weigh nothing. Or what was counted, where photons
             are few. The method is then given line integrals and weights that carry the likelihood of the counts, see
-            `recon.prep.counts.line_integrals`; `use.weights` multiply them. Of an `Emission` likewise, see
-            `recon.weighted_lines`; mlem and osem take the counts themselves.
+            `recon.prep.counts.line_integrals`; `use.weights` multiply them.
         method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
             of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
@@ -73,13 +71,12 @@ def reconstruct(
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
     _refuse_one_side(geometry)
-    if isinstance(projections, Counts | Emission):
+    if isinstance(projections, Counts):
         projections, use = _of_counts(projections, geometry, use)
         data = _line_integrals(projections, geometry)
     else:
         data = _line_integrals(projections, geometry)
-        if use.emission is None:
-            warn_of_other_quantity(data)
+        warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
     if not setting(chosen, "allow_negative", True):
         _warn_of_negative(data)
@@ -87,7 +84,7 @@ def reconstruct(
         raise ValueError(sentence)
     warn_of_degrees(geometry.angles)
     grid = grid or Grid.matching(geometry)
-    _warn_of_unseen_cone(chosen, geometry, grid)
+    _warn_of_unseen_cone(chosen, geometry)
     begin = control.now()
     result = run_in_box_of_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
     return replace(
@@ -123,9 +120,9 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
         )
 
 
-def _warn_of_unseen_cone(method: Method, geometry: Geometry, grid: Grid) -> None:
+def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
-    if lean and isinstance(method, CostedMethod) and method.costs(geometry, grid).choice.amounts:
+    if lean and any(_chooses_prior(each) for each in candidates_of(method)):
         warnings.warn(
             f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
             "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
@@ -133,6 +130,11 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry, grid: Grid) -> None
             "edges",
             stacklevel=3,
         )
+
+
+def _chooses_prior(method: Method) -> bool:
+    """Whether views held out choose a weight of total variation: its own, or that of the finish of a fit."""
+    return bool(getattr(method, "trial_sweeps", 0) or getattr(method, "finish_sweeps", 0))
 
 
 def _refuse_one_side(geometry: Geometry) -> None:
@@ -162,14 +164,14 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         raise ValueError(f"method {method.name!r} has no option {owners}: leave that out, or choose another method")
 
 
-def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
+def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
     """Line integrals, and their weights times the given ones."""
     require_views(geometry, counts.counts, "counts")
     if use.weights is not None:
         require_views(geometry, use.weights, "weights")
-    data, weights = weighted_lines(counts) if isinstance(counts, Emission) else line_integrals(counts)
+    data, weights = line_integrals(counts)
     weights = weights if use.weights is None else weights * use.weights
-    return data, replace(use, weights=weights, emission=counts if isinstance(counts, Emission) else None)
+    return data, replace(use, weights=weights)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

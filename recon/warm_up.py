@@ -13,8 +13,8 @@ from numba.core import event
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of
-from recon.base.method import DataUse, Method, ReconProblem
-from recon.base.volume import Grid, Volume
+from recon.base.method import DataUse, Method
+from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name
 from recon.reconstruction import reconstruct
 from recon.splatting.fit_method import FitMethod
@@ -78,44 +78,6 @@ def _reconstruct_silently(toy: Method, data: F32, views: Geometry, device: str, 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reconstruct(data, views, toy, device=device, use=DataUse(weights))
-
-
-def warm_up_rest() -> None:
-    """Compile half of the kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
-
-    So two processor cores compile. The box of voxels and the end of a step are compiled first, since `warm_up` reaches
-    them last. The kernels of the finish follow.
-    """
-    from recon.kernels.cpu.adam import adam_all, add_lengths
-    from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, camera, grid_layout
-    from recon.kernels.cpu.footprints import HIDDEN
-    from recon.kernels.cpu.losses import total_variation
-    from recon.splatting.finish import finish
-    from recon.splatting.gaussians import Gaussians
-    from recon.splatting.settings import FitSettings
-
-    views = _views_like(None)
-    grid, one = Grid.matching(views), np.ones(1, np.float32)
-    blob = Active(_rows(3), _rows(3) + 2, np.eye(3, dtype=np.float32).reshape(1, 9), one, FitSettings().kernel)
-    layout, into = grid_layout(blob, grid, 0.01, 3.0), Gradients.zeros(1)
-    volume = np.ascontiguousarray(layout.fill())
-    layout.backward(volume, into.means, into.log_scales, into.rotations, into.densities)
-    parameters = [_rows(3), _rows(3), _rows(4), one]
-    adam_all(parameters, parameters, parameters, parameters, [0.0] * 4, 1)
-    into.to_raw(_rows(4), one, 1.0)
-    total_variation(volume, np.empty_like(volume), 1.0)
-    add_lengths(_rows(2), 1.0, np.zeros(1, np.float32))
-    image, hidden, none = np.zeros(_SHAPE, np.float32), Scratch.of(1, _SHAPE), np.empty(0, np.intp)
-    hidden.table.fill(HIDDEN)
-    RenderedView(image, blob, camera(views, 0), 0.0, hidden, none, None).backward(image, into, _rows(2))
-    data, views = toy_of()
-    width, rho = _blob(views)
-    gaussians = Gaussians.from_physical(np.zeros((1, 3)), np.array([width]), np.array([rho]), kernel=blob.kernel)
-    finish(Volume(volume, grid), gaussians, ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
-
-
-def _rows(n: int) -> F32:
-    return np.zeros((1, n), np.float32)
 
 
 @contextmanager

@@ -117,13 +117,10 @@ class Dummy:
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
-from beamline.scan import recorder
 from beamline.scan.run import run_scan
 from beamline.features.files.validate import describe
 import h5py
 from pathlib import Path
-
-recorder.rehearse = lambda monitor, begin: None  # for what is compiled; it would take minutes without
 
 words = ["simulation.clock=virtual", "scan.angles.views=6", "devices.camera.roi=[1140, 2008, 24, 80]"]
 words += ["scan.darks.count=2", "scan.flats.count=2", "scan.flats.at=start", "scan.period_s=2", "scan.mode=step"]

@@ -6,7 +6,7 @@ import shlex
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,7 +19,7 @@ from beamline.cli.options import json_events, refuse_contradictions, refuse_shar
 from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
-from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
+from beamline.cli.terminal import events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
 from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
@@ -39,21 +39,17 @@ if TYPE_CHECKING:
 
 
 class LogLines:
-    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence.
+    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence."""
 
-    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
-    """
-
-    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
-        self._ignored = closed_terminal_ignored if terminal else nullcontext
 
     def __call__(self, event: Event) -> None:
         text = None if isinstance(event, ReconStarted) else sentence(event)
         if text is None:
             text = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock, self._ignored():
+        with self._lock:
             self._stream.write(f"{at}  {event.event}: {printable(' '.join(text.split()))}\n")
             self._stream.flush()
 
@@ -233,7 +229,7 @@ def run_reconstruction(
             stop.ready = True
 
     with events_shown(values["as_json"]) as usual:
-        shown = LogLines(sys.stderr, terminal=True) if values.get("verbose") and not values["as_json"] else usual
+        shown = LogLines(sys.stderr) if values.get("verbose") and not values["as_json"] else usual
         with logged(values.get("log"), shown) as lines:
             sink = fan_out(made, *lines, shown)
             scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
@@ -262,12 +258,10 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import busy
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:
-        needs = estimate(options, MachineSpeed(), busy())
+        needs = estimate(options)
         sink(Done(needs, time=clock.now()))
     if not as_json:
         click.echo("\n".join(needs.lines()))

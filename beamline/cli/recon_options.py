@@ -50,7 +50,7 @@ def cluster_of(text: str) -> str:
 
 
 _OF_FEATURES = in_folders("recon.features", "METHODS").items()
-_FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not (entry.several or entry.emission))
+_FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not entry.several)
 
 
 def region_of(text: str) -> Region | AroundSample:

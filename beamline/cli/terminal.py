@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import sys
@@ -10,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TextIO
 
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from beamline.storage.recon_record import ReconRecord
 
 
-LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
 SAY_EVERY = 0.2  # s between events on the progress of many frames
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
 _COUNTED = {
@@ -84,15 +83,12 @@ class Terminal:
         self._last_text, self._narrated = "", Narration()
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
-        self._long: threading.Timer | None = None  # names the phase after LONG
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._end_of_phase()
-        with closed_terminal_ignored():
-            self._bar.stop()
+        self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
         """Print a request to the operator without the progress bar, and wait until `put` returns."""
@@ -105,25 +101,24 @@ class Terminal:
             self._asking = False
 
     def __call__(self, event: Event) -> None:
-        with self._lock, closed_terminal_ignored():
+        with self._lock:
             for each in self._narrated(event):
                 self._take(each)
 
     def say(self, text: str) -> None:
         """Print a line that is not an event."""
-        with self._lock, closed_terminal_ignored():
+        with self._lock:
             self._console.print(printable(text))
 
     def _take(self, event: Event) -> None:
-        self._end_of_phase()
         match event:
             case FrameStored(n, of):
                 self._show("scan", n, of, rates(event))
             case Counted(stage, n, of):
                 what, counted = _COUNTED.get(stage, (stage, stage))
                 self._show(what, n, of, rate_text(event, counted))
-            case PhaseReached():
-                self._show_phase(event)
+            case PhaseReached(_, counted, phase, n, of) if n or not self._bar.disable:
+                self._show(phase, n, of, rate_text(event, counted))
             case TrialReached(stage, n, of):
                 what = in_folders("beamline.features", "COUNTED").get(stage, "trials")
                 self._show(what, n, of, trials(event, what))
@@ -138,19 +133,6 @@ class Terminal:
                 if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                     self._last_text = text
                     self._console.print(one_line(text, SENTENCE))
-
-    def _show_phase(self, reached: PhaseReached) -> None:
-        if reached.n or not self._bar.disable:
-            self._show(reached.phase, reached.n, reached.of, rate_text(reached, reached.counted))
-            return
-        self._long = threading.Timer(LONG, self.say, [f"{reached.phase}: begun {LONG:.0f} s ago"])
-        self._long.daemon = True
-        self._long.start()
-
-    def _end_of_phase(self) -> None:
-        if self._long is not None:
-            self._long.cancel()
-            self._long = None
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:
@@ -217,34 +199,24 @@ def answering(as_json: bool) -> Iterator[Answer]:
         click.echo("\n".join(answer.lines))
 
 
-@contextmanager
-def closed_terminal_ignored() -> Iterator[None]:
-    """A context that ignores errors from a closed terminal, so that the work continues."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno != errno.EIO:
-            raise
-
-
 def rates(frame: FrameStored) -> str:
     """n/N, frames/s, MB/s and the time left."""
     speed = f"{frame.frames_per_s:.1f} frames/s  {frame.mb_per_s:.1f} MB/s"
-    return f"{frame.n}/{frame.of}  {speed}  {_clock_time(frame.eta_s)} left"
+    return f"{frame.n}/{frame.of}  {speed}  {timedelta(seconds=round(frame.eta_s))} left"
 
 
 def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
     """n/N, rate and remaining time, if known; else that the work has begun."""
     if not (done.of and done.per_s) or done.eta_s is None:
         return "begun"
-    return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
+    return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {timedelta(seconds=round(done.eta_s))} left"
 
 
 def trials(done: TrialReached, what: str = "trials") -> str:
     """n/N, trials/min, remaining time if known, and the running trial."""
     parts = [f"{done.n}/{done.of}"]
     if done.eta_s is not None:
-        parts += [f"{done.per_min:.1f} {what}/min", f"{_clock_time(done.eta_s)} left"]
+        parts += [f"{done.per_min:.1f} {what}/min", f"{timedelta(seconds=round(done.eta_s))} left"]
     return "  ".join([*parts, one_line(done.label, SENTENCE)])
 
 
@@ -260,7 +232,7 @@ def fit(at: FitReached) -> str:
     if at.held_out is not None and math.isfinite(at.held_out):
         parts.append(f"held out {at.held_out:.4f}")
     if at.eta_s is not None:
-        parts.append(f"{_clock_time(at.eta_s)} left")
+        parts.append(f"{timedelta(seconds=round(at.eta_s))} left")
     return ", ".join(parts)
 
 
@@ -296,10 +268,15 @@ def results(record: ReconRecord) -> str:
         lines.append(f"{'volumes' if several else 'volume':<10}{several}{shape} in {record.unit or 'volume fractions'}")
     lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
     lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
+    return "\n".join([*lines, "", *_metrics_of(record)])
+
+
+def _metrics_of(record: ReconRecord) -> list[str]:
+    """Lines of a table of metrics by method."""
     columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
     if record.compared is not None:
         columns[BASELINE] = {**record.compared}
-    lines += ["", f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
+    lines = [f"{'':<30}" + "".join(f"{name:>14}" for name in columns)]
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
@@ -307,12 +284,7 @@ def results(record: ReconRecord) -> str:
             if name == "seconds" and record.ending.resumed_from:
                 label += ", since resumed"
             lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
-    return "\n".join(lines)
-
-
-def _clock_time(seconds: float) -> str:
-    whole_seconds = round(seconds)
-    return f"{whole_seconds // 3600}:{whole_seconds // 60 % 60:02}:{whole_seconds % 60:02}"
+    return lines
 
 
 LOOK, ACT = "watch", "control"  # Purpose of an address: the first word of its line

@@ -373,8 +373,8 @@ class TrialDone(Event, event="trial"):
     figures: Mapping[str, Any] = _spread()
 
 
-class CostExplained(Listed, event="explain"):
-    """What a frame of a scene costs, by effect."""
+class StepsListed(Listed, event="explain"):
+    """Steps of a frame of a scene in order, and the effects that it does not name."""
 
 
 class Diagnosed(Listed, event="check"):

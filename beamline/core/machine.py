@@ -95,12 +95,6 @@ def usable_cores() -> int:
     return len(psutil.Process().cpu_affinity())
 
 
-def busy() -> float:
-    """How many times as long work on all cores takes beside what ran here in the last minute; 1: nothing did."""
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0  # Windows has none
-    return 1 + load / usable_cores()
-
-
 def free_memory() -> int:
     """Free memory in bytes, without swapping, within the limits of the container and of `memory_limit`."""
     free = [int(psutil.virtual_memory().available), *_left_in_cgroups(CGROUPS, OWN_CGROUP)]

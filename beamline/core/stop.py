@@ -21,7 +21,6 @@ from beamline.core.errors import INTERRUPTED, ScanStopped
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 """Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
-_PRINTING = 0.2  # s that a message to the terminal may delay the stop
 
 
 @contextmanager
@@ -36,16 +35,16 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         if stop.stopping:
             stop.abort("Ctrl-C was pressed again")
-            _say("Aborting.")
+            _print("Aborting.")
         else:
             stop.stop("Ctrl-C was pressed")
-            _say("Stopping cleanly. Press Ctrl-C again to abort.")
+            _print("Stopping cleanly. Press Ctrl-C again to abort.")
 
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
 
     def keep_on(number: int, frame: FrameType | None) -> None:
-        _say("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
+        _print("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
     with _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_asking_to_end(), terminate)}):
@@ -101,13 +100,6 @@ def _asking_to_end() -> list[signal.Signals]:
     """The signals of _ENDING that the system has, and that are not ignored, as SIGHUP under `nohup`."""
     there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
     return [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
-
-
-def _say(text: str) -> None:
-    """Print in a thread of its own: a terminal without a reader must not delay the stop of the scan."""
-    thread = threading.Thread(target=_print, args=(text,), daemon=True)
-    thread.start()
-    thread.join(_PRINTING)
 
 
 def _print(text: str) -> None:

@@ -109,7 +109,9 @@ def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
     )
 
 
-_FORMULA = re.compile(r"[=@\t\r\n]|[+-](?!$|(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$|inf$|nan$)", re.IGNORECASE)
+NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+"""The regular expression of a decimal number without a sign."""
+_FORMULA = re.compile(rf"[=@\t\r\n]|[+-](?!$|{NUMBER}$|inf$|nan$)", re.IGNORECASE)
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

@@ -20,6 +20,7 @@ from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
+from recon.prep.align import mirror_mismatch
 
 EVERY = math.radians(5)  # radians between kept views
 MOST = 36  # of them: half a turn
@@ -243,15 +244,9 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
 
 
 def _nearest(before: Reals, now: Reals) -> int:
-    """Cells across by which `before` fits `now` best: least mean square of what is left in the columns they share."""
-    cols = now.shape[1]
-    reach = int(SEARCH * cols)
-    strips = np.add.reduceat(np.stack([before, now]), np.arange(0, len(now), max(1, len(now) // 16)), axis=1)
-    one, two = strips - strips.mean(axis=(1, 2), keepdims=True)
-    best, least = 0, math.inf
-    for move in range(-reach, reach + 1):
-        a, b = (one[:, : cols - move], two[:, move:]) if move >= 0 else (one[:, -move:], two[:, : cols + move])
-        left = float(np.var(a - b))
-        if left < least:
-            best, least = move, left
-    return best
+    """Cells across by which `before` fits `now` best."""
+    reach = int(SEARCH * now.shape[1])
+    moves = np.arange(-reach, reach + 1)
+    strips = np.add.reduceat(np.stack([before[:, ::-1], now]), np.arange(0, len(now), max(1, len(now) // 16)), axis=1)
+    mismatch = mirror_mismatch(strips[0], strips[1], (now.shape[1] - 1 + moves) / 2)
+    return int(moves[mismatch.argmin()])

@@ -1,14 +1,10 @@
-"""Monitor: all checks together. It takes frames and returns flags; its state is a value.
-
-`rehearse` shows the checks a toy scan, so that their kernels are compiled before the first view.
-"""
+"""Monitor: all checks together. It takes frames and returns flags; its state is a value."""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +15,7 @@ from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
 from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
-from beamline.monitor.digest import FrameDigest, block_side, digests
+from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.field import PixelsCheck
 from beamline.monitor.motion import Shake
 from beamline.monitor.view import NO_SPOTS, CellView, dimmer_than_flats, grid_of, light_left, spots_of, view_of
@@ -125,7 +121,7 @@ def look(
             continue
         begin(check.name)
         try:
-            looks.append(_look_of(check.look(state, frame, digest, monitor.context)))
+            looks.append(_look_of(check.look(state, frame, digest, monitor.context), frame.index))
         except BaseException as error:  # a plug-in may call sys.exit
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
@@ -161,10 +157,12 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
     return replace(digest, preview=preview, peaks=peaks)
 
 
-def _look_of(answer: Any) -> Look[Any]:
-    """What a check returned; TypeError where it is no `Look`, as of one of another package."""
+def _look_of(answer: Any, at: int) -> Look[Any]:
+    """What a check returned at a frame; TypeError where it is no `Look` at frames so far, as of another package's."""
     if not isinstance(answer, Look) or not isinstance(answer.flag, Flag | None):
         raise TypeError(f"it returned {answer!r:.80}; expected a Look with a Flag or None")
+    if answer.flag is not None and not 0 <= answer.flag.frame <= at:
+        raise TypeError(f"its flag is of frame {answer.flag.frame}; expected 0 to {at}")
     return answer
 
 
@@ -238,39 +236,3 @@ def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Moni
         flat = running_mean(context.flat, digest.preview, counted)
         context = replace(context, flat=flat, flat_exposure=frame.exposure, grid=None)
     return replace(monitor, context=context, counted=counted, kind=frame.kind)
-
-
-_SIDE, _BIN = 256, 8  # pixels of a toy frame, and of a pixel of its preview, whose blocks are joined
-_DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts
-_SATURATION, _STEP = 65_535, 0.02  # counts; rad from view to view
-_BEFORE_GHOST = 36  # views
-REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
-
-
-def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None) -> None:
-    """Run the checks on a few small frames, to compile them; the monitor does not change. begin: as in `look`.
-
-    numba keeps what it compiles: once on a machine it takes up to a minute, then a fraction of a second, and nothing
-    for the next scan of the process with the same checks. A check that fails here will say so in the scan.
-    """
-    checks = repr(monitor.checks)
-    if checks in REHEARSED:
-        return
-    # A scan of its own: the views of another step would not be neighbours, and the kernels that compare them not run.
-    toy = start(ScanContext(_SATURATION, _SIDE**2, period=0.1, step=_STEP), monitor.checks)
-    rng = np.random.default_rng(0)
-    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * (SPAN + _BEFORE_GHOST)
-    x = np.arange(_SIDE) - _SIDE / 2
-    for row, kind in enumerate(kinds):
-        level = np.full((_SIDE, _SIDE), _DARK if kind is FrameKind.DARK else _FLAT, np.float64)
-        if kind is FrameKind.PROJECTION:
-            level[:, np.abs(x - 3 * np.sin(_STEP * row)) < _SIDE / 4] = _SAMPLE
-            at = 14 * row % _SIDE
-            level[100:112, at : at + 12] *= 0.8  # a crumb crosses the field; and at last a ghost
-            level *= 1 - 0.2 * np.exp(-(((x + _SIDE / 2 - 14 * (row - _BEFORE_GHOST)) / 30) ** 2))
-        counts = rng.poisson(level).astype(np.uint16)
-        counts[row, row] = 60_000  # a spot
-        frame = Frame(counts, kind, row, row, row, _STEP * row, 1.8e9 + row, 0.1)
-        with suppress(CheckError):
-            toy, _ = look(toy, frame, digests(counts, _SATURATION, _BIN)[0], begin)
-    REHEARSED.add(checks)

@@ -17,8 +17,8 @@ from scipy.ndimage import map_coordinates
 from beamline.core.errors import DataError
 from beamline.page.tiles import TileRegion, bin_mean
 from beamline.storage import hdf5
+from beamline.storage.foreign_zarr import ZarrScale
 from beamline.storage.recon_record import ReconRecord
-from beamline.storage.volumes.base import VolumeScale
 from beamline.storage.volumes.files import opened_volume, times_of
 from beamline.storage.writers.recon_file import opened_reconstruction
 from recon.base.arrays import some_values
@@ -35,7 +35,7 @@ _Piece = tuple[NDArray[Any], TileRegion, int]
 
 def slices_of(path: Path, values: Any, held: int) -> ScaledSlices | CopiedSlices:
     """Open the slices of the voxels in a file."""
-    if isinstance(values, VolumeScale) and 4 * math.prod((values, *values.coarser)[-1].shape) <= held:
+    if isinstance(values, ZarrScale) and 4 * math.prod((values, *values.coarser)[-1].shape) <= held:
         return ScaledSlices(values)
     return CopiedSlices(path, values, held)
 
@@ -46,7 +46,7 @@ class ScaledSlices:
 
     bin, ready = 1, 1.0
 
-    def __init__(self, finest: VolumeScale) -> None:
+    def __init__(self, finest: ZarrScale) -> None:
         self._scales = [(scale, _steps(finest.shape, scale.shape)) for scale in (finest, *finest.coarser)]
 
     def read_more(self) -> bool:
@@ -64,7 +64,7 @@ class ScaledSlices:
             for i, edges in zip(sides, shown.slices, strict=True):
                 first[i] = min(edges.start // bin_, scale.shape[i] - 1)
                 end[i] = min(-(-edges.stop // bin_), scale.shape[i])
-            if _bytes_read(scale, axis, first, end) <= SLICE_READ_BYTES:
+            if _bytes_read(scale, first, end) <= SLICE_READ_BYTES:
                 break
         rows, cols = ((first[i] * bin_, end[i] * bin_) for i in sides)
         return scale.box(_place(first), _place(end)).squeeze(axis), TileRegion(*rows, *cols), bin_
@@ -138,11 +138,10 @@ def _steps(finest: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(2 ** round(math.log2(n / m)) for n, m in zip(finest, shape, strict=True))
 
 
-def _bytes_read(scale: VolumeScale, axis: int, first: list[int], end: list[int]) -> int:
-    """Of a box that is one voxel thick: chunks as a whole, or across z one plane of each."""
+def _bytes_read(scale: ZarrScale, first: list[int], end: list[int]) -> int:
+    """Of a box: its chunks as a whole."""
     chunks = [-(-b // n) - a // n for a, b, n in zip(first, end, scale.chunk, strict=True)]
-    planes = 1 if axis or scale.whole_chunks else scale.chunk[0]
-    return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk) // planes
+    return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk)
 
 
 BINS = 256

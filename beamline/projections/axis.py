@@ -27,7 +27,7 @@ from recon.prep.correct import Projections
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
-_COMPARED = 90  # views that are enough for an axis that is given
+_COMPARED, _FEWEST = 90, 20  # views that are enough for an axis that is given; fewer may be sure and wrong
 _CONFIRMED = 0.5  # columns, of binned views, up to which those held out confirm an axis
 _CANDIDATES = 14  # of the axis of a cone, usually
 
@@ -57,7 +57,8 @@ def rotation_axis(
         by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
-    if selection.axis_col is not None and not posed and cone_of(source, selection) is None:
+    straight = not posed and cone_of(source, selection) is None
+    if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:
         _compare_with_views(source, axis_col, correction, usable.frames, warn)
     return axis_col, axis
 

@@ -92,7 +92,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     24737 above its metal seem to turn by 14 % more, for a reason that is not known.
     """
     geometry, data = prepared.geometry, prepared.projections.data
-    known = prepared.measured is None and prepared.emission is None and prepared.projections.floored <= _FLOORED
+    known = prepared.measured is None and prepared.projections.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or len(data) < _LEAST_VIEWS or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)

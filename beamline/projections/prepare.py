@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +27,13 @@ from beamline.projections.selection import Selection, choose_views, cone_of, pix
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views
+from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.changed import JOINED_DEG
 from beamline.storage.rules.light import without_air
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
-from recon.base.registry import in_folders
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
@@ -97,12 +95,6 @@ def prepare_projections(
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
-    if (emission := source.emission) is not None:
-        if buffer is not None:
-            refuse_spilled(source)
-        views = import_module(in_folders("beamline.features", "VIEWS")["emission"])
-        emitted: PreparedProjections = views.prepare_emission(source, emission, selection, warn)
-        return emitted
     phases = phases or Phases()
     phases.enter("flags and references")
     usable, poses, wide = _usable(source, selection, warn)
@@ -164,16 +156,9 @@ def _with_held_out(
     return prepared
 
 
-def refuse_spilled(source: ScanSource) -> None:
-    """Raise DataError for a scan whose views cannot be stored on disk."""
-    if source.emission is not None:
-        raise DataError(f"{source.path}: an emission scan must fit into memory. Give more --memory, or --rows.")
-
-
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    if source.emission is None:
-        _usable(source, selection, lambda sentence: None)
+    _usable(source, selection, lambda sentence: None)
 
 
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:

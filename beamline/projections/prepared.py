@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.core.quantities import VoxelKind
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.recon_record import Value
@@ -21,7 +20,6 @@ from recon.base.method import Energies, SampleRadius
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.prep.counts import Emission
 from recon.voxels.projector import seen_rays
 
 
@@ -39,7 +37,7 @@ class PreparedProjections:
         held_out_weights: of their rays, as `projections.weights` of the views used; None: as a usual ray of these.
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
-        quantity: what the pixels were: "counts", which were corrected, "line_integrals", or "emission".
+        quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
         flags: of all frames of the scan; None if the file has no flags.
@@ -48,7 +46,6 @@ class PreparedProjections:
         done: what each step did, by name, in the order in which it did.
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
-        emission: the counts behind these views; None: the sample does not emit.
         times: [view] s when each was exposed; None: no method asked for it.
         energies: of the views, where they are of several scans; None: they are of one.
         recorded: what the volume's file says of several scans, by name; empty of one.
@@ -75,7 +72,6 @@ class PreparedProjections:
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
     held_out_ids: NDArray[np.int64] | None = None
     held_out_weights: NDArray[np.float32] | None = None
-    emission: Emission | None = None
     times: NDArray[np.float64] | None = None
     energies: Energies | None = None
     recorded: Mapping[str, Value] = field(default_factory=dict)
@@ -102,11 +98,6 @@ class PreparedProjections:
         """The box of the field, or as wide as the sample was measured to be."""
         grid, sample = Grid.matching(self.geometry), self.sample_radius
         return grid.reaching(sample.radius, self.geometry) if isinstance(sample, SampleRadius) else grid
-
-    @property
-    def kind(self) -> VoxelKind:
-        """The physical quantity of the voxels reconstructed from these views."""
-        return VoxelKind.ATTENUATION if self.emission is None else VoxelKind.ACTIVITY
 
     @property
     def on_disk(self) -> bool:
@@ -159,7 +150,6 @@ class PreparedProjections:
             geometry=geometry,
             view_weights=some(self.view_weights),
             shares=some(self.shares),
-            emission=self.emission and self.emission.summed(views[:, None], geometry),
             times=some(self.times),
             energies=energies and replace(energies, of_view=energies.of_view[views]),
         )

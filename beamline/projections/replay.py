@@ -22,8 +22,8 @@ from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
+from beamline.storage.readers.averaged import stated_frames_per_view
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
-from beamline.storage.readers.changed import stated_frames_per_view
 from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.scan import altered_sentence

@@ -170,10 +170,6 @@ class Light:
     gray: float | None = None
     material: str = ""
 
-    def of(self, frames: int) -> dict[str, float]:
-        """Photons and dose of so many frames, by name."""
-        return {"photons": self.photons * frames} | ({} if self.gray is None else {"gray": self.gray * frames})
-
     def in_words(self) -> list[str]:
         """Light and dose of all views, as sentences."""
         each = f"{self.photons:.4g} photons a pixel and view in the open beam"
@@ -203,18 +199,6 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
     return Light(
         views, photons, _gray(asked.material, source, photons), f"{asked.material} at {source.energy_kev:g} keV"
     )
-
-
-def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
-    """Light and dose of a view, from darks and flats read for it; None if the user did not ask.
-
-    Raises:
-        ConfigError: as `LightAsked.refuse_impossible`, before any frame is read.
-    """
-    if asked is None:
-        return None
-    asked.refuse_impossible(source)
-    return light_of(source, statistics_of(source, lambda n, of: None, (FrameKind.DARK, FrameKind.FLAT)), asked)
 
 
 def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,11 +19,10 @@ from beamline.reconstruct.plan import planned, refuse_before_reading
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
-from recon.base.method import Method, volumes_of
+from recon.base.method import Clock, Method, candidates_of, volumes_of
 from recon.base.volume import Grid, Slab, slabs_of
-from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
-
-_SHARED = 1.3  # from which the text says so
+from recon.forecast import forecast
+from recon.warm_up import warm_up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,6 @@ class Estimate(Need):
     runs in memory.
 
     Attributes:
-        busy: the seconds over those of a machine on which nothing else runs.
         shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
@@ -40,7 +39,6 @@ class Estimate(Need):
         free: bytes on the disk of the output.
     """
 
-    busy: float
     method: str
     views: int
     shape: tuple[int, ...]
@@ -66,20 +64,15 @@ class Estimate(Need):
 
     def _time(self) -> str:
         if self.seconds is None or self.least_seconds is None:
-            return f"not known: {self.method} does not say what it computes"
+            return f"not known: {self.method} has to be tried"
         most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
         span = f"{most}; {least} where the data end it early" if self.least_seconds < self.seconds else most
-        shared = f", {self.busy:.2g} times as long as alone: others use the cores" if self.busy > _SHARED else ""
-        return f"{span}{shared}; reading and correction not counted"
+        return f"{span}; reading and correction not counted"
 
 
-def estimate(options: ReconOptions, rates: Rates, busy: float = 1.0) -> Estimate:
-    """Estimate a reconstruction of a finished scan; for a partial volume, of the missing slabs. No method runs; frames
-    are read only to find a region around the sample.
-
-    Args:
-        rates: of this machine, alone.
-        busy: see `beamline.core.machine.busy`.
+def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
+    """Estimate a reconstruction of a finished scan; for a partial volume, of the missing slabs. The method runs for a
+    few iterations on simulated views; frames are read only to find a region around the sample.
 
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
@@ -99,9 +92,8 @@ def estimate(options: ReconOptions, rates: Rates, busy: float = 1.0) -> Estimate
     options.target.require_room(plan.output, plan.scratch)
     shape, several = Grid.matching(geometry).shape, volumes_of(method)
     missing = plan.missing if plan.slabs else slabs_of(shape[0], shape[0], 0)
-    span = _span(options, method, geometry, missing, rates)
+    span = _seconds(options, method, geometry, missing, now)
     return Estimate(
-        busy=busy,
         method=options.method.name,
         views=geometry.n_views,
         shape=shape if several == 1 else (several, *shape),
@@ -113,8 +105,8 @@ def estimate(options: ReconOptions, rates: Rates, busy: float = 1.0) -> Estimate
         scratch=plan.scratch,
         output=plan.output,
         free=shutil.disk_usage(options.target.output.parent).free,
-        seconds=None if span is None else busy * span.most,
-        least_seconds=None if span is None else busy * span.least,
+        seconds=None if span is None else span[1],
+        least_seconds=None if span is None else span[0],
     )
 
 
@@ -122,21 +114,26 @@ def _slices(slabs: Sequence[Slab]) -> int:
     return sum(slab.own.stop - slab.own.start for slab in slabs)
 
 
-def _span(
-    options: ReconOptions, method: Method, geometry: Geometry, missing: Sequence[Slab], rates: Rates
-) -> Span | None:
-    """The seconds of these slabs; None where the method does not say what it computes."""
+def _seconds(
+    options: ReconOptions, method: Method, geometry: Geometry, missing: Sequence[Slab], now: Clock
+) -> tuple[float, float] | None:
+    """The least and the most seconds of these slabs; None where they are not known before the method is tried."""
     if not missing:
-        return Span(0.0, 0.0)
-    heights = [slab.slices.stop - slab.slices.start for slab in missing]
+        return 0.0, 0.0
+    grid = Grid.matching(geometry)
     try:
-        costs = costs_of(method, parts_of(geometry, heights), decided=options.partial is not None)
+        for candidate in candidates_of(method):
+            warm_up(candidate, geometry)
+        expected = forecast(method, geometry, grid, now)
     except ValueError as error:  # as the method itself refuses the views
         raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}.") from error
-    if costs is None:
+    if expected is None:
         return None
-    span, times = seconds_of(costs, rates), 1 + options.uncertainty  # error bars take at most as long
-    return Span(times * span.least, times * span.most)
+    choice = 0.0 if options.partial is not None else expected.choice  # it was made before
+    share = sum(slab.slices.stop - slab.slices.start for slab in missing) / grid.shape[0]  # slabs overlap
+    bars = 1 + options.uncertainty  # error bars take at most as long
+    least, most = (bars * (choice + share * each(expected.volumes.values())) for each in (min, max))
+    return least, most
 
 
 def _refuse_scan(source: ScanSource, options: ReconOptions) -> None:

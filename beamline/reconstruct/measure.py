@@ -117,7 +117,7 @@ def measure(
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
-    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With views: the residual in up to 16 of
+    With a truth: PSNR, SSIM 3D, NRMSE. With views: the residual in up to 16 of
     the views used, and in the views held out where there are any. Of a detector with more than 2^17 pixels only bands
     of rows with so many pixels are used. `progress` hears how many of these views were compared.
     """
@@ -126,8 +126,6 @@ def measure(
         values["psnr"] = metrics.psnr(truth.data, volume.data)
         values["ssim3d"] = metrics.ssim3d(truth.data, volume.data)
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
-        if prepared is not None and prepared.emission is not None:
-            values |= metrics.contrast(truth.data, volume.data)
     if prepared is None:
         return {name: float(value) for name, value in values.items()}
     some, weights = spread(np.arange(prepared.geometry.n_views), _RESIDUAL_VIEWS), prepared.ray_factors()

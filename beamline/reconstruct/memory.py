@@ -22,7 +22,6 @@ from recon.base.method import Method, candidates_of, volumes_of
 from recon.base.method import for_part as method_for_part
 from recon.base.registry import ADD_ONS, plugins
 from recon.base.volume import Grid
-from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
 from recon.voxels.matter_checks import stray_mass_memory, unexplained_memory
@@ -34,7 +33,6 @@ _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
 _REGIONS, _REGION = 2**21, 12  # voxels at most of the regions that judge volumes (`metrics.sampled`); bytes of a voxel
 _NO_STEPS = StepMemory()
-_EMISSION = 6 * 4  # bytes a pixel: counts, survival, background and weights, and what they are made of
 _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
 
 
@@ -163,7 +161,6 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
     one = stated_geometry(source, selection)
     geometry = with_as_many_views(one, one.n_views + views_of_others(options.source, selection))
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
-    pixel = pixel if source.emission is None else _EMISSION
     part = ScanPart(source, selection, geometry)
     stated = {step.name: step.memory(part) for step in in_order(selection)}
     return ReconMemory(
@@ -185,22 +182,8 @@ def memory_of(options: ReconOptions) -> int:
     return round(SHARE * free / (1 + local_workers(options.cluster)))
 
 
-def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError, before these views are corrected, if they are too few for several volumes."""
-    method = options.method
-    if not method.traits.several or not isinstance(method, CostedMethod):
-        return
-    try:
-        method.costs(geometry, Grid.matching(geometry))
-    except ValueError as error:
-        raise DataError(
-            f"{source.path} cannot be reconstructed by {method.name}: {error}. Nothing was written."
-        ) from error
-
-
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
     """Raise ConfigError for methods and options that need everything in memory."""
-    refuse_few_views(source, options, needs.geometry)
     if (traits := options.method.traits).several:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""

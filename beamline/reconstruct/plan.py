@@ -20,7 +20,7 @@ from beamline.core.machine import Need
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.prepare import DiskBuffer, prepare_projections, refuse_spilled
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, cone_of
 from beamline.reconstruct.measure import read_truth
@@ -30,7 +30,6 @@ from beamline.reconstruct.memory import (
     local_workers,
     memory_of,
     recon_memory_of,
-    refuse_few_views,
     refuse_smallest,
     refuse_whole,
 )
@@ -52,7 +51,7 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.method import SampleRadius
+from recon.base.method import SampleRadius, volumes_of
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
@@ -100,7 +99,6 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         _refuse_region(options, needs.geometry)
     if at_once <= allowed and options.partial is None:
         return _plan(options, needs, allowed)
-    refuse_spilled(source)
     if options.partial is None:
         options.target.refuse_partial()
     if not options.method.traits.several and cone_of(source, options.selection) is not None:
@@ -126,7 +124,7 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
     geometry = prepared.geometry
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
     weighted = differ and not options.method.traits.direct
-    sample, whole = prepared.sample_radius, knows_outside(options.method.traits, prepared.emission)
+    sample, whole = prepared.sample_radius, knows_outside(options.method.traits)
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
@@ -166,7 +164,12 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
 
 def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
     """Raise DataError and ConfigError for views that are too few."""
-    refuse_few_views(source, options, geometry)
+    volumes, least = volumes_of(options.method), options.method.traits.least_views
+    if volumes * least > geometry.n_views:
+        raise DataError(
+            f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes of {geometry.n_views} "
+            f"views: expected {least} views or more for each. Nothing was written."
+        )
     if options.uncertainty:
         refuse_views(options.method_for(geometry), geometry)
 
@@ -245,7 +248,7 @@ def prepare_within(
     prepared = prepare_projections(source, selection, warn, buffer, check, phases)
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
-    if knows_outside(options.method.traits, prepared.emission):
+    if knows_outside(options.method.traits):
         views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
         prepared = replace(prepared, sample_radius=sample_radius(*views) or 0.0)  # it is not searched again
     return prepared, of_views(source, options, plan, prepared)

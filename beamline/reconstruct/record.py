@@ -142,7 +142,7 @@ def _record(
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
-        kind=VoxelKind.SHARE if made.series is not None and made.series.names else prepared.kind,
+        kind=VoxelKind.SHARE if made.series is not None and made.series.names else VoxelKind.ATTENUATION,
         raw_file=str(context.facts.path.resolve()),
         title=_title(made, context),
         sample=context.facts.sample or "not stated",

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.scan_facts import ReportContext, as_text, label_of
 from beamline.report import figures
@@ -158,7 +159,7 @@ def _further(made: Reconstruction, prepared: PreparedProjections, context: Repor
             "Stray mass",
             "The highest density above each other, of voxels that the views show to be empty. All of it is an "
             "artefact: less is better.",
-            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, prepared.kind),
+            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -179,7 +180,7 @@ def _further(made: Reconstruction, prepared: PreparedProjections, context: Repor
 
 def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> Iterator[Picture]:
     """Slices of all volumes, and in what these differ from the first."""
-    unit, kind = prepared.length_unit, prepared.kind
+    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     shown = {"Truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     yield Picture(
@@ -229,7 +230,7 @@ def _doubts(
     psnr: Sequence[tuple[float, float]],
 ) -> Iterator[Picture]:
     """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
-    unit, kind = prepared.length_unit, prepared.kind
+    unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
         yield Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit))
     if made.deviation is not None:
@@ -261,7 +262,7 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
     data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
     yield Picture(
         "Projection",
-        f"One corrected view: the line integral of the {prepared.kind.value} along each ray. Air is better the "
+        f"One corrected view: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air is better the "
         "nearer to 0 and the more even it is.",
         figures.projection(data, geometry, 0, unit),
     )

@@ -17,7 +17,6 @@ import recon
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections, with_held_out
-from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
 from beamline.storage.disk_file import scratch_array
@@ -32,8 +31,6 @@ from recon.base.volume import Grid, Slab, Volume, part_of, slabs_of
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import by_name, with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.in_time import first_sweep_seconds
-from recon.splatting.initialise import sweeps_of_start
 
 
 def run_on(
@@ -62,12 +59,9 @@ def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geome
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     # Rays that weigh nothing were filled on disk, as a direct method does it.
     filled = method.traits.direct and prepared.on_disk
-    emission = prepared.emission  # of pixels that were binned, or beside views held out, the line integrals speak alone
-    alike = emission is not None and emission.counts.shape == (geometry.n_views, *geometry.detector_shape)
     use = DataUse(
         None if filled else prepared.ray_weights(len(held_out)),
         held_out,
-        emission if alike else None,
         prepared.times if method.traits.in_time else None,
         prepared.energies if method.traits.by_energy else None,
         prepared.sample_radius,
@@ -116,8 +110,7 @@ _AT_ONCE = 32  # views that are projected together
 _REPORT = 5.0  # s, its pictures
 _BYTES = 1e8  # of a volume, written and read back in a second
 _BUSIEST = 4.0  # largest slow-down of this by other programs
-_FORWARD = 0.5  # of a sweep
-_LEAST = 0.1  # of a sweep: the time of a start from coarse views and one step
+_MEASURING = 0.05  # of the seconds: looks at the volume, which are left out where these are over
 
 
 def fit_within(
@@ -131,33 +124,25 @@ def fit_within(
 ) -> tuple[Method, Stop]:
     """The fit with the seconds of its budget minus those of measuring, report and writing; and when these begin.
 
-    If they are too few, `warn` is told the expected duration before the fit.
+    If they are too few, `warn` gets a sentence before the fit.
 
     Args:
         limit: seconds of the call.
         started: when the call began, by the clock and in seconds of this process's work.
     """
-    geometry, grid = prepared.geometry, Grid.matching(prepared.geometry)
-    sweep = first_sweep_seconds(geometry, grid, clock.now)
+    grid, pages = Grid.matching(prepared.geometry), target.report is not None
     spent = clock.now() - started[0]
     busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
-    pages = target.report is not None
     after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
-    measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
-    remaining, least = limit - spent - measuring - after, _LEAST * sweep
-    if remaining < least:
-        sentence = (
+    measuring = _MEASURING * limit
+    remaining = limit - spent - measuring - after
+    if remaining <= 0:
+        warn(
             f"{duration_text(limit)} do not suffice for this scan: reading and correcting it took "
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "
-            f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method"
+            f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method, "
+            "which makes one step."
         )
-        if isinstance(method, FitMethod):
-            start = sweeps_of_start(geometry, method.start) * sweep
-            sentence += (
-                f". The start of a fit of all pixels takes {duration_text(start)}. With a start from coarse pixels the "
-                f"end is in about {duration_text(least + measuring + after)}"
-            )
-        warn(f"{sentence}.")
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
 

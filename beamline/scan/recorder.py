@@ -26,7 +26,7 @@ from beamline.core.text import count, spans
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digests
-from beamline.monitor.watch import Monitor, look_past_failures, rehearse
+from beamline.monitor.watch import Monitor, look_past_failures
 from beamline.plan.plan import Retake, Timeline
 from beamline.scan.references import ReferenceLog
 from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
@@ -38,7 +38,8 @@ WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the threads
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
-STALL = 60.0  # real s that a write, or the checks of a frame, may take
+STALL = 60.0  # real s that a write may take, after which the disk counts as dead
+CHECKED_WITHIN = 300.0  # real s that the checks of a frame may take, which compile once on a machine
 SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
@@ -84,7 +85,7 @@ class Recorder:
 
     No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
     so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
-    raise DataError where a frame could not be written, or a write or the checks of a frame take longer than STALL. A
+    raise DataError where a frame could not be written, or a write or the checks of a frame take too long. A
     stop or an abort waits for neither: what the camera still owes is kept in memory.
 
     Args:
@@ -155,7 +156,7 @@ class Recorder:
         self._raise_failure()
 
     def wait(self) -> None:
-        """Wait until the checks are compiled and every frame that was put is written, or a stop is requested."""
+        """Wait until every frame that was put is written, or a stop is requested."""
         reached = threading.Event()
         self._enqueue(reached)
         while not reached.wait(SLICE) and not self._stop.stopping:
@@ -240,9 +241,9 @@ class Recorder:
                 return
 
     def _refuse_stall(self) -> None:
-        if time.monotonic() - self._checking_since > STALL:
+        if time.monotonic() - self._checking_since > CHECKED_WITHIN:
             raise DataError(
-                f"The check {self._check_name} has not come back from a frame for {STALL:g} s. {self._safe()}"
+                f"The check {self._check_name} has not come back from a frame for {CHECKED_WITHIN:g} s. {self._safe()}"
             )
         if time.monotonic() - self._writing_since > STALL:
             raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
@@ -261,7 +262,6 @@ class Recorder:
 
     def _check_frames(self) -> None:
         """The first thread: digests and checks, until the last frame."""
-        self._rehearse()
         while (item := self._next()) is not None:
             if isinstance(item, threading.Event):
                 self._checked.put(item)
@@ -271,14 +271,6 @@ class Recorder:
                 self._checking_since = math.inf
                 self._checked.put(checked)
         self._checked.put(None)
-
-    def _rehearse(self) -> None:
-        """Compile what the checks need, before the first frame. An error costs no frame."""
-        try:
-            rehearse(self._monitor, self._begin_check)
-        except BaseException as error:
-            self._monitor_off = True
-            self._sink(Warned(f"the monitor failed in its rehearsal and is off: {error!r}"))
 
     def _begin_check(self, name: str) -> None:
         self._check_name = name

@@ -8,7 +8,7 @@ file joins them all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -183,14 +183,19 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
-            whole = f"{run} has all {planned} views and its references"
-            if not closed or (len(parts) > 1 and not is_joined(run / JOINED)):
-                what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
-                raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
-            raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
+            _refuse_whole(run, planned, parts, closed)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
     )
+
+
+def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:
+    """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
+    whole = f"{run} has all {planned} views and its references"
+    if closed and (len(parts) == 1 or is_joined(run / JOINED)):
+        raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
+    what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
+    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
@@ -217,30 +222,12 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
         raise ConfigError(f"{run} was planned with other angles: has their file changed? {_UNTOUCHED}")
     if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
         raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
-    for device, before, now, _ in _devices_differing(stored, ready):
+    for device, before, now in _devices_differing(stored, ready):
         raise ConfigError(f"{run} was taken with another {device}: {before}; now there is {now}. {_UNTOUCHED}")
 
 
-def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
-    """One sentence for each device that differs from the one that the newest run in this folder found at the same
-    port."""
-    differing: list[str] = []
-    with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
-        for path in sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)[-1:]:
-            with hdf5.open_hdf5(path) as stored:
-                differing += [
-                    f"{device}: at {port} there is {now}; in {path.parent.name}, the run before, it was {before}. If "
-                    "cables or ports were swapped, stop the scan. devices.stage.serial refuses another device, where "
-                    "its controller tells a serial number."
-                    for device, before, now, port in _devices_differing(stored, ready)
-                    if port
-                ]
-    return differing
-
-
-def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str, str]]:
-    """Each device whose identity differs from that in a file: its name, both identities, and its port; "" for another
-    port than in the file."""
+def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str]]:
+    """Each device whose identity differs from that in a file: its name, and both identities."""
     for device, description in ready.info.devices.items():
         group = datasets.resolve(stored["/entry/instrument/devices"], device.replace("/", "_")) or {}
         earlier = {key: datasets.text(group[key][()]) for key in group}
@@ -249,8 +236,7 @@ def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[st
             for facts in (earlier, description)
         )
         if before != now:
-            port = str(description.get("port", ""))
-            yield device, before, now, port if earlier.get("port") == port else ""
+            yield device, before, now
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:

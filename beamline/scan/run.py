@@ -39,7 +39,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_sho
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
-from beamline.scan.resume import ResumableRun, other_devices
+from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
@@ -54,7 +54,7 @@ from drivers.stages.shared import FOUND
 SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
 
 READY_WITHIN = 300.0
-"""Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._compiled`."""
+"""Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._wait_for`."""
 
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
@@ -109,7 +109,7 @@ def run_scan(
         still = series.remaining if series else all_of
         ready = preflight(config, instrument, place, still, check_stop=lambda: _refuse_stop(stop))
         _refuse_stop(stop)
-        remarks = [*_settings_before(ready), *([] if series else other_devices(place, ready))]
+        remarks = [*_settings_before(ready)]
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
             record, *logs = _logs(config, ready, folder, stack)
@@ -234,12 +234,11 @@ class _Run:
                 ending.callback(follower.close)
             return self._acquire_and_follow(writer, follower, release)
 
-    def _compiled(self, recorder: Recorder, follower: LiveReconstruction | None) -> None:
-        """Wait until the live reconstruction and the monitor have compiled, at the same time: once on a machine.
+    def _wait_for(self, follower: LiveReconstruction | None) -> None:
+        """Wait until the live reconstruction has compiled: once on a machine.
 
         A real scan waits before its first frame, a simulated one, whose references do not age, before its first view.
         """
-        recorder.wait()
         if follower is not None:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
 
@@ -355,7 +354,7 @@ class _Run:
         self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
     ) -> None:
         if self.config.simulation is None:
-            self._compiled(recorder, follower)
+            self._wait_for(follower)
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
@@ -411,7 +410,7 @@ class _Run:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
         recorder.wait()
         if self.config.simulation is not None:
-            self._compiled(recorder, follower)
+            self._wait_for(follower)
         if self.stop.stopping:
             return None
         blocks = self.ready.timeline.blocks

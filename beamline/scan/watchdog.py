@@ -1,8 +1,8 @@
 """Watchdog: a process that makes the instrument safe when the process of the scan dies or freezes without doing so.
 
 `python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
-it writes a byte each BEAT: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. It
-answers by a line, so that the scan notices a watchdog that is frozen itself, and replaces it. A frozen scan holds the
+it writes a byte each BEAT: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A line
+says that it is ready. One that has ended is replaced. A frozen scan holds the
 stage's port, so it is killed first. What the scan held is free then: the port, which the watchdog opens, and the
 camera, which stops without its program. A scan that ends by itself kills the watchdog first. As long as its scan lives,
 the watchdog ignores the requests to end that a shutdown sends to every process.
@@ -40,9 +40,6 @@ PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows 
 BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
 BEAT = 0.2  # real s between signs of life; about as long nobody watches after a watchdog has died
-UNANSWERED = (
-    50  # signs of life without an answer, after which a watchdog counts as frozen: 10 s in which the scan lived
-)
 FROZEN = 60.0  # s without one, after which a scan counts as dead
 AGAIN = 3  # most watchdogs that are started as replacements
 ACTED = 70  # exit code of a watchdog that has made the instrument safe
@@ -84,8 +81,8 @@ def inhibited() -> Iterator[None]:
 
 
 class _Keeper:
-    """Keeps a watchdog alive and tells it that the scan lives, in a thread of its own; one that has died or does not
-    answer is replaced. `start`: starts a command; the function is called with each line that it writes."""
+    """Tells a watchdog that the scan lives, in a thread of its own, and replaces one that has died. `start`: starts a
+    command; the function is called with each line that it writes."""
 
     def __init__(
         self, folder: Path, sink: Sink, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
@@ -93,7 +90,6 @@ class _Keeper:
         self._command = [*COMMAND, str(folder), str(os.getpid())]
         self._sink, self._start = sink, start
         self._ready, self._over = threading.Event(), threading.Event()
-        self._unanswered = 0  # signs of life, each written by a living scan: a computer that sleeps counts none
         self._process = self._started()
         self._thread: threading.Thread | None = None
 
@@ -116,9 +112,7 @@ class _Keeper:
     def _keep(self, stop: StopRequest, pause: PauseRequest | None) -> None:
         left = AGAIN
         while not self._over.wait(BEAT):
-            most = UNANSWERED if self._ready.is_set() else READY_WITHIN / BEAT
-            if self._process.running and self._unanswered < most:
-                self._unanswered += 1
+            if self._process.running:
                 self._process.beat()
                 continue
             code = self._process.code
@@ -127,26 +121,19 @@ class _Keeper:
                 self._warn(f"Failed: {why}. The scan ends.")
                 stop.abort(why)
                 return
-            what = "does not answer" if code is None else f"has ended (code {code})"
             self._process.end()
             if not left:
-                self._warn(f"The watchdog {what}, too: a scan that is killed leaves the shutter open.")
+                self._warn(f"The watchdog has ended (code {code}), too: a scan that is killed leaves the shutter open.")
                 if pause is not None:
                     pause.pause("no watchdog runs")
                 return
             left -= 1
             with suppress(OSError):
                 self._process = self._started()
-            self._warn(f"The watchdog {what}; another one is started.")
+            self._warn(f"The watchdog has ended (code {code}); another one is started.")
 
     def _started(self) -> ChildProcess:
-        self._unanswered = 0
-        self._ready.clear()
-        return self._start(self._command, self._answered)
-
-    def _answered(self, line: str) -> None:
-        self._unanswered = 0
-        self._ready.set()
+        return self._start(self._command, lambda line: self._ready.set())
 
     def _warn(self, message: str) -> None:
         self._sink(Warned(message))
@@ -250,12 +237,9 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
     config = load(folder / CONFIG, environment={})
     life, clock = _Life(source), SystemClock()
 
-    def signs() -> int | None:
-        with suppress(OSError):  # the scan has died; perhaps before this process was there
-            os.write(STDOUT, b"watching\n")
-        return None if life.ended else life.signs
-
-    frozen = until_dead(signs, clock)
+    with suppress(OSError):  # the scan has died; perhaps before this process was there
+        os.write(STDOUT, b"watching\n")
+    frozen = until_dead(lambda: None if life.ended else life.signs, clock)
 
     def say(text: str) -> None:
         # A full disk, or a folder that is gone, must not keep the stage turning.

@@ -93,7 +93,7 @@ class SimulateRequest:
         ),
         "--explain",
         is_flag=True,
-        help="Print the steps of computing a frame, in order, with the time of each.",
+        help="Print the steps of computing a frame, in order.",
     )
     views: int | None = set_by(
         "--frames",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import yaml
@@ -21,14 +21,12 @@ from beamline.core.quantities import VoxelKind
 from beamline.simulate import volumes_beside
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry
-from recon.base.registry import in_folders, unknown
+from recon.base.registry import unknown
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import Scene, load_scene
-
-S = TypeVar("S")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,20 +48,6 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
     path, tree, text = _scene_text(name, overrides)
     with _naming(path):
         return SceneFile(load_scene(tree, volumes_beside(path.parent)), path, text)
-
-
-def open_other(name: str, overrides: Sequence[str], load: Callable[[Mapping[str, Any]], S]) -> S:
-    """Open a scene of a feature, which `load` builds from its values; otherwise as `open_scene`."""
-    path, tree, _ = _scene_text(name, overrides)
-    with _naming(path):
-        return load(tree)
-
-
-def feature_of(name: str, overrides: Sequence[str]) -> str | None:
-    """The module of the feature to which a key of the scene belongs; None for a scene of frames."""
-    _, tree, _ = _scene_text(name, overrides)
-    modules = in_folders("beamline.features", "SCENES")
-    return next((module for key, module in modules.items() if key in tree), None)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.text import printable
+from beamline.core.text import NUMBER, printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
 from beamline.storage.structure import plain_name
 
@@ -28,7 +28,7 @@ LENGTH_UNITS = {  # mm
 ENERGY_UNITS = {"ev": 1e-3, "electronvolt": 1e-3, "kev": 1.0, "kiloelectronvolt": 1.0, "j": _JOULE, "joule": _JOULE}
 WAVELENGTH_UNITS = {"angstrom": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "nanometer": 10.0, "pm": 0.01, "m": 1e10}  # Å
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "ms": 1e-3, "millisecond": 1e-3, "us": 1e-6}  # s
-_WRITTEN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)\s*(.*)", re.I)  # a number, and perhaps its unit
+_WRITTEN = re.compile(rf"([-+]?{NUMBER})\s*(.*)")  # a number, and perhaps its unit
 
 
 def factor_of(unit: str, units: Mapping[str, float]) -> float | None:
@@ -43,7 +43,7 @@ _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
 _PIECE = 2**31  # bytes of a chunk of frames
 NAME = 1000  # letters of a name or a title
-BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
+BRIEF = 2**28  # bytes of a text, a number or a list of a scan
 
 
 def text(value: Any) -> str:
@@ -96,17 +96,16 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def first_of(item: h5py.Dataset) -> Any:
     """The first value of a dataset, which may have many; of an empty dataset nothing."""
-    _require_brief(item, item.dtype.itemsize)
     return item[()] if item.size <= 1 else item[(0,) * item.ndim]
 
 
-def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
-    """All values of a dataset of at most so many bytes, by default those of a number, a text or a list of a scan.
-
-    Raises:
-        DataError: it holds more.
-    """
-    _require_brief(item, (item.size or 0) * item.dtype.itemsize, most)
+def values_of(item: h5py.Dataset) -> Any:
+    """All values of a number, a text or a list of a scan. DataError: it holds more than BRIEF bytes."""
+    if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
+        raise DataError(
+            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
+            f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
+        )
     return item[()]
 
 
@@ -122,15 +121,6 @@ def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
     return math.prod(pieces) * math.prod(across) * int(item.dtype.itemsize)
-
-
-def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> None:
-    """DataError where so many bytes, or the piece of the file that HDF5 unpacks for them, are too many."""
-    if (n := max(n_bytes, piece_of(item))) > most:
-        raise DataError(
-            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
-            f"{most / 1e9:.3g} GB at most. Nothing was read."
-        )
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:

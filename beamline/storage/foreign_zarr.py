@@ -31,13 +31,15 @@ def is_zarr(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """A scale of a volume: an array [..., z, y, x] of a Zarr store whose leading axes have length one
-    (`VolumeScale`)."""
+    """A scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length one.
+
+    Attributes:
+        coarser: the same volume with fewer voxels.
+    """
 
     path: Path
     array: Any
     coarser: tuple[ZarrScale, ...] = ()
-    whole_chunks = True
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -93,17 +95,22 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     if not arrays:
         raise DataError(f"{path} is not an OME-Zarr image; name an array in it, in `view` as {path.name}::NAME.")
     finest, *coarser = arrays
-    if finest.ndim < 3 or any(n != 1 for n in finest.shape[:-3]) or np.dtype(finest.dtype).kind not in "uifb":
-        raise DataError(
-            f"{path} holds {finest.dtype} of shape {finest.shape}; expected real numbers [z, y, x], of one time and "
-            "one channel. Copy one to a file of its own."
-        )
+    _require_volume(path, finest)
     scales = [finest, *(array for array in coarser if is_halved(finest.shape[-3:], array))]
     for array in scales:
         _require_chunks(path, array)
     if spacing is not None and not all(0 < step < np.inf for step in spacing):
         raise DataError(f"{path} states voxels of {spacing} mm; expected lengths above 0. Nothing was read.")
     return ZarrScale(path, finest, tuple(ZarrScale(path, array) for array in scales[1:])), spacing
+
+
+def _require_volume(path: Path, array: Any) -> None:
+    """DataError for an array that is no volume of real numbers."""
+    if array.ndim < 3 or any(n != 1 for n in array.shape[:-3]) or np.dtype(array.dtype).kind not in "uifb":
+        raise DataError(
+            f"{path} holds {array.dtype} of shape {array.shape}; expected real numbers [z, y, x], of one time and "
+            "one channel. Copy one to a file of its own."
+        )
 
 
 def _require_chunks(path: Path, array: Any) -> None:

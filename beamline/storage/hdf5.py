@@ -82,10 +82,9 @@ def _unopened(
     cut = re.search(r"truncated file: eof = (\d+),.* stored_eof = (\d+)", str(problems[0]))
     missing = int(cut[2]) - int(cut[1]) if cut else head.missing if head is not None else 0
     if missing:
-        rescue = f"`beamline recover {path}` rescues its frames" if _ours(path, head) else "nothing else brings it back"
         return DataError(
-            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original: if there is "
-            f"no other, {rescue}. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If there is "
+            f"no other, `beamline recover {path}` rescues the frames of a scan of this program. Nothing was read."
         )
     if head is not None and head.open_for_writing:
         return DataError(
@@ -95,15 +94,6 @@ def _unopened(
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(held_sentence(path))
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
-
-
-def _ours(path: Path, head: Superblock | None) -> bool:
-    """Whether this program wrote a file that is not whole."""
-    with suppress(*ALTERED):
-        if head is not None:
-            with h5py.File(GrowingFile(path, head), "r") as file:
-                return COMMITTED in file
-    return False
 
 
 def grows_here(path: Path) -> bool:

@@ -75,30 +75,43 @@ def _no_run(folder: Path, wanted: str) -> Path:
 
 def next_step(scan: Path) -> str:
     """A sentence on the next step for a scan that is running, died or ended early; "" if nothing is missing."""
-    run = run_of(scan.parent) if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file() else None
-    if run is not None:
-        parts = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]
-        scan = parts[-1] if parts else scan
-    head = superblock(scan) if scan.is_file() else None
-    resume = f"`beamline scan --resume {run}` takes what is missing"
+    if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file():
+        return _step_of_run(run_of(scan.parent))
+    if not scan.is_file() or (head := superblock(scan)) is None or not head.open_for_writing:
+        return ""
+    if held(scan):
+        return f"Its scan still runs: `beamline recon {scan} --follow` reconstructs it meanwhile."
+    return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
+
+
+def _step_of_run(run: Path) -> str:
+    parts = parts_of(run)
+    scan = next((part / SCAN for part in reversed(parts) if (part / SCAN).is_file()), run / SCAN)
+    head, lives = superblock(scan) if scan.is_file() else None, alive(parts[-1])
     growing = head is not None and head.open_for_writing
-    lives = None if run is None else alive(parts_of(run)[-1])
-    if lives or (run is not None and held(run / EVENTS, exclusively=True)) or (growing and held(scan)):
-        watch = "" if run is None else f"`beamline watch {run}` shows it, "
-        return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
-    if run is not None and not files_with_frames(run):
+    if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
+        return (
+            f"Its scan still runs: `beamline watch {run}` shows it, `beamline recon {scan} --follow` reconstructs it "
+            "meanwhile."
+        )
+    if not files_with_frames(run):
         return "It ended before its first frame: start the scan anew."
-    if not growing:
-        if run is not None and head is not None and _lacks_views(run):
-            return f"It ended early: {resume}."
-        record = None if run is None else read_record(parts_of(run)[-1])
-        died = f"Its process died after its scan file was closed: `beamline recover {run}` ends the run."
-        return died if record is not None and record.state == DIED else ""
-    sure = lives is False or abandoned(scan)  # where the disk has no locks, its program may run
-    died = "Its scan has died" + ("" if sure else ", unless a program still writes to it")
-    what = scan if run is None else run
-    recover = f"`beamline recover {what}` makes an ordinary file of the frames that are there"
-    return f"{died}: {recover if run is None else f'{resume}, {recover}'}."
+    resume = f"`beamline scan --resume {run}` takes what is missing"
+    if growing:
+        return f"{_died(lives is False or abandoned(scan))}: {resume}, `beamline recover {run}` {_MAKES}."
+    if head is not None and _lacks_views(run):
+        return f"It ended early: {resume}."
+    record = read_record(parts[-1])
+    died = record is not None and record.state == DIED
+    return f"Its process died after its scan file was closed: `beamline recover {run}` ends the run." if died else ""
+
+
+_MAKES = "makes an ordinary file of the frames that are there"
+
+
+def _died(sure: bool) -> str:
+    """Where the disk has no locks, its program may run."""
+    return "Its scan has died" + ("" if sure else ", unless a program still writes to it")
 
 
 def _lacks_views(run: Path) -> bool:

@@ -2,13 +2,11 @@
 
 The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
 holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
-records name, number of frames and digest of each part, so that a reader can check that it has all parts,
-unchanged.
+records name and number of frames of each part, so that a reader can check that it has all parts.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -218,25 +216,17 @@ def is_joined(joined: Path) -> bool:
 def _disagreement(joined: h5py.File, folder: Path) -> str:
     if layout.PARTS not in joined:
         return "it does not say what its parts are"
-    names, frames, digests = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames", "digest"))
+    names, frames = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames"))
     parts = [folder / datasets.text(name) for name in names]
-    for part, n, digest in zip(parts, frames, digests, strict=True):
+    for part, n in zip(parts, frames, strict=True):
         if not part.is_file():
             return f"its part {part} is not there"
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             committed = int(file[layout.COMMITTED][()])
-            if committed != n or _digest(file) != datasets.text(digest):
-                return f"its part {part} has {committed} frames that are not the {n} which it was made of"
+            if committed != n:
+                return f"its part {part} has {committed} frames, not the {n} which it was made of"
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
     return f"it lacks those of {others[0]}" if others else ""
-
-
-def _digest(part: h5py.File) -> str:
-    """SHA-256 of the records of the frames: kind, angle, time, ..., and the checksum of their pixels."""
-    n, hash_ = int(part[layout.COMMITTED][()]), hashlib.sha256()
-    for path in layout.COLUMNS:
-        hash_.update(part[path][:n].tobytes())
-    return hash_.hexdigest()
 
 
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:
@@ -265,7 +255,6 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     group.attrs["NX_class"] = "NXcollection"
     group.create_dataset("name", data=list(names), dtype=text)
     group.create_dataset("frames", data=np.array(rows, np.int64))
-    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
     _complete(files[0], joined, int(firsts[-1]))
     return int(firsts[-1])
 

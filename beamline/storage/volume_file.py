@@ -58,7 +58,7 @@ def read_volume(
             return _from_nifti(path)
         if is_hdf5 or name.endswith((".h5", ".hdf5", ".nxs")):
             with hdf5.open_hdf5(path) as file:
-                return _from_hdf5(path, file, dataset), None
+                return _from_hdf5(path, file, dataset)
         if name.endswith((".tif", ".tiff")):
             return _from_tiff(path), None
         return _from_numpy(path, dataset)
@@ -70,7 +70,7 @@ def read_volume(
 
 def axes_of(
     file: h5py.File, dataset: str | None, unit: str = "mm"
-) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+) -> tuple[tuple[float, float, float] | None, tuple[float, ...] | None]:
     """Spacing and first coordinates (z, y, x) from the arrays z, y, x beside a dataset; None without them in `unit`."""
     node = None if dataset is None else file.get(dataset)
     axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
@@ -79,7 +79,8 @@ def axes_of(
     if any(axis.attrs.get("units") != unit for axis in axes):
         return None, None
     ends = [(float(axis[0]), float(axis[-1]), axis.size) for axis in axes]
-    return tuple((last - low) / (n - 1) for low, last, n in ends), tuple(low for low, _, _ in ends)
+    dz, dy, dx = ((last - low) / (n - 1) for low, last, n in ends)
+    return (dz, dy, dx), tuple(low for low, _, _ in ends)
 
 
 def _is_numpy(path: Path) -> bool:
@@ -188,7 +189,9 @@ def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tupl
     return arrays[name], (float(slices), float(spacing), float(spacing))
 
 
-def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.generic]:
+def _from_hdf5(
+    path: Path, file: h5py.File, name: str | None
+) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     if name is None:
         arrays: dict[str, int] = {}
         file.visititems(
@@ -201,7 +204,7 @@ def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.gene
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
     _check_size(path, item.nbytes)
-    return item[()]
+    return item[()], axes_of(file, name)[0]
 
 
 def _only(path: Path, axes: dict[str, int]) -> str:

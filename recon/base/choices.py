@@ -13,7 +13,7 @@ Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
 Noise = Literal["auto", "log", "counts"]
 Quality = Literal["preview", "standard", "best"]
-Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
+Rings = Literal["none", "auto", "sort", "vo"]
 FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv", "published"]
 

@@ -65,7 +65,7 @@ of a shell in a coarse cone lose 1.2 dB."""
 # Where do the first Gaussians lie, and how many are there?
 
 VOXELS_A_GAUSSIAN = 60
-"""In the cylinder of the field. Without, with half and a quarter as many: -0.1, -0.5 dB (`time_model.CURVES`)."""
+"""In the cylinder of the field. Without, with half and a quarter as many: -0.1, -0.5 dB."""
 
 SPREAD = 0.6
 """Width of a first Gaussian over the distance to its neighbours. Without: level, and a tenth to a fifth more CPU time,

@@ -111,8 +111,6 @@ class DataUse(Checked):
         weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
             neighbours and takes all others alike.
         held_out: numbers of the views that are not fitted; their residual is in the history.
-        emission: a `recon.Emission`, which this module must not import: the counts that projections and weights are
-            made of. None: these are all there is.
         times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
             views.
         energies: of the views, for a method of volumes of materials; None: all have one, at which there is one material
@@ -123,7 +121,6 @@ class DataUse(Checked):
 
     weights: F32 | None = None
     held_out: Sequence[int] = ()
-    emission: Any = None
     times: F64 | None = None
     energies: Energies | None = None
     sample_radius: float | SampleRadius | None = None
@@ -292,6 +289,7 @@ class Traits:
         in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
             `volume_names` if they are of materials; `Reconstruction.series` has all.
         by_energy: likewise, of each material, from scans at several energies.
+        least_views: of each of several volumes.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
         error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
@@ -307,6 +305,7 @@ class Traits:
     needs_matter: bool = False
     in_time: bool = False
     by_energy: bool = False
+    least_views: int = 0
     own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None

@@ -22,7 +22,11 @@ _PREFIX = "splatline."
 ADD_ONS = {
     "archive": "splatline-archive",
     "cluster": "splatline-cluster",
+    "emission": "splatline-emission",
+    **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
+    **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
     "tango": "splatline-tango",
+    "xafs": "splatline-spectral",
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant
@@ -183,7 +187,6 @@ class MethodEntry:
         module, cls: of its settings class, see `recon.base.method.Method`.
         streams: it has `stream`, so that its volume can grow while views arrive.
         compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
-        emission: it is compared where the sample emits, whatever `compared` says.
         several: what its volumes are of, where it makes several.
         lengths: that a trade-off tries; None: the default.
     """
@@ -192,6 +195,5 @@ class MethodEntry:
     cls: str
     streams: bool = False
     compared: bool = True
-    emission: bool = False
     several: Literal["", "times", "materials"] = ""
     lengths: Lengths | None = None

@@ -28,13 +28,6 @@ _MOST = 0.1  # of the columns
 _EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
 _ROWS = 8  # looked at
 _COPIES = 13  # float32 copies of a sinogram
-_LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
-
-# Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).
-_DB5 = np.array(
-    [0.160102397974125, 0.603829269797473, 0.724308528438574, 0.138428145901103, -0.242294887066190,
-     -0.032244869585030, 0.077571493840065, -0.006241490213012, -0.012580751999016, 0.003335725285002]
-)  # fmt: skip
 
 
 def width_for(cols: int) -> int:
@@ -95,34 +88,7 @@ def by_vo(sinogram: F32) -> F32:
     return by_sorting(without_large_stripes(without_dead_columns(sinogram)))
 
 
-def by_wavelets(sinogram: F32, levels: int = _LEVELS, damping: float = _DAMPING) -> F32:
-    """Remove stripes from the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express
-    17, 8567).
-
-    Coefficients that are smooth along the views and rough along the columns hold the stripes. There, frequencies k
-    along the views are damped by 1 - exp(-k² / (2 damping²)).
-    """
-    views, cols = sinogram.shape
-    step = 2**levels
-    pad = [(step * 2, step * 2 + -n % step) for n in (views, cols)]
-    smooth = np.pad(sinogram.astype(np.float64), pad, mode="symmetric")
-    details = []
-    for _ in range(levels):
-        low, high = _analysed(smooth, 1)
-        smooth, along = _analysed(low, 0)
-        stripes, corner = _analysed(high, 0)
-        spectrum = np.fft.rfft(stripes, axis=0)
-        k = np.arange(len(spectrum))[:, None]
-        stripes = np.fft.irfft(spectrum * (1 - np.exp(-(k**2) / (2 * damping**2))), len(stripes), axis=0)
-        details.append((along, stripes, corner))
-    for along, stripes, corner in reversed(details):
-        smooth = _synthesised(_synthesised(smooth, along, 0), _synthesised(stripes, corner, 0), 1)
-    return smooth[pad[0][0] : pad[0][0] + views, pad[1][0] : pad[1][0] + cols].astype(np.float32)
-
-
-REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType(
-    {"sort": by_sorting, "vo": by_vo, "wavelet": by_wavelets}
-)
+REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType({"sort": by_sorting, "vo": by_vo})
 """Ways to remove stripes, by name."""
 _NAMES: Mapping[Callable[[F32], F32], str] = {
     by_sorting: "sort",
@@ -173,7 +139,7 @@ def remove_rings(
         projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
         angles: [view], radians.
         rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
-            ones. "wavelet" by wavelets (Münch et al. 2009), "none". "auto" looks and chooses.
+            ones, "none". "auto" looks and chooses.
         axis_col: column of the rotation axis; None: the middle.
 
     Raises:
@@ -269,8 +235,7 @@ def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     looked_at = views * min(rows, _ROWS) * cols
     if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:
         return 4 * (rows * cols + looked_at)
-    padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
-    return 4 * (rows * cols + looked_at + _COPIES * (padded if rings == "wavelet" else views * cols))
+    return 4 * (rows * cols + looked_at + _COPIES * views * cols)
 
 
 def _noise(values: NDArray[np.floating]) -> float:
@@ -311,22 +276,3 @@ def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
     out = sinogram.copy()
     out[:, wanted] = (1 - share) * sinogram[:, left] + share * sinogram[:, right]
     return out
-
-
-def _analysed(values: NDArray[np.float64], axis: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Smooth and detail coefficients of a periodic signal along an axis, each half as long."""
-    values = np.moveaxis(values, axis, 0)
-    low = sum(h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5))
-    high = sum((-1) ** n * h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5[::-1]))
-    return np.moveaxis(np.asarray(low), 0, axis), np.moveaxis(np.asarray(high), 0, axis)
-
-
-def _synthesised(low: NDArray[np.float64], high: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    """The signal of these coefficients: the transpose of `_analysed`, which is orthogonal."""
-    low, high = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
-    out = np.zeros((2 * len(low), *low.shape[1:]))
-    for n, (h, g) in enumerate(zip(_DB5, _DB5[::-1], strict=True)):
-        spread = np.zeros_like(out)
-        spread[::2] = h * low + (-1) ** n * g * high
-        out += np.roll(spread, n, axis=0)
-    return np.moveaxis(out, 0, axis)

@@ -9,7 +9,7 @@ sample in the field and air at zero.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -213,18 +213,18 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
 
 
 def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
-    """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
+    """The rotation axis of a scan from all views.
 
     If all views together give no axis, and they cover the full turn, pairs of opposite views do: the axis of a wide
-    field stands near an edge of the detector. Of half a turn of a sample wider than the field, its two ends do.
+    field stands near an edge of the detector. Of half a turn of a sample wider than the field, its two ends do, or a
+    pair of views half a turn apart.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
 
     Returns:
-        The estimate from all views, or from opposite views, the ends or the pair if only these are confident. It is
-        not confident if they disagree.
+        The estimate from all views, or from opposite views, the ends or the pair if only these are confident.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -241,40 +241,28 @@ def find_axis(projections: ArrayLike, angles: ArrayLike) -> AxisEstimate:
     try:
         from_all = axis_from_sinogram(projections, theta)
     except AxisError:
-        if (from_some := _from_some(projections, theta)) is not None:
-            return from_some
-        raise
-    if not from_all.confident:
-        from_all = _from_some(projections, theta) or from_all
-        if from_all.confident or _has_opposites(theta, projections.shape[2]):
-            return from_all  # one pair tells less than all of them, which do not agree
-    pair = closest_pair(theta, tolerance=2 / projections.shape[2])
-    if pair is None:
-        return from_all
-    try:
-        from_pair = axis_from_pair(projections[pair[0]], projections[pair[1]])
-    except AxisError:  # these two views do not show the axis, but all views together do
-        return from_all
-    if not from_pair.confident:
-        return from_all
-    if abs(from_all.value - from_pair.value) > AGREE:
-        return replace(from_all, confident=False)
-    return from_all if from_all.confident else from_pair
-
-
-def _has_opposites(theta: Floats, cols: int) -> bool:
-    """Whether there are enough pairs of opposite views for `axis_from_opposites`."""
-    return _opposite_pairs(theta, cols)[0].size >= _FEWEST_PAIRS
+        if (from_some := _from_some(projections, theta)) is None:
+            raise
+        return from_some
+    return from_all if from_all.confident else _from_some(projections, theta) or from_all
 
 
 def _from_some(projections: NDArray[np.floating], theta: Floats) -> AxisEstimate | None:
-    """The axis by opposite views if they show it clearly; by the ends of half a turn if the field cuts the sample."""
+    """The axis by opposite views if they show it clearly; without these by the ends of half a turn if the field cuts
+    the sample, or by a pair of views, whichever is confident; else by the ends, or none."""
+    by_ends = None
     with suppress(ValueError):  # an AxisError is a ValueError, too
-        if not _has_opposites(theta, projections.shape[2]):
-            return axis_from_ends(projections, theta) if is_cut_off(projections) else None
-        estimate = axis_from_opposites(projections, theta)
-        return estimate if estimate.confident else None
-    return None
+        if _opposite_pairs(theta, projections.shape[2])[0].size >= _FEWEST_PAIRS:
+            by_opposites = axis_from_opposites(projections, theta)
+            return by_opposites if by_opposites.confident else None
+        if is_cut_off(projections):
+            by_ends = axis_from_ends(projections, theta)
+    with suppress(ValueError):
+        pair = closest_pair(theta, tolerance=2 / projections.shape[2])
+        if pair is not None and not (by_ends and by_ends.confident):
+            by_pair = axis_from_pair(projections[pair[0]], projections[pair[1]])
+            return by_pair if by_pair.confident else by_ends
+    return by_ends
 
 
 def closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:

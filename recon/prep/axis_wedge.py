@@ -172,13 +172,8 @@ def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     """
     if not _covers_half_a_turn(theta):
         raise ValueError("the views do not go round half a turn evenly")
-    part, theta, bin_ = _for_wedge(data, theta)
-    omega, fits = _wedge_residuals(part, theta)
-    candidates = np.arange(0, part.shape[2] - 1 + _STEP / 2, _STEP)
-    phase = 2 * np.outer(candidates, omega)
-    fits = fits * omega ** (2 if is_cut_off(part) else 1)
-    curves = fits[0].sum(axis=1)[:, None] + fits[1] @ np.cos(phase).T + fits[2] @ np.sin(phase).T
-    return candidates * bin_ + (bin_ - 1) / 2, curves / np.maximum(fits[0].sum(axis=1), 1e-30)[:, None]
+    wedge = _Wedge.of(data, theta)
+    return wedge.columns, np.stack([wedge.curve(fit, wedge.power) for fit in np.moveaxis(wedge.fits, 1, 0)])
 
 
 def _covers_half_a_turn(theta: Floats) -> bool:
@@ -187,42 +182,58 @@ def _covers_half_a_turn(theta: Floats) -> bool:
     return bool(gap <= max(_WIDEST_GAP, 4 * np.pi / len(theta)))
 
 
-def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
-    """The necessary views and columns, their angles, and the number of columns that were averaged."""
-    views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
-    bin_ = -(-data.shape[2] // _MOST_COLS)
-    cols = data.shape[2] // bin_
-    part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
-    return part, theta[views], bin_
-
-
 def is_cut_off(part: NDArray[np.floating]) -> bool:
     """Whether the first or last columns of line integrals [view, row, col] are not air."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     return bool(rim > 0.05 * part.mean(axis=(0, 1)).max())
 
 
+@dataclass(frozen=True, eq=False)
+class _Wedge:
+    """What harmonics leave of some views.
+
+    Attributes:
+        columns: [n], candidates for the axis.
+        bin: columns that were averaged.
+        basis: [3, n, frequency], 1, cosine and sine of a candidate.
+        omega: [frequency]. fits: [3, row, frequency], see `_wedge_residuals`.
+        power: of the frequency, its weight: low ones are worse where the field cuts the sample.
+    """
+
+    columns: Floats
+    bin: int
+    basis: Floats
+    omega: Floats
+    fits: Floats
+    power: int
+
+    @classmethod
+    def of(cls, data: Floats, theta: Floats) -> _Wedge:
+        """By as many views and columns as are necessary."""
+        views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
+        bin_ = -(-data.shape[2] // _MOST_COLS)
+        cols = data.shape[2] // bin_
+        part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
+        omega, fits = _wedge_residuals(part, theta[views])
+        candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
+        phase = 2 * np.outer(candidates, omega)
+        basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
+        return cls(candidates * bin_ + (bin_ - 1) / 2, bin_, basis, omega, fits, 2 if is_cut_off(part) else 1)
+
+    def curve(self, fit: Floats, power: int) -> Floats:
+        """Mismatch [n] by coefficients [3, frequency]."""
+        weighted = fit * self.omega**power
+        return np.einsum("knw,kw->n", self.basis, weighted) / max(float(weighted[0].sum()), 1e-30)
+
+
 def _axis_from_wedge(data: Floats, theta: Floats) -> AxisEstimate:
-    part, theta, bin_ = _for_wedge(data, theta)
-    cols = part.shape[2]
-    omega, fits = _wedge_residuals(part, theta)
-    fit = fits.sum(axis=1)
-    candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
-    phase = 2 * np.outer(candidates, omega)
-    basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
-
-    def curve_for(power: int) -> Floats:
-        weighted = fit * omega**power
-        return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
-
-    power = (
-        2 if is_cut_off(part) else 1
-    )  # worse low frequencies; one harmonic more and one less must give the same axis
-    curve = curve_for(power)
-    full = candidates * bin_ + (bin_ - 1) / 2
-    value, depth = optimum(full, curve)
-    bands = abs(lowest(full, curve_for(power - 1))[0] - lowest(full, curve_for(power + 1))[0])
-    return AxisEstimate(value, full, curve, depth > 0.5 and bands < AGREE * bin_, "double wedge")
+    wedge = _Wedge.of(data, theta)
+    # One harmonic more and one less must give the same axis.
+    fewer, curve, more = (wedge.curve(wedge.fits.sum(axis=1), wedge.power + by) for by in (-1, 0, 1))
+    value, depth = optimum(wedge.columns, curve)
+    bands = abs(lowest(wedge.columns, fewer)[0] - lowest(wedge.columns, more)[0])
+    confident = depth > 0.5 and bands < AGREE * wedge.bin
+    return AxisEstimate(value, wedge.columns, curve, confident, "double wedge")
 
 
 def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:

@@ -69,15 +69,15 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
         )
     for curves_of in (wedge_curves, opposite_curves):
         with suppress(ValueError):
-            return _line(*curves_of(data, np.asarray(angles, np.float64)), heights)
+            return line_through(*curves_of(data, np.asarray(angles, np.float64)), heights)
     raise ValueError(
         f"the axes of {len(heights)} bands of rows lie on no line within {math.degrees(STEEPEST):g} degrees, or the "
         "views do not go round half a turn"
     )
 
 
-def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
-    """The line through the axes of bands, from their mismatch [band, candidate].
+def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
+    """The line through the axes of bands, from their mismatch [band, candidate], as for `find_tilt`.
 
     Raises:
         ValueError: it has no clear optimum.

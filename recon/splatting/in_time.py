@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,42 +9,26 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from recon.assess.time_model import Speeds
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.volume import Grid, Volume
-from recon.base.work import CLOCK, Costs, Rates, Work
-from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS, finish
+from recon.base.volume import Grid
+from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS, finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import (
-    SCALED_BY,
-    count_for,
-    default_count,
-    joined_for,
-    sample_gaussians,
-    start_method,
-    sweeps_of_start,
-)
-from recon.splatting.settings import FitSettings, growth
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
-from recon.voxels.direct import direct_work
-from recon.voxels.held_out import CHOICE_SWEEPS, LEAST_VIEWS, choice_sweeps
+from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
-from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 FINISH_SHARE = 0.8
 """Largest share of the finish in the time after the first steps: it adds more than most steps before it."""
 
 _GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling then takes so many times longer
 _SLAB = 16  # slices that are filled to measure it
-_DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
-_COLS = 96  # binned pixels of the views that time a start
 # Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
 # projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
@@ -64,26 +47,6 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
     parts = subsets_of(geometry, SUBSETS)
     return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
-
-
-def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of a sweep of FISTA-TV, estimated quickly at the beginning from binned pixels."""
-    factor = max(1, min(geometry.detector_shape[1] // _COLS, geometry.detector_shape[0]))
-    coarse = geometry.binned(factor)
-    box = Grid.of_field(coarse, coarse.sample_pitch)
-    share = math.prod(grid.shape) / math.prod(box.shape)
-    return sweep_seconds(coarse, box, now) * share
-
-
-def first_draw_seconds(grid: Grid, count: int, now: Clock) -> float:
-    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, as if all were matter."""
-    nz, ny, nx = grid.shape
-    slices = min(_DRAWN, nz)
-    slab, rng = grid.part(slice(0, slices), slice(0, ny), slice(0, nx)), np.random.default_rng(0)
-    noise = Volume(rng.random(slab.shape, dtype=np.float32), slab)
-    begin = now()
-    sample_gaussians(noise, max(1, count * slices // nz), rng, field_radius=math.inf)
-    return (now() - begin) * nz / slices
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
@@ -227,123 +190,3 @@ class LastRound:
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory in bytes without the projections: that of the method that began the fit."""
         return self.method.memory(geometry, grid, weighted)
-
-
-_RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
-
-
-def covered(voxels: float, gaussians: float) -> float:
-    """Proportional to the pixels that Gaussians cover in a view, as wide as their distances."""
-    return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
-
-
-def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
-    """The work of `train.run_fit`."""
-    if method.planned_steps is None:
-        return Costs({method.name: Work.of(CLOCK, method.seconds or 0.0)})
-    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid, PnpDct.iterations)
-    fit = _fit(method, geometry, grid, method.planned_steps)
-    if not method.by_content or geometry.n_views < LEAST_VIEWS:
-        if method.finish_sweeps == 0:
-            return Costs({method.name: fit})
-        choice = weight + patches if method.finish is None else weight
-        return Costs({method.name: fit + _finish(method, geometry, grid)}, choice)
-    short = _fit(method, geometry, grid, method.least_steps or 0)
-    volumes = {method.name: fit + _finish(method, geometry, grid)}
-    for other in (FistaTv(), PnpDct()):
-        volumes[other.name] = short + other.costs(geometry, grid).volumes[other.name]
-    trial = Work()
-    if (part := trial_part(geometry, grid)) is not None:
-        share = part[0].detector_shape[0] / geometry.detector_shape[0]
-        own = method.for_trial(share, FIRST_SHARE)
-        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS)
-        trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
-    return Costs(volumes, weight + patches + trial)
-
-
-def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
-    """Work from the first volume to the volume of the Gaussians."""
-    cone = geometry.is_cone
-    field = Grid.for_fit(geometry, grid)
-    voxels, usual = math.prod(field.shape), count_for(field, cone)
-    given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
-    count = given or usual
-    joined = method.fit.joined_pixels or joined_for(field, cone, max(count, usual), geometry.detector_shape)
-    first = start_method(geometry, method.start)
-    start = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
-    rays = geometry.n_views * math.prod(geometry.detector_shape) / joined**2
-    start = start * (1 / joined**3) + Work.of("draw", count, voxels / joined**3)
-    start += Work.of("views", geometry.n_views, rays)
-    views = steps * method.fit.views_per_step + _RENDER * SCALED_BY
-    grown = count * (1 + growth(method.fit)) / 2
-    fill = Work.of("fill", grown, math.prod(grid.shape))
-    return start + views * _view(method, geometry, voxels / joined**3, grown) + fill
-
-
-def _view(method: FitMethod, geometry: Geometry, voxels: float, gaussians: float) -> Work:
-    """Work of one view in a step of a fit."""
-    reach = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
-    return Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, gaussians) * reach**2)
-
-
-def _rendered(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
-    """Work of rendering all views of the Gaussians, and once more the part that no voxels explain."""
-    field = Grid.for_fit(geometry, grid)
-    count = method.gaussians if isinstance(method.gaussians, int) else count_for(field, geometry.is_cone)
-    return 2 * _RENDER * geometry.n_views * _view(method, geometry, math.prod(field.shape), count)
-
-
-def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
-    """The refinement on voxels, with steps of sparse patches where these may follow."""
-    refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS)) + _rendered(method, geometry, grid)
-    refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
-    if method.finish is not None:
-        return refined
-    return refined + patch_steps(geometry, grid, PnpDct.iterations)
-
-
-def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
-    """Seconds of each part of a reconstruction on this machine; `recon.assess.time_model` chooses by them."""
-    field = Grid.for_fit(geometry, grid)
-    voxels, count = math.prod(field.shape), count_for(field, geometry.is_cone)
-    view = Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, count))
-    first = start_method(geometry, "fbp")
-    volume = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
-    start = Work.of("draw", count, voxels) + _RENDER * SCALED_BY * view
-    try:
-        sweep = fista_sweeps(geometry, grid, 1, SUBSETS, TV_STEPS).seconds(rates)
-        trials = weight_choice(geometry, grid).seconds(rates) if geometry.n_views >= LEAST_VIEWS else 0.0
-    except ValueError:  # voxels do not take these views
-        sweep, trials = math.inf, 0.0
-    step, fill = FitSettings().views_per_step * view, Work.of("fill", count, math.prod(grid.shape))
-    return Speeds(
-        volume.seconds(rates), start.seconds(rates), step.seconds(rates), fill.seconds(rates), sweep, trials
-    )  # fmt: skip
-
-
-_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
-
-
-def factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
-    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
-
-    Warns:
-        UserWarning: they do not suffice for a start from all pixels.
-    """
-    if isinstance(method.gaussians, Gaussians):
-        return 1
-    count = method.gaussians or default_count(geometry, grid.voxel_size)
-    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
-    needed += first_draw_seconds(grid, count, now)
-    remaining = max(end - now(), 0.0)
-    if needed <= remaining:
-        return 1
-    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
-    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
-    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
-    warnings.warn(
-        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
-        f"{then if factor > 1 else 'it ends late'}",
-        stacklevel=2,
-    )
-    return factor

@@ -9,7 +9,6 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from recon.base.arrays import bin_views
 from recon.base.choices import Filter
 from recon.base.choices import Start as Start
 from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
@@ -21,7 +20,6 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.slopes import slopes_at, windowed
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.field_edges import wider_than_field
@@ -131,20 +129,14 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
 
 
 def first_volume(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", factor: int = 1,
-    device: str = "cpu",
-) -> Volume:  # fmt: skip
+    projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp", device: str = "cpu"
+) -> Volume:
     """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
     "fbp": FBP or FDK; too short a scan of a cone for FDK gets a few sweeps of OS-SIRT with TV instead.
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
-    ramp. Pixels and voxels are joined by `factor`. The device is that of `direct` and of the sweeps.
+    ramp. The device is that of `direct` and of the sweeps.
     """
-    if factor > 1:
-        nz, ny, nx = (-(-n // factor) for n in grid.shape)
-        pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
-        grid = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
-        projections, geometry = bin_views(projections, factor), binned_geometry(geometry, factor)
     projections = without_wild_pixels(projections)
     if (sweeps := start_method(geometry, start)) is not None:
         return solve(sweeps, Projector(geometry, grid, device=device), projections)
@@ -182,11 +174,6 @@ def mean_change(
 def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
     """The sweeps that make the first volume; None if FBP or FDK makes it."""
     return OsSirtTv(iterations=START_SWEEPS, momentum=True) if _swept(geometry, start) else None
-
-
-def sweeps_of_start(geometry: Geometry, start: Start) -> float:
-    """Approximate number of sweeps of FISTA-TV over all views that take as long as the first volume."""
-    return 2 * START_SWEEPS if _swept(geometry, start) else 1.0
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:

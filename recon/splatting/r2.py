@@ -17,11 +17,9 @@ from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.in_time import fit_costs
 from recon.splatting.initialise import Start, default_count, first_volume, place
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
@@ -41,8 +39,8 @@ class R2(Checked):
             predict as well: then they make the volume, see `finish.judged`. With `seconds` it takes as many as
             fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
-            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
-            are too few for the start, a warning says so before it, and the start uses binned views.
+            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. The
+            start and one step are made in any case.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
@@ -155,9 +153,6 @@ class R2(Checked):
             rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return fit_costs(self, geometry, grid)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians

@@ -29,7 +29,6 @@ from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
     FinishPlan,
-    factor_in_time,
     fill_seconds,
     planned_finish,
 )
@@ -283,14 +282,13 @@ def _started(
     end = math.inf if method.seconds is None else begin + method.seconds
     first = None
     if control.resume is None:
-        factor = 1 if method.seconds is None else factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
-            first = first_volume(views.p, views.seen, views.field, method.start, factor, problem.device)
+            first = first_volume(views.p, views.seen, views.field, method.start, problem.device)
             start = place(
                 first, views.p, views.seen, views.count, np.random.default_rng(problem.seed),
                 start=method.start, rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
-            first = first if method.start == "fbp" and factor == 1 else None
+            first = first if method.start == "fbp" else None
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)

@@ -46,14 +46,14 @@ def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunCont
     The box is as wide as the sample. Where a sample goes on above or below the field of a cone, it is as tall as the
     rays: voxels of a thorax of 48 rows, cut from 128, have 38.7 dB in place of 14.4.
 
-    A sample within the field, a direct method, which continues the views, methods that make several volumes, and those
-    of an emission run as they are.
+    A sample within the field, a direct method, which continues the views, and methods that make several volumes run as
+    they are.
 
     Raises:
         ValueError: as `Method.run`.
     """
     decide = control.decide or Decisions(problem.seed)
-    if not knows_outside(method.traits, problem.use.emission):
+    if not knows_outside(method.traits):
         return method.run(problem, control)
 
     data, views, grid = problem.projections, problem.geometry, problem.grid
@@ -81,9 +81,9 @@ def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunCont
     return replace(result, volume=volume, settings={**result.settings, **radius}, outside=outside)
 
 
-def knows_outside(traits: Traits, emission: object | None) -> bool:
+def knows_outside(traits: Traits) -> bool:
     """Whether a method explains views by a box that holds all of the sample."""
-    return not (traits.direct or traits.several) and emission is None
+    return not (traits.direct or traits.several)
 
 
 def sample_radius(

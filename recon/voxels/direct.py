@@ -21,10 +21,8 @@ from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
-from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
-from recon.voxels.back_project import SLICES, nanoseconds
 from recon.voxels.devices import voxel_device
 from recon.voxels.fbp import Filter, continuation, continued, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
@@ -326,11 +324,6 @@ class Fbp(Checked):
     def toy(self) -> Self:
         return self
 
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        if geometry.is_cone and missing_arc(geometry) > 0:
-            cone_weights(geometry)  # refuses these views by the degrees that they lack
-        return Costs({self.name: direct_work(geometry, grid)})
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         views, (rows, cols) = geometry.n_views, geometry.detector_shape
         beside = fbp_memory(views, max(cols, grid.shape[2]))
@@ -356,22 +349,6 @@ def direct(
     if geometry.is_cone:
         return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)
-
-
-def direct_work(geometry: Geometry, grid: Grid) -> Work:
-    """The work of `direct`; of views that it does not take, none."""
-    if not has_direct_method(geometry):
-        return Work()
-    nz, ny, nx = grid.shape
-    views, cols = geometry.n_views, geometry.detector_shape[1]
-    if geometry.is_cone or not geometry.is_straight:
-        kind = "cone" if geometry.is_straight else "posed"
-        return Work.of(f"back-projection, {kind}", views * ny * nx, views * ny * nx * nz)
-    ways = nanoseconds(views, cols, (ny, nx), nz, partial(ramp, pixel_pitch=1.0, filter="hann"))
-    blocks = -(-nz // SLICES)
-    way = "rays" if ways[0] <= ways[1] else "gridding"
-    rays = 0.0 if way == "gridding" else float(views * SLICES * blocks * cols)  # gridding has them among its points
-    return Work.of(f"fbp, {way}", rays, 1e-9 * min(ways) * blocks)
 
 
 def has_direct_method(geometry: Geometry) -> bool:

@@ -14,7 +14,6 @@ from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
-from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
@@ -25,7 +24,7 @@ from recon.voxels.held_out import (
     preferred_strength,
 )
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
-from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct
 from recon.voxels.voxel_problem import (
     Momentum,
     TotalVariationProx,
@@ -35,15 +34,6 @@ from recon.voxels.voxel_problem import (
     interleaved,
     iterative_memory,
     largest_eigenvalue,
-)
-from recon.voxels.work import (
-    fista_sweeps,
-    on_volume,
-    ordered_sweeps,
-    patch_choice,
-    patch_steps,
-    power_rounds,
-    weight_choice,
 )
 
 
@@ -99,13 +89,6 @@ class FistaTv(VoxelMethod):
             used = weight.value if isinstance(weight, NoiseBalance) else weight
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        count = subsets_of(geometry, self.subsets, FEWEST_SUBSETS)
-        start = ordered_sweeps(geometry, grid, 1, 9) + power_rounds(geometry, grid, count)
-        sweeps = fista_sweeps(geometry, grid, self.iterations, self.subsets, self.tv_steps, FEWEST_SUBSETS)
-        choice = weight_choice(geometry, grid) if self.tv_weight is None else Work()
-        return Costs({self.name: start + sweeps}, choice)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 7.3, 3.0, 4.8 * weighted, filtered=True)
@@ -171,11 +154,6 @@ class OsSirtTv(VoxelMethod):
             problem.decide(TV_WEIGHT_CHOSEN, lambda: threshold / unit)
         return x
 
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        step = on_volume("tv", grid, self.tv_steps + 1) + on_volume("pass", grid, 2 * self.momentum)
-        work = ordered_sweeps(geometry, grid, self.iterations, self.subsets) + self.iterations * step
-        return Costs({self.name: work}, weight_choice(geometry, grid) if self.tv_weight is None else Work())
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 8.1 + 2 * self.momentum, 5.2, 8.2 * weighted, filtered=True)
 
@@ -234,12 +212,6 @@ class PnpDct(VoxelMethod):
             strength = problem.decide("threshold", lambda: share * density_unit(x))
         further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
         return pnp_dct(further, x, strength, steps=self.iterations)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        first = FistaTv().costs(geometry, grid)
-        choice = patch_choice(geometry, grid, self.trial_steps) if self.patch_threshold is None else Work()
-        work = first.volumes[FistaTv.name] + patch_steps(geometry, grid, self.iterations)
-        return Costs({self.name: work}, first.choice + choice)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape

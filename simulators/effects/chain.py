@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Protocol, TypeAlias, runtime_checkable
 
@@ -13,9 +12,6 @@ from pydantic import AfterValidator
 
 from simulators.effects.catalogue import CATALOGUE, FINAL, Domain, class_of, order_error
 from simulators.frame.shot import Image, Moments, Pose, Shot
-
-StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
-"""A context that is entered with the name of each step of an exposure, to measure its cost."""
 
 
 class Effect(Protocol):
@@ -128,12 +124,11 @@ class Chain:
         """(row, col) of each ray of a pixel, in pixels from its middle."""
         return next((effect.offsets for effect in self.effects if isinstance(effect, AreaEffect)), [(0.0, 0.0)])
 
-    def apply(self, domain: Domain, image: Image, shot: Shot, on_step: StepHook = nullcontext) -> Image:
+    def apply(self, domain: Domain, image: Image, shot: Shot) -> Image:
         """The image after the effects of one domain."""
         for effect in self.effects:
             if effect.domain == domain and isinstance(effect, ImageEffect):
-                with on_step(effect.name):
-                    image = effect.apply(image, shot)
+                image = effect.apply(image, shot)
         return image
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:

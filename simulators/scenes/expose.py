@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from drivers.base.frame import FrameKind
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
 from simulators.effects.catalogue import Domain
-from simulators.effects.chain import StepHook
 from simulators.frame.sensor import CONVERSION, digitise, largest_count
 from simulators.frame.shot import AngleAt, Detector, Image, Pose, Shot
 from simulators.samples.sample import sample_at
@@ -130,39 +128,35 @@ class Scan:
         return lambda at: angle + speed * (at - time)
 
 
-def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray[np.uint16]:
+def expose(scene: Scene, shot: Shot) -> NDArray[np.uint16]:
     """One frame, counts uint16 [row, col].
 
     Args:
         shot: the conditions; the same shot gives the same frame.
-        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects'.
     """
     chain = scene.chain
     if shot.beam:
-        photons = _photons(scene, shot, on_step)
-        electrons = chain.apply(Domain.PHOTONS, photons, shot, on_step)
+        photons = _photons(scene, shot)
+        electrons = chain.apply(Domain.PHOTONS, photons, shot)
     else:
         electrons = np.zeros(shot.detector.shape)
-    electrons = chain.apply(Domain.ELECTRONS, electrons, shot, on_step)
-    with on_step("digitise"):
-        electrons /= shot.conversion
-    counts = chain.apply(Domain.COUNTS, electrons, shot, on_step)
-    with on_step("digitise"):
-        return digitise(counts, largest_count(shot.readout, shot.binning))
+    electrons = chain.apply(Domain.ELECTRONS, electrons, shot)
+    electrons /= shot.conversion
+    counts = chain.apply(Domain.COUNTS, electrons, shot)
+    return digitise(counts, largest_count(shot.readout, shot.binning))
 
 
-def _photons(scene: Scene, shot: Shot, on_step: StepHook) -> Image:
+def _photons(scene: Scene, shot: Shot) -> Image:
     """Photons behind the sample, averaged over the moments of the effects of motion; float64 [row, col]."""
     open_beam = scene.beam.photons_per_s * shot.exposure * shot.binning**2  # photons of a pixel
     if not shot.sample:
-        with on_step("beer_lambert"):
-            return np.full(shot.detector.shape, open_beam)
+        return np.full(shot.detector.shape, open_beam)
     if not scene.chain.moves:
         angle = np.full(shot.detector.shape[0], shot.angle)
-        return _transmission(scene, shot, angle, np.zeros_like(angle), open_beam, on_step)
+        return _transmission(scene, shot, angle, np.zeros_like(angle), open_beam)
     moments = scene.chain.moments(shot)
     parts = (
-        _transmission(scene, shot, _row_angles(times, shot), times, weight * open_beam, on_step)
+        _transmission(scene, shot, _row_angles(times, shot), times, weight * open_beam)
         for times, weight in zip(moments.times, moments.weights, strict=True)
     )
     photons = next(parts)
@@ -177,7 +171,6 @@ def _transmission(
     angles: NDArray[np.float64],
     times: NDArray[np.float64],
     open_beam: float,
-    on_step: StepHook,
 ) -> Image:
     """open_beam x exp(-line integral) with the sample's pose at one moment of each row, mean over a pixel's rays."""
     pose = scene.chain.pose(Pose(angles), times, shot)
@@ -187,13 +180,11 @@ def _transmission(
 
     def through(row: float, col: float) -> Image:
         detector = shot.detector.aimed(row, col)
-        with on_step("line_integrals"):
-            depth = sample.line_integrals(pose, detector)
-        depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, replace(now, detector=detector), on_step)
-        with on_step("beer_lambert"):
-            np.exp(np.negative(depth, out=depth), out=depth)
-            depth *= open_beam / len(rays)
-            return depth
+        depth = sample.line_integrals(pose, detector)
+        depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, replace(now, detector=detector))
+        np.exp(np.negative(depth, out=depth), out=depth)
+        depth *= open_beam / len(rays)
+        return depth
 
     photons = through(*rays[0])
     for ray in rays[1:]:

@@ -59,7 +59,6 @@ class ArraySource:
     finished = True
     ending = ScanEnding()
     times = None
-    emission = None
     plan: dict[str, Any] = {}  # noqa: RUF012
     unreadable: dict[int, str] = {}  # noqa: RUF012
 

@@ -79,7 +79,7 @@ CASES: Mapping[str, tuple[str | Scene, ...]] = {
     "diamond, half the views, rings": (*DIAMOND, "--views", "every:2", "--rings", "vo", "--air", "surface:1"),
     "diamond, turned": (*DIAMOND, "--tilt", "0.5", "--distortion", "lens.txt", "--hardening", "fit"),
     "diamond, tilt sought": (DIAMOND[0], "--tilt", "auto", "--bin", "2"),
-    "diamond, phase": (*DIAMOND, *PAGANIN, "--unsharp", "1:0.5", "--rings", "wavelet", "--air", "12,12"),
+    "diamond, phase": (*DIAMOND, *PAGANIN, "--unsharp", "1:0.5", "--rings", "sort", "--air", "12,12"),
     "diamond, phase of turned views in slabs": (*DIAMOND, *PAGANIN, "--tilt", "-0.4", "--memory", "14M"),
     "diamond, followed": (*DIAMOND, "--follow", "--seconds", "0.5", "--tilt", "0.5"),
     "tooth, dynamic flats": (*TOOTH, "--flat-fields", "dynamic", "--rings", "auto"),

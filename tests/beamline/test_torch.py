@@ -11,8 +11,6 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 
 NEED = {
     "beamline.core.machine",  # asks for its version, where it is loaded
-    "recon.features.neural.networks",
-    "recon.features.neural.train",
     "recon.splatting.autograd",
     "recon.splatting.finish",  # these hold Gaussians as tensors
     "recon.splatting.gaussians",
@@ -21,7 +19,7 @@ NEED = {
 }
 """Modules that may load torch, beside those of `recon.kernels.gpu`."""
 
-ON_VOXELS = ("fista-tv", "os-sirt-tv", "pnp-dct", "sirt", "sart", "cgls", "asd-pocs", "osem")
+ON_VOXELS = ("fista-tv", "os-sirt-tv", "pnp-dct", "sirt", "sart", "cgls", "asd-pocs")
 
 WITHOUT = """
 import sys

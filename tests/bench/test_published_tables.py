@@ -27,12 +27,13 @@ import psutil
 import pytest
 
 import recon
+import splatline_neural
 from recon.assess.metrics import psnr, ssim2d, ssim3d
 from recon.base.method import DataUse, RunControl
-from recon.features.neural.train import FieldMethod
 from recon.features.published.r2_published import R2Published, published_fit
 from recon.methods import with_settings
 from recon.warm_up import warm_up
+from splatline_neural.train import FieldMethod
 from tests.bench.quality_cases import F32, Case, cone, diamond, seen_by_simulator, walnut_halved
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(0)]
@@ -46,9 +47,9 @@ METHODS: dict[str, Any] = {
     "ASD-POCS": recon.AsdPocs(),
     "SIRT": recon.Sirt(),
     "FISTA-TV": recon.FistaTv(),
-    "IntraTomo-class": recon.IntraTomo(steps=10**6),
-    "NAF": recon.NAF(steps=10**6),
-    "SAX-NeRF": recon.SaxNerf(steps=10**6),
+    "IntraTomo-class": splatline_neural.IntraTomo(steps=10**6),
+    "NAF": splatline_neural.NAF(steps=10**6),
+    "SAX-NeRF": splatline_neural.SaxNerf(steps=10**6),
     "plain splatting": R2Published(gaussians=COUNT, fit=replace(FIT, rays=replace(FIT.rays, rectified=False))),
     "R2 as published": R2Published(gaussians=COUNT),
     "R2 of ours": recon.R2(),

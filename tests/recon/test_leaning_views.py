@@ -20,15 +20,14 @@ from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
 GRID = recon.Grid((28, 32, 32), 0.04)
 ANGLES = np.arange(32) * 2 * np.pi / 32
-# Their rays are those of r2, naf and fista-tv.
+# Their rays are those of r2 and fista-tv.
 QUICK = "fbp", "cgls", "fista-tv"
 CONES = "r2", "fbp", "sirt"  # whose rays of a cone are those of the others
-LIKE_OTHERS = "r2-published", "sax-nerf", "intratomo", "series", "materials"
+LIKE_OTHERS = "r2-published", "series", "materials"
 SHORT = {
     "r2": {"steps": 60, "gaussians": 300, "finish": 4},
     "r2-published": {"steps": 60, "gaussians": 300},
     "fbp": {},
-    "naf": {"steps": 300, "rays": 256, "samples": 24, "rate": 1e-2},
 }
 
 

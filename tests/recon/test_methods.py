@@ -20,11 +20,6 @@ from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
 
 ROOT = Path(__file__).parents[2]
-FIELDS = {
-    "naf": {"steps": 120, "rays": 128, "samples": 16, "rate": 1e-2, "levels": 1},
-    "intratomo": {"steps": 120, "rays": 128, "samples": 16, "rate": 1e-2, "width": 32, "bands": 3},
-    "sax-nerf": {"steps": 120, "rays": 64, "samples": 12, "rate": 1e-2, "levels": 1, "width": 16, "window_count": 0},
-}  # settings with which a neural field is done within a second
 VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (6, 24), pixel_pitch=0.5)
 
 
@@ -41,7 +36,7 @@ def _first_steps() -> recon.RunControl:
     return recon.RunControl(should_stop=lambda: next(asked) >= 20)
 
 
-@pytest.mark.parametrize("name", [name for name in methods.names_of_one_volume() if name not in FIELDS])
+@pytest.mark.parametrize("name", methods.names_of_one_volume())
 def test_a_method_by_name_is_the_method_by_object_to_the_bit(name: str, projections: NDArray[np.float32]) -> None:
     method = methods.by_name(name)
     by_name, by_object = (
@@ -52,7 +47,7 @@ def test_a_method_by_name_is_the_method_by_object_to_the_bit(name: str, projecti
     assert by_object.volume.data.max() > 0.05
 
 
-@pytest.mark.parametrize("name", [name for name in methods.taking("allow_negative") if name not in FIELDS])
+@pytest.mark.parametrize("name", methods.taking("allow_negative"))
 def test_negative_densities_are_kept_where_they_are_allowed(name: str, projections: NDArray[np.float32]) -> None:
     """Air below zero: 0.02 on rays of 12 mm."""
     views = projections - np.float32(0.02)
@@ -67,7 +62,7 @@ def test_negative_densities_are_kept_where_they_are_allowed(name: str, projectio
 
 
 def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
-    positive = {"mlem", "osem", "series", "materials"}  # the iterations of the first two multiply
+    positive = {"series", "materials"}
     others = set(methods.names()) - set(methods.with_trait("direct")) - positive
     assert set(methods.taking("allow_negative")) == others
 
@@ -136,7 +131,7 @@ class TestConformance(MethodConformance):
     @pytest.fixture(
         params=[
             pytest.param(name, marks=[pytest.mark.slow] * entry.module.startswith("recon.features"))
-            for name, entry in methods.METHODS.items()
+            for name, entry in methods.REGISTRY.items()
         ]
         + ["auto"]
     )
@@ -145,9 +140,6 @@ class TestConformance(MethodConformance):
         if request.param == "auto":
             return recon.Auto((recon.Fbp(), recon.FistaTv(iterations=3), fit))
         method = methods.by_name(request.param)
-        if request.param in FIELDS:
-            request.getfixturevalue("one_thread")
-            return methods.build(method, FIELDS[request.param])
         if request.param not in methods.names_of_one_volume():
             return methods.build(
                 method, {"sweeps": 5, "weight": 0.01} | ({"moves": False} if request.param == methods.IN_TIME else {})

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from recon import warm_up as module
-from recon.base.choices import KERNEL
 from recon.base.geometry import Geometry
-from recon.kernels.cpu import activation, adam, footprints, joseph, losses, project, tv, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.view_weights import missing_arc
-from recon.warm_up import toy_of, warm_up, warm_up_rest
+from recon.warm_up import toy_of, warm_up
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
 _SCRIPT = """
@@ -130,16 +128,3 @@ def test_it_counts_what_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     assert counted == [1, 2, 3, 4]  # of the fit, and of the patches that may make its volume
     warm_up(geometry=cone, on_kernel=counted.append)
     assert counted == [1, 2, 3, 4]  # once in a process
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_what_a_second_process_compiles_is_what_the_fit_calls() -> None:
-    kernels = (
-        voxelize._near, voxelize._place, voxelize._FILL[KERNEL], voxelize._GATHER[KERNEL], adam._adam, adam.add_lengths,
-        activation.activation_backward, losses._total_variation, footprints._straight_footprints_backward,
-        project._MOMENTS[KERNEL], joseph._forward, joseph._adjoint, tv._dual_step, tv._primal, tv._total_variation,
-    )  # fmt: skip
-    warm_up()
-    known = [set(kernel.signatures) for kernel in kernels]
-    warm_up_rest()
-    assert [set(kernel.signatures) for kernel in kernels] == known and all(known)

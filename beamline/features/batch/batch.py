@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +14,10 @@ from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
-from beamline.core.machine import Need
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import SENTENCE, count, csv_text, one_line, safe_name, size
+from beamline.core.text import SENTENCE, csv_text, one_line, safe_name
 from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
-from recon.assess.time_model import duration_text
 
 RowState = Literal["waiting", "done", "poor", "failed"]
 
@@ -106,72 +104,6 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
         return rows
     finally:
         lock.release()
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScanNeed(Need):
-    """Time and memory of the reconstruction of a scan; `refusal`: why it would fail, or empty."""
-
-    refusal: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BatchPlan(Need):
-    """Scans that a batch would reconstruct, and the time and memory needed.
-
-    Attributes:
-        rows: all rows of the table, with those of this call.
-        needs: of each scan that waits, by its row's name.
-    """
-
-    folder: Path
-    rows: Sequence[BatchRow]
-    needs: Mapping[str, ScanNeed]
-
-    def lines(self) -> list[str]:
-        """The plan as lines for people."""
-        width = max((len(row.name) for row in self.rows), default=4)
-        rows = [
-            f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{one_line(row.scan, SENTENCE)}"
-            for row in self.rows
-        ]
-        refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]
-        unknown = sum(needs.seconds is None and not needs.refusal for needs in self.needs.values())
-        time = f"about {duration_text(self.seconds or 0.0)} at most, reading and correction not counted"
-        time += f", beside {count(unknown, 'scan')} whose time is not known" if unknown else ""
-        fails = f"; {len(refused)} of them would fail" if refused else ""
-        return [
-            *rows,
-            "",
-            *([*refused, ""] if refused else []),
-            f"{'scans':<10}{len(self.rows)}; {len(self.needs)} to be reconstructed{fails}",
-            f"{'time':<10}{time if self.needs else 'none: every scan has a volume'}",
-            f"{'memory':<10}{size(self.memory or 0)} for the largest",
-            f"{'disk':<10}{size(self.disk)}",
-            f"{'output':<10}{self.folder}: {TABLE}, and a folder a scan (not written now)",
-        ]
-
-    def _time_of(self, row: BatchRow) -> str:
-        needs = self.needs.get(row.name)
-        return "" if needs is None or needs.seconds is None else duration_text(needs.seconds)
-
-
-def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) -> BatchPlan:
-    """Plan `run_batch`: nothing is written, and no frame is read.
-
-    Args:
-        needs_of: what the reconstruction of a scan file by the recipe takes.
-
-    Raises:
-        DataError: as `run_batch`, which would refuse the folder.
-    """
-    folder, earlier = options.folder, list[BatchRow]()
-    if folder.exists():
-        _refuse_other(folder, b"" if options.recipe is None else options.recipe.read_bytes())
-        earlier = _read(folder)
-    rows = _rows(options.scans, earlier)
-    needs = {row.name: needs_of(row.scan) for row in rows if not row.has_volume}
-    return BatchPlan(folder=folder, rows=rows, needs=needs, **vars(Need.in_turn(needs.values())))
 
 
 def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[str]:
@@ -299,10 +231,7 @@ def _read(folder: Path) -> list[BatchRow]:
             if not {"name", "scan"} <= {*(reader.fieldnames or ())}:
                 raise ValueError(f"expected a first line with name and scan, not {reader.fieldnames}")
         table = TypeAdapter(list[BatchRow]).validate_python(rows)
-        folded = [TABLE, RECIPE, *(row.name.casefold() for row in table)]
-        for n, row in enumerate(table, start=2):
-            if row.name != safe_name(row.name) or folded[n] in folded[:n]:
-                raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
+        _refuse_names(table)
         return [
             BatchRow(row.name, row.scan) if row.has_volume and not (folder / row.name / RECON).is_file() else row
             for row in table
@@ -313,6 +242,14 @@ def _read(folder: Path) -> list[BatchRow]:
         raise DataError(f"{path} is no table of a batch ({place}: {first['msg']}). Nothing was touched.") from error
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
+
+
+def _refuse_names(rows: Sequence[BatchRow]) -> None:
+    """ValueError for a name that is not safe for a folder, or that another row or file of the batch has."""
+    folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
+    for n, row in enumerate(rows, start=2):
+        if row.name != safe_name(row.name) or folded[n] in folded[:n]:
+            raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:

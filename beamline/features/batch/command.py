@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import os
-from dataclasses import fields
-from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import click
 
-from beamline.cli.options import dry_option, json_option
+from beamline.cli.options import json_option
 from beamline.cli.terminal import answering
-from beamline.core.errors import BeamlineError, DataError, ScanStopped
-from beamline.core.files import RECON
-from beamline.core.machine import Need
-from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
+from beamline.core.errors import DataError, ScanStopped
+from beamline.features.batch.batch import TABLE, BatchOptions, run_batch
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
@@ -37,24 +32,6 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
     return list(scans)
 
 
-def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
-    """What the reconstruction of a scan takes, with its output on the disk of the folder `beside`."""
-    from beamline.cli.recon import options_of, recon  # the batch itself needs none of it
-    from beamline.core.durations import MachineSpeed
-    from beamline.core.machine import busy
-    from beamline.reconstruct.estimate import estimate
-
-    recipe = [] if config is None else ["--config", str(config)]
-    try:
-        with TemporaryDirectory(prefix=".beamline-", dir=beside) as work:
-            words = [scan, *recipe, "--output", str(Path(work) / RECON)]
-            with recon.make_context("beamline recon", words) as context:
-                needs = estimate(options_of(context), MachineSpeed(), busy())
-    except (BeamlineError, click.ClickException) as error:
-        return ScanNeed(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
-    return ScanNeed(**{each.name: getattr(needs, each.name) for each in fields(Need)})
-
-
 @click.command()
 @click.argument("scans", nargs=-1, required=True, callback=scans_of)
 @click.option(
@@ -69,9 +46,8 @@ def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
     required=True,
     help="Folder of the results: new, or that of an earlier call with the same recipe, which is continued.",
 )
-@dry_option
 @json_option
-def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_json: bool) -> None:
+def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:
     """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
 
     Each scan gets a folder in --output with its volume, report and log; batch.csv says what became of it, and why it
@@ -83,12 +59,6 @@ def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_js
 
         refuse_recipe(config)
     options = BatchOptions(scans, config, output)
-    if dry:
-        beside = next(folder for folder in output.absolute().parents if folder.is_dir())
-        planned = planned_batch(options, partial(_needs_of, config, beside))
-        with answering(as_json) as answer:
-            answer.done(planned, *planned.lines())
-        return
     with answering(as_json) as answer:
         try:
             rows = run_batch(options, answer.sink, answer.clock)

@@ -6,8 +6,8 @@ import os
 import shlex
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -19,7 +19,6 @@ from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
-from beamline.core.process import ChildProcess
 from beamline.core.sinks import fan_out, sentence
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
@@ -55,21 +54,12 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
         config = load(config_folder() / "demo.yaml", overrides)
         stop = StopRequest()
         last: list[Event] = []
-        with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
+        with stop_signals(stop), Terminal(sys.stderr) as terminal:
             run_demo(config, output, [terminal, last.append, json_sink], stop, shlex.join(["beamline", *sys.argv[1:]]))
     if not as_json:
         done = last[-1]
         assert isinstance(done, VolumeDone)
         click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
-
-
-@contextmanager
-def _compiling() -> Iterator[None]:
-    """A process of low priority that compiles the last kernels of the fit: once on a machine."""
-    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
-        words = [sys.executable, "-c", "from recon.warm_up import warm_up_rest; warm_up_rest()"]
-        with ChildProcess(words, nowhere, lambda line: None, behind=True):
-            yield
 
 
 def _keep_bytecode() -> None:

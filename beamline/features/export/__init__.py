@@ -1,5 +1,5 @@
-"""Volumes in other formats, and films of volumes and views."""
+"""Volumes in other formats."""
 
 COMMANDS = {
-    "export": ("Copy a volume to another format, with grey values if wanted, or make a film of it.", True),
+    "export": ("Copy a volume to another format, with grey values if wanted.", True),
 }

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,6 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.options import (
-    FiniteRange,
     NameChoice,
     WholeRange,
     dataset_option,
@@ -28,70 +26,16 @@ from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing
-from beamline.core.sinks import Warn
 from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.views import spread
 
 if TYPE_CHECKING:
-    from beamline.features.export.film_file import FilmImages, FilmStyle, WrittenFilm
+    from beamline.gaussians import Model
     from beamline.storage.recon_record import ReconRecord
 
-VIEWS, AXES = "views", "zyx"
-SUFFIXES = (".gif", ".mp4")
 _PLY, _CSV = ".ply", ".csv"
 _SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
-
-
-def export_film(of: str, file: Path, output: Path, style: FilmStyle, dataset: tuple[str | None, int | None],
-                as_json: bool) -> None:  # fmt: skip
-    """Write the film and print what it shows.
-
-    Args:
-        of: "z", "y", "x" or "views".
-        dataset: of a volume: which array, and which volume of a series in time.
-    """
-    from beamline.features.export.film_file import write_film
-
-    with answering(as_json) as answer:
-        refuse_existing(output)
-        with _images(of, file, style, dataset, answer.warn) as images:
-            made = write_film(output, images, style, answer.counting("images"))
-        every = images.shown[1] - images.shown[0] if of != VIEWS and len(images.shown) > 1 else 1
-        answer.done({"output": output, "film": of, **vars(made)}, *_lines(output, of, made, every))
-
-
-@contextmanager
-def _images(
-    of: str, file: Path, style: FilmStyle, dataset: tuple[str | None, int | None], warn: Warn
-) -> Iterator[FilmImages]:
-    from beamline.features.export.film_file import slices_along
-
-    if of != VIEWS:
-        from beamline.storage.volumes.files import opened_volume
-
-        with opened_volume(file, *dataset) as record:
-            yield slices_along(record, AXES.index(of), style.side)
-        return
-    from beamline.features.export.film_file import views_by_angle
-    from beamline.storage.readers.open import SourceOptions
-
-    with SourceOptions(file, frames_per_view=None).open() as source:
-        yield views_by_angle(source, style.side, warn)
-
-
-def _lines(output: Path, of: str, made: WrittenFilm, every: int) -> list[str]:
-    shown = "views by angle" if of == VIEWS else f"slices along {of}"
-    if every > 1:
-        shown += f", one of {every}"
-    rows, cols = made.shape
-    low, high = made.window
-    length = f"{made.images / made.fps:.1f} s, {made.fps:.3g} a second"
-    return [
-        f"output   {output}",
-        f"film     {made.images} {shown}, {cols} x {rows} pixels; {length}",
-        f"window   {low:.4g} (black) to {high:.4g} (white)",
-    ]
 
 
 def window_of(text: str) -> tuple[float, float]:
@@ -106,22 +50,21 @@ def window_of(text: str) -> tuple[float, float]:
 
 
 def _output_path(text: str) -> Path:
-    return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV, *SUFFIXES) else volume_path(text)
+    return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)
 
 
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
     """What `beamline export` is asked for."""
 
-    volume: Path = set_by(click.argument("volume", metavar="VOLUME|RUN|SCAN", type=click.Path(path_type=Path)))
+    volume: Path = set_by(click.argument("volume", metavar="VOLUME|RUN", type=click.Path(path_type=Path)))
     output: Path = set_by(
         "-o",
         "--output",
         metavar="PATH",
         callback=parsed(_output_path),
         required=True,
-        help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv, with --film "
-        ".gif or .mp4.",
+        help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
     )
     bits: str = set_by(
         "--bits", type=NameChoice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values."
@@ -130,23 +73,8 @@ class ExportRequest:
         "--window",
         metavar="LOW:HIGH",
         callback=parsed(window_of),
-        help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped. Of "
-        "--film: those that become black and white; default: by 99.8 % of the values of some images.",
+        help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
     )
-    film: str | None = set_by(
-        "--film",
-        type=NameChoice([*AXES, VIEWS]),
-        excludes={"bits": "its images have 8 bits", **dict.fromkeys(("gaussians", "poses"), "give one of them")},
-        help="A film of the slices along an axis, or of the views of a SCAN by angle. An .mp4 needs ffmpeg.",
-    )
-    fps: float = set_by(
-        "--fps", type=FiniteRange(0.1, 100), default=20.0, show_default=True, needs=("film", "is of --film."),
-        help="Of a film: images a second. A .gif takes the nearest that it can state: 50, 33.3, 25, 20 ...",
-    )  # fmt: skip
-    side: int = set_by(
-        "--side", type=WholeRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
-        help="Of a film: pixels of an image's longer side, at most; pixels are averaged, never enlarged.",
-    )  # fmt: skip
     gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
     poses: bool = set_by(
         "--poses",
@@ -163,25 +91,18 @@ class ExportRequest:
 @click.command(cls=Repeatable)
 @with_request(ExportRequest)
 def export(request: ExportRequest) -> None:
-    """Copy VOLUME to another format, or show it, or the views of SCAN, as a film.
+    """Copy VOLUME to another format.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.
     """
-    from beamline.storage.interrupted import scan_file, volume_file
+    from beamline.storage.interrupted import volume_file
 
     context = click.get_current_context()
     refuse_contradictions(context.command, names_given(context))
-    file = (scan_file if request.film == VIEWS else volume_file)(request.volume)
-    request = replace(request, volume=file)
+    request = replace(request, volume=volume_file(request.volume))
     refuse_shared({"VOLUME": request.volume, "--output": request.output})
-    if (request.output.suffix.lower() in SUFFIXES) != (request.film is not None):
-        raise click.UsageError(
-            f"-o {request.output}: --film goes with the suffixes {' and '.join(SUFFIXES)}, and voxels with others."
-        )
-    if request.film is not None:
-        _export_film(request)
-    elif (part := _part_asked_for(request)) is not None:
+    if (part := _part_asked_for(request)) is not None:
         part(request.volume, request.output, request.as_json)
     else:
         _export_voxels(request)
@@ -242,25 +163,42 @@ def _export_voxels(request: ExportRequest) -> None:
         )
 
 
-def _export_film(request: ExportRequest) -> None:
-    from beamline.features.export.film_file import FilmStyle
-
-    style = FilmStyle(request.side, request.fps, request.window)
-    export_film(
-        request.film or VIEWS, request.volume, request.output, style, (request.dataset, request.at), request.as_json
-    )
-
-
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
-    from beamline.features.export.film_file import write_ply
     from beamline.gaussians import read_model
 
     with answering(as_json) as answer:
         refuse_existing(output)
         model = read_model(volume)
-        write_ply(output, model)
+        _write_ply(output, model)
         facts = {"output": output, "gaussians": model.gaussians.n}
         answer.done(facts, f"output     {output} (PLY)", f"gaussians  {model.gaussians.n}, {model.gaussians.kernel}")
+
+
+def _write_ply(path: Path, model: Model) -> None:
+    """The Gaussians as a binary PLY: x y z, scale_0..2 (standard deviations), rot_0..3 (w x y z), density.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses; nothing is left.
+    """
+    import numpy as np
+
+    from beamline.core.files import whole_file
+
+    arrays, unit = model.gaussians.physical(), model.record.length_unit
+    names = ("x", "y", "z", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "density")
+    columns = (arrays["centres"], arrays["widths"], arrays["rotations"], arrays["densities"][:, None])
+    rows = np.concatenate(columns, axis=1).astype("<f4")
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment lengths in {unit}, densities in {model.record.unit}, kernel {model.gaussians.kernel}",
+        f"element vertex {len(rows)}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    with whole_file(path) as partial, partial.open("wb") as file:
+        file.write(("\n".join(head) + "\n").encode())
+        file.write(rows.tobytes())
 
 
 def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
@@ -287,9 +225,8 @@ def _suggestion(record: ReconRecord) -> str:
     if not values.size:
         return "No value of the slices looked at is finite. Nothing was written."
     low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
-    if low < high:
-        return f"99.8 % of the values of {count(chosen.size, 'slice')} lie in {low:g}:{high:g}. Nothing was written."
-    lowest, highest = float(values.min()), float(values.max())
-    if lowest < highest:  # matter in a few voxels, or values that differ in their last digits
-        return f"The values of {count(chosen.size, 'slice')} lie in {lowest:.8g}:{highest:.8g}. Nothing was written."
-    return f"Every value of the slices looked at is {lowest:g}: there is no window to take. Nothing was written."
+    if low == high:  # matter in a few voxels, or values that differ in their last digits
+        low, high = float(values.min()), float(values.max())
+    if low == high:
+        return f"Every value of the slices looked at is {low:g}: there is no window to take. Nothing was written."
+    return f"The values of {count(chosen.size, 'slice')} lie in {low:.8g}:{high:.8g}. Nothing was written."

@@ -92,11 +92,11 @@ def _described(facts: Mapping[str, Any], returned: Sequence[str]) -> list[str]:
     """The facts of a scan or a volume in lines, with how the sample came back to earlier angles."""
     from beamline.storage.flag_legend import counted
 
-    apart = ("attributes", "used", "not_used", "findings", "returned")
+    apart = ("attributes", "not_used", "findings", "returned")
     shown = {name: value for name, value in facts.items() if name not in apart}
     if shown.get("flags") is not None:
         shown["flags"] = counted(shown["flags"])
-    for name in apart[:3]:
+    for name in apart[:2]:
         shown |= facts.get(name, {})
     width = max(map(len, shown)) + 2
     lines = [f"{name:<{width}}{_text(value)}" for name, value in shown.items()]
@@ -109,7 +109,7 @@ def _returned(scan: SourceOptions) -> list[ReturnedView]:
     from beamline.projections.flagged_frames import returned_views
     from beamline.storage.readers.base import TakesTooLongError
     from beamline.storage.readers.open import open_scan
-    from beamline.storage.readers.wrapped import brief_source
+    from beamline.storage.readers.transforms import brief_source
 
     until = SystemClock().now() + LOOK
     with suppress(TakesTooLongError), open_scan(scan) as source:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from datetime import datetime
 from typing import Any
 
 import h5py
@@ -69,66 +68,6 @@ def angle_units(places: Places) -> Iterator[Finding]:
         if datasets.factor_of(unit, datasets.ANGLE_UNITS) is None:
             units = f"the units {unit!r}" if unit else "no units attribute"
             yield Finding("error", "angle-units", f"{places.angle.name} has {units}; expected degree or rad.")
-
-
-def links_targeted(places: Places) -> Iterator[Finding]:
-    """NXdata links to the three datasets that NXtomo requires, and @target names their paths."""
-    nxdata = datasets.resolve(places.entry, "data")
-    if not isinstance(nxdata, h5py.Group):
-        yield Finding("warning", "links", f"{places.entry.name}/data (NXdata) is not there: viewers find no plot.")
-        return
-    for name, original in (("data", places.data), ("image_key", places.image_key), ("rotation_angle", places.angle)):
-        if original is None:
-            continue
-        linked = datasets.dataset(nxdata, name)
-        target = datasets.attribute(original, "target")
-        if linked is None:
-            yield Finding("warning", "links", f"{nxdata.name}/{name} is not there.")
-        elif linked != original:
-            yield Finding("warning", "links", f"{nxdata.name}/{name} is another dataset than {original.name}.")
-        elif not target:
-            yield Finding("warning", "links", f"{original.name} has no @target: strict readers refuse the link to it.")
-        elif datasets.dataset(places.entry, target) != original:
-            yield Finding("warning", "links", f"@target of {original.name} names {target!r}, which is something else.")
-
-
-def axis_order(places: Places) -> Iterator[Finding]:
-    """NXdata's axes are rotation_angle, then rows and columns as float positions."""
-    nxdata = datasets.resolve(places.entry, "data")
-    if not isinstance(nxdata, h5py.Group) or "axes" not in nxdata.attrs:
-        if isinstance(nxdata, h5py.Group):
-            yield Finding("warning", "axes", f"{nxdata.name} has no axes attribute.")
-        return
-    axes = [datasets.text(axis) for axis in np.ravel(nxdata.attrs["axes"])]
-    if len(axes) != 3 or axes[0] != "rotation_angle":
-        yield Finding("warning", "axes", f"axes are {axes}; expected rotation_angle, then rows, then columns.")
-        return
-    for axis, n in zip(axes, places.data.shape, strict=True):
-        item = datasets.dataset(nxdata, axis)
-        if item is None or item.dtype.kind != "f" or item.size != n:
-            yield Finding("warning", "axes", f"axis {axis!r} of {nxdata.name} is no float dataset of {n} numbers.")
-
-
-def names_stated(places: Places) -> Iterator[Finding]:
-    """Sample name and title are present, as validators and people expect."""
-    for where in ("sample/name", "title"):
-        if not datasets.text_at(places.entry, where):
-            yield Finding("warning", "names", f"{places.entry.name}/{where} is empty or not there.")
-
-
-def iso_times(places: Places) -> Iterator[Finding]:
-    """start_time and end_time are ISO 8601 and in order."""
-    times = []
-    for name in ("start_time", "end_time"):
-        text = datasets.text_at(places.entry, name)
-        if not text:
-            continue
-        try:
-            times.append(datetime.fromisoformat(text))
-        except ValueError:
-            yield Finding("warning", "iso-times", f"{places.entry.name}/{name} is {text!r}, which is not ISO 8601.")
-    if len(times) == 2 and (times[0].tzinfo is None) == (times[1].tzinfo is None) and times[1] < times[0]:
-        yield Finding("warning", "iso-times", f"It ends ({times[1]}) before it starts ({times[0]}).")
 
 
 def time_order(places: Places) -> Iterator[Finding]:
@@ -211,10 +150,6 @@ RULES: tuple[Rule, ...] = (
     lengths,
     key_codes,
     angle_units,
-    links_targeted,
-    axis_order,
-    names_stated,
-    iso_times,
     time_order,
     framestamp_order,
     frames_differ,

@@ -20,7 +20,7 @@ from beamline.features.files.nexus import nexus_findings
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import brief_source
+from beamline.storage.readers.transforms import brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
@@ -221,8 +221,8 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and the findings of the rules; None for what is unknown.
 
-    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `used` are
-    the numbers that the file states and somebody uses, by path, `not_used` those that nobody does. `findings` are the
+    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
+    are the numbers that the file states and nobody uses, by path. `findings` are the
     messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
@@ -232,6 +232,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     attributes = dict(source.attributes)
     if not source.finished and not held(source.path):
         attributes["status"] = "died"
+    optional = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
     facts = {
         "path": str(source.path),
         "format": source.format,
@@ -243,8 +244,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "quantity": source.quantity,
         **_angles(source),
         "pixel_size_mm": source.pixel_size_mm,
-        **({} if source.row_pitch_mm is None else {"pixel_height_mm": source.row_pitch_mm}),
-        **({} if source.cone is None else {"cone_mm": source.cone}),
+        **{name: value for name, value in optional.items() if value is not None},
         "energy_kev": source.energy_kev,
         "axis_col": source.axis_col,
         "exposure_s": attributes.pop("exposure_s", None),
@@ -256,13 +256,12 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     return {
         **facts,
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
-        "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
-            finding.message for finding in findings if finding.severity != "info" or finding.rule == CONSTANT_DARKS
-        ]
-        + ([altered_sentence(source)] if source.altered else [])
-        + (_fringes(brief) if facts["reconstructable"] else []),
+            *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),
+            *([altered_sentence(source)] if source.altered else []),
+            *(_fringes(brief) if facts["reconstructable"] else []),
+        ],
     }
 
 

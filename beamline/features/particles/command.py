@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +19,6 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.terminal import answering
-from beamline.core.errors import ConfigError
 from beamline.core.text import safe_name
 from recon.base.choices import NECK
 
@@ -61,7 +58,6 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
               help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "
               "always.")  # fmt: skip
-@click.option("--napari", "view", is_flag=True, help="Open volume and labels in napari afterwards, if installed.")
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Random seed of the clustering.")
 @click.option(
     "-o",
@@ -76,7 +72,6 @@ def segment(
     crop: str | None,
     margin: float,
     clusters: int | None,
-    view: bool,
     output: Path | None,
     as_json: bool,
     **values: Any,
@@ -92,8 +87,6 @@ def segment(
     from beamline.features.particles.run import SegmentOptions, settings_of
     from beamline.features.particles.run import segment as segment_volume
 
-    if view and importlib.util.find_spec("napari") is None:
-        raise ConfigError("--napari: napari is not installed. Install it with: pip install 'napari[all]'")
     output = output or Path(f"{safe_name(volume.name.split('.')[0])}_particles.h5")
     if output.suffix.lower() in (".csv", ".png"):
         raise click.UsageError(f"--output {output} is the HDF5 file of the labels; name it .h5")
@@ -111,8 +104,6 @@ def segment(
         labels = segment_volume(options)
         files = {"output": output, "table": options.table, "picture": options.picture}
         answer.done({**files, **settings_of(labels, options)}, summary(labels, options))
-    if view:
-        show(labels)
 
 
 def summary(result: Segmented, options: SegmentOptions) -> str:
@@ -145,12 +136,3 @@ def summary(result: Segmented, options: SegmentOptions) -> str:
         sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
         lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")
     return "\n".join(lines)
-
-
-def show(result: Segmented) -> None:
-    """Open volume and labels in napari, until its window is closed."""
-    napari = import_module("napari")
-    viewer, spacing = napari.Viewer(), result.volume.grid.spacing
-    viewer.add_image(result.volume.data, scale=spacing, name="volume")
-    viewer.add_labels(result.labels, scale=spacing, name="particles")
-    napari.run()

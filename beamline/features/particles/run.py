@@ -14,15 +14,14 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.files import refuse_existing, whole_file, write_together, write_whole
 from beamline.core.installed import version
 from beamline.core.text import count, csv_text
 from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
-from beamline.storage.volume_file import axes_of
-from beamline.storage.volumes.files import whole_volume
+from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
@@ -193,38 +192,24 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
     """The volume on its grid, and the unit of length.
 
     Raises:
-        ConfigError, DataError: it cannot be read, or is no volume of finite numbers.
+        DataError: it cannot be read, or is no volume of finite numbers.
     """
-    path, dataset = options.volume, options.dataset
-    spacing: tuple[float, ...] | None = None
-    first: tuple[float, ...] | None = None
-    if path.is_file() and h5py.is_hdf5(path):
-        if dataset is None and _is_scan(path):
-            raise DataError(
-                f"{path} is a scan: its frames are no slices. Reconstruct it with `beamline recon`, and segment the "
-                "volume. Nothing was written."
-            )
-        with hdf5.open_hdf5(path) as file:
-            if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
-                dataset = _SIGNAL
-            spacing, first = axes_of(file, dataset)
-    data, stated = whole_volume(path, dataset)
-    if data.ndim != 3 or data.dtype.kind not in "fiub" or min(data.shape) < 3:
-        raise DataError(f"{path} holds {data.dtype} of shape {data.shape}; expected real numbers [z, y, x], 3 or more.")
-    values = np.ascontiguousarray(data, np.float32)
+    path = options.volume
+    if options.dataset is None and path.is_file() and h5py.is_hdf5(path) and _is_scan(path):
+        raise DataError(
+            f"{path} is a scan: its frames are no slices. Reconstruct it with `beamline recon`, and segment the "
+            "volume. Nothing was written."
+        )
+    with opened_volume(path, options.dataset) as record:
+        grid, unit = record.volume.grid, record.length_unit
+        values = np.ascontiguousarray(record.volume.data[: grid.shape[0]], np.float32)
+    if min(values.shape) < 3:
+        raise DataError(f"{path} holds {values.shape}; expected a volume [z, y, x] of 3 or more voxels a side.")
     if not np.isfinite(values).all():
         raise DataError(f"{path} has values that are not finite; nothing was written.")
     if options.voxel_mm is not None:
-        spacing, first = (options.voxel_mm,) * 3, None
-    spacing = spacing or stated
-    z, y, x = spacing or (1.0, 1.0, 1.0)
-    if abs(y - x) > 1e-3 * x:
-        raise ConfigError(f"{path} has voxels of {y:g} by {x:g} mm in a slice; square ones are expected.")
-    grid = Grid(values.shape, x, slice_pitch=z)
-    if first is not None:
-        centre = tuple(low + (n - 1) / 2 * edge for low, n, edge in zip(first, values.shape, (z, y, x), strict=True))
-        grid = Grid(values.shape, x, centre, z)
-    return Volume(values, grid), "px" if spacing is None else "mm"
+        grid, unit = Grid(values.shape, options.voxel_mm), "mm"
+    return Volume(values, grid), unit
 
 
 def _is_scan(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Simulated scans of a scene without an instrument: frames, labels, the truth behind them, and what they cost."""
+"""Simulated scans of a scene without an instrument: frames, labels, the truth behind them, and the steps of a frame."""
 
 COMMANDS = {
     "simulate": ("Simulate a scan of a scene, with labels and truth.", True),

@@ -1,12 +1,9 @@
-"""`beamline simulate`: frames of a scene without an instrument, their cost, their labels and the truth behind them."""
+"""`beamline simulate`: frames of a scene without an instrument, their steps and labels, and the truth behind them."""
 
 from __future__ import annotations
 
 import os
 import sys
-import time
-from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +12,10 @@ import click
 from beamline.cli.options import json_events, with_request
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import CostExplained, Done, Sink
+from beamline.core.events import Done, Sink, StepsListed
 from beamline.core.files import refuse_existing, remove, write_whole
 from beamline.core.installed import shipped_scenes
-from beamline.core.machine import free_memory, machine, machine_line
+from beamline.core.machine import free_memory
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
@@ -37,14 +34,13 @@ def simulate(request: SimulateRequest) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
     Only the effects that the scene names are computed. The file has the format of the instrument, which
-    `beamline recon` reads. A scene with `emission` gives the counts of a sample that emits (PET), which it reads, too.
-    The first Ctrl-C stops after the current frame, with a readable file and its labels; the
+    `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
     second stops at once.
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
     from beamline.features.simulate.write import check_output, exposure_errors, scan_of, sheet
-    from beamline.scenes.scene_file import feature_of, open_scene
+    from beamline.scenes.scene_file import open_scene
 
     clock = SystemClock()
     with terminated_like_interrupted(), json_events(request.as_json) as sink, exposure_errors(request.scene):
@@ -52,9 +48,6 @@ def simulate(request: SimulateRequest) -> None:
             raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
         if request.truth_bin and not request.truth:
             raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
-        if (module := feature_of(request.scene, request.overrides)) is not None:
-            import_module(module).run(request, Output(sink, clock, plain=not request.as_json), sink)
-            return
         picture = request.out.with_suffix(".png") if request.out and not request.picture else request.picture
         _refuse_outputs(request.out, request.truth, picture)
         opened = open_scene(request.scene, request.overrides)
@@ -103,12 +96,19 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
 
 
 def _explain(scan: Scan, output: Output) -> None:
-    from beamline.features.simulate.write import cost_table, frame_cost
+    from beamline.features.simulate.write import steps_of, unused_effects
 
-    cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
-    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]
-    output.event(CostExplained(asdict(cost_of_frame) | {"costs": costs, "machine": where}))
-    output.lines(f"{machine_line(where)}\n\n{cost_table(cost_of_frame)}")
+    steps, unused = steps_of(scan.scene), unused_effects(scan.scene)
+    named = [dict(zip(("name", "domain", "summary"), step, strict=True)) for step in steps]
+    output.event(StepsListed({"steps": named, "unused": unused}))
+    output.lines(
+        "\n".join(
+            [f"{'step':<22}{'acts on':<15}what happens"]
+            + [f"{name:<22}{domain:<15}{summary}" for name, domain, summary in steps]
+            + ["\nNot named by the scene, hence neither imported nor computed:"]
+            + [f"  {name:<20}{summary}" for name, summary in unused]
+        )
+    )
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Writes the scan of a scene into a file like an instrument's, frame by frame; what a frame costs; an overview."""
+"""Writes the scan of a scene into a file like an instrument's, frame by frame; the steps of a frame; an overview."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from recon.base.arrays import F32
+from simulators.effects.catalogue import CATALOGUE, Domain
 from simulators.effects.chain import Anomaly, Label
 from simulators.frame.shot import CannotExposeError
-from simulators.scenes.cost import FrameCost, explain
 from simulators.scenes.expose import PlannedFrame, Scan, expose
+from simulators.scenes.scene import Scene
 
 PREVIEW_BIN = 4
 REPORT_EVERY = 0.1  # s of real time between `frame` events
@@ -176,21 +177,22 @@ def exposure_errors(scene: str) -> Iterator[None]:
         raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
 
 
-def frame_cost(scan: Scan, now: Callable[[], float]) -> FrameCost:
-    """The cost of the view in the middle of the scan, where an anomaly is most likely."""
-    return explain(scan.scene, scan.frame(len(scan) - 1 - scan.views // 2).shot, now)
+def steps_of(scene: Scene) -> list[tuple[str, str, str]]:
+    """Steps of a frame of a scene in order: name, what it acts on, and what happens."""
+    effects = [(e.domain, (e.name, e.domain.words, CATALOGUE[e.name].summary)) for e in scene.chain.effects]
+    return [
+        ("line_integrals", "", "rays through the sample"),
+        *(row for domain, row in effects if domain <= Domain.OPTICAL_DEPTH),
+        ("beer_lambert", "", "photons x exp(-depth)"),
+        *(row for domain, row in effects if domain > Domain.OPTICAL_DEPTH),
+        ("digitise", "", "electrons to whole counts"),
+    ]
 
 
-def cost_table(found: FrameCost) -> str:
-    """A line for each step, in order, and the effects that are not in the scene."""
-    lines = [f"{'step':<22}{'acts on':<15}{'ms/frame':>9}{'memory':>10}  what happens"]
-    for cost in found.costs:
-        domain = "" if cost.domain is None else cost.domain.words
-        lines.append(f"{cost.name:<22}{domain:<15}{cost.ms:>9.2f}{size(cost.size):>10}  {cost.summary}")
-    lines.append(f"{'a frame':<37}{found.ms:>9.2f}")
-    lines.append("\nNot named by the scene, hence neither imported nor computed:")
-    lines += [f"  {name:<20}{summary}" for name, summary in found.unused]
-    return "\n".join(lines)
+def unused_effects(scene: Scene) -> list[tuple[str, str]]:
+    """(name, summary) of the catalogue's effects that a scene does not name."""
+    named = {effect.name for effect in scene.chain.effects}
+    return [(name, row.summary) for name, row in CATALOGUE.items() if name not in named]
 
 
 PICTURES = 8

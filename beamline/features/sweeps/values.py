@@ -8,13 +8,14 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 
+from beamline.core.text import NUMBER
 from recon.base.registry import did_you_mean
 
 MOST = 64
 _AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
 """Slices of a sheet."""
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):({_NUMBER})")
+_SIGNED = rf"[-+]?{NUMBER}"
+_RANGE = re.compile(rf"({_SIGNED}):({_SIGNED}):({_SIGNED})")
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class SweptOption:
     @property
     def numbers(self) -> tuple[float, ...]:
         """The values as numbers; empty if some are no numbers."""
-        numeric = all(re.fullmatch(_NUMBER, value) for value in self.values)
+        numeric = all(re.fullmatch(_SIGNED, value) for value in self.values)
         return tuple(map(float, self.values)) if numeric else ()
 
 

@@ -17,7 +17,6 @@ from beamline.cli.options import (
     MethodChoice,
     NameChoice,
     WholeRange,
-    dry_option,
     json_option,
     new_folder_option,
     others,
@@ -30,7 +29,7 @@ from beamline.cli.options import (
     with_request,
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
-from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
+from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
 from beamline.core.text import safe_name
@@ -62,15 +61,14 @@ class TradeoffRequest:
         help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
         "held out.",
     )
-    values: Mapping[str, Any] = others(light_options, selection_options)
+    values: Mapping[str, Any] = others(selection_options)
     methods: tuple[str, ...] | None = set_by(
         heading(METHOD),
         "--methods",
         callback=parsed(listed),
         metavar="A,B,...",
         help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
-        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
-        "of an emission also mlem and osem.",
+        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}.",
     )
     quick: bool = set_by(
         "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."
@@ -83,7 +81,6 @@ class TradeoffRequest:
         help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
         "would not fit is not begun.",
     )
-    dry: bool = set_by(dry_option)
     seed: int = set_by(heading(METHOD), seed_option)
     output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem + _tradeoff"))
     as_json: bool = set_by(json_option)
@@ -101,7 +98,6 @@ class TradeoffRequest:
         "rows",
         "binning",
         "output",
-        "dry",
     ),
 )
 @with_request(TradeoffRequest)
@@ -119,7 +115,7 @@ def tradeoff(request: TradeoffRequest) -> None:
 
     scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff", request.max_seconds)
     plan = partial(planned_tradeoff, scan, depth="quick" if request.quick else "full")
-    _compare(scan, plan, dry=request.dry, as_json=request.as_json, begun=begun)
+    _compare(scan, plan, as_json=request.as_json, begun=begun)
 
 
 def _compared(
@@ -134,21 +130,17 @@ def _compared(
     output = request.output or Path(folder)
     return ComparedScan(
         source, selection, output, methods, request.truth,
-        light_asked(values["photons_per_count"], values["dose_in"]), request.seconds, max_seconds, request.seed,
+        request.seconds, max_seconds, request.seed,
         repeating(context, request.file, output),
     )  # fmt: skip
 
 
-def _compare(scan: ComparedScan, plan: Plan, *, dry: bool, as_json: bool, begun: float | None = None) -> None:
-    """Run a comparison and print its table, or print what it will take."""
-    from beamline.features.trials.runner import dry_run, run_comparison
+def _compare(scan: ComparedScan, plan: Plan, *, as_json: bool, begun: float | None = None) -> None:
+    """Run a comparison and print its table."""
+    from beamline.features.trials.runner import run_comparison
     from beamline.features.trials.table import page_of, text
 
     with answering(as_json) as answer:
-        if dry:
-            facts, lines = dry_run(plan, scan.folder, answer.warn)
-            answer.done(facts, *lines)
-            return
         table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
         answer.lines = text(table), f"\n{'report':<10}{scan.folder / page_of(table)}"
     if table.stopped:
@@ -180,7 +172,7 @@ class StudyRequest:
         help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use.",
     )
     seconds: float | None = set_by(heading(METHOD), equal_time)
-    values: Mapping[str, Any] = others(row_options, light_options, selection_options)
+    values: Mapping[str, Any] = others(row_options, selection_options)
     ramp: Filter = set_by(
         heading(METHOD),
         "--filter",
@@ -197,14 +189,13 @@ class StudyRequest:
         help="How often the study random draws its views.",
     )
     seed: int = set_by(seed_option)
-    dry: bool = set_by(dry_option)
     output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem and the study's name"))
     as_json: bool = set_by(json_option)
 
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output", "dry"),
+    first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output"),
 )
 @with_request(StudyRequest)
 def study(request: StudyRequest) -> None:
@@ -213,9 +204,6 @@ def study(request: StudyRequest) -> None:
     fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
     equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring
     views, side by side and overlapping.
-
-    dose: FILE is a configuration. Its simulated instrument takes scans of equal time and of equal dose, with many and
-    with few views, flying and in steps, and each is compared with the truth.
 
     Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
     the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
@@ -228,4 +216,4 @@ def study(request: StudyRequest) -> None:
     scan = _compared(request, methods, f"{safe_name(request.file.stem)}_{request.which}")
     asked = STUDIES[request.which]
     plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
-    _compare(scan, plan, dry=request.dry, as_json=request.as_json)
+    _compare(scan, plan, as_json=request.as_json)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,21 +12,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import psutil
-
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, TrialDone, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
 from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.sinks import Warn, Warnings
-from beamline.core.text import size
 from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
 from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections, hold_out
-from beamline.projections.scan_statistics import LightAsked, light_in
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.scan_facts import facts_of
@@ -53,7 +48,6 @@ class ComparedScan:
         folder: for the results; must not exist.
         methods: names in `recon.methods`; none: those that suit the comparison.
         truth: FILE or FILE:first:end to compare with.
-        light: what the user knows of it; None: the dose is counted in frames.
         seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
         max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
             what remains is not begun, a running one is ended. None: no limit.
@@ -65,7 +59,6 @@ class ComparedScan:
     folder: Path
     methods: Sequence[str] = ()
     truth: str | None = None
-    light: LightAsked | None = None
     seconds: float | None = None
     max_seconds: float | None = None
     seed: int = 0
@@ -109,25 +102,17 @@ def opened_scan(
     refuse_existing(asked.folder)
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
-        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
+        facts = dict(facts_of(source).table)
         prepared = prepare_projections(source, asked.selection, warn).without_warnings
     if held_out and truth_given is None:
         prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     truth = None
     if truth_given is not None:
         truth = fit_truth(truth_given, Grid.matching(prepared.geometry), asked.selection.binning).data
-    if light is not None:
-        facts["light"] = "; ".join(light.in_words())
-    table = replace(table_of(asked, name, title, prepared, facts), light=light)
-    return TrialData(prepared, truth), table if truth is None else replace(table, by="psnr")
-
-
-def table_of(
-    scan: ComparedScan, name: str, title: str, prepared: PreparedProjections, facts: dict[str, str]
-) -> TrialTable:
-    """A table without trials of these views; `facts` are of the scan, by name."""
-    known = {**facts, "volume": " × ".join(map(str, Grid.matching(prepared.geometry).shape))}
-    return TrialTable(name, title, (), HELD_OUT, prepared.length_unit, machine(), known, scan.command)
+    by = HELD_OUT if truth is None else "psnr"
+    facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
+    table = TrialTable(name, title, (), by, prepared.length_unit, machine(), facts, asked.command)
+    return TrialData(prepared, truth), table
 
 
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:
@@ -323,32 +308,3 @@ def _result_folder(folder: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it has results
             folder.rmdir()
-
-
-def dry_run(plan: Plan, folder: Path, warn: Warn) -> tuple[dict[str, Any], list[str]]:
-    """The trials of a comparison with the memory of each, as facts and as lines; nothing is written, and nothing run.
-
-    Raises:
-        ConfigError, DataError: the comparison would be refused.
-    """
-    libraries = int(psutil.Process().memory_info().rss)
-    planned = plan(warn)
-    data, prepared = planned.data, planned.data.prepared
-    held_out = None if prepared.held_out is None else prepared.held_out[0]
-    arrays = (prepared.projections.data, prepared.projections.weights, data.truth, held_out)
-    disk, weighted = sum(array.nbytes for array in arrays if array is not None), prepared.ray_factors() is not None
-    needs = dict[str, int]()
-    for trial in [*planned.references, *(planned.table.outcomes[n].trial for n in planned.table.todo)]:
-        coarse = data.geometry.binned(trial.binning)
-        # the views twice: all of them, and those that the trial uses
-        needs[trial.label] = libraries + 2 * disk + trial.build().memory(coarse, Grid.matching(coarse), weighted)
-    free = shutil.disk_usage(folder.absolute().parent).free
-    facts = {"trials": [{"label": label, "memory": memory} for label, memory in needs.items()], "disk": disk}
-    width = max(map(len, needs))
-    return {**facts, "output": folder}, [
-        *(f"{label:<{width}}  {size(memory):>9}" for label, memory in needs.items()),
-        "",
-        f"{'trials':<10}{len(needs)}; how long they take is said after the first",
-        f"{'disk':<10}{size(disk)} for the views meanwhile; {size(free)} free",
-        f"{'output':<10}{folder}: {planned.table.name}.csv, page and pictures (not written now)",
-    ]

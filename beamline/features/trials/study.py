@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
-
 from beamline.core.errors import DataError
 from beamline.core.events import StudyStarted
 from beamline.core.sinks import Warn
-from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
-from beamline.projections.prepared import PreparedProjections
-from recon.base.arrays import F32, F64
 from recon.base.choices import Filter
 from recon.base.method import Plain
 from recon.methods import BASELINE
@@ -42,11 +37,8 @@ def planned_study(
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    if study.rows is None:
-        data, table, choices = taken_scans(scan, study.title, warn)
-    else:
-        data, table = opened_scan(scan, "study", study.title, warn, held_out=False)
-        choices = study.rows(_view_set(scan.seed, draws, data.prepared))
+    data, table = opened_scan(scan, "study", study.title, warn, held_out=False)
+    choices = study.rows(ViewSet(data.geometry.angles, data.geometry.period, scan.seed, draws))
     n_views, given = data.geometry.n_views, settings or {}
 
     def trial(method: str, choice: ViewChoice) -> Trial:
@@ -57,9 +49,9 @@ def planned_study(
     table = replace(
         table,
         outcomes=tuple(Outcome(each, "not run", message=reason) for each, reason in outcomes),
-        by="psnr" if study.rows is None else "psnr_all",
+        by="psnr_all",
         question=study.question,
-        notes=[*_notes(study, n_views, ramp), *_notes_on_methods(given, scan.seconds)],
+        notes=[_note(n_views, ramp), *_notes_on_methods(given, scan.seconds)],
         scan={**table.scan, "views to choose from": str(n_views)},
     )
     if not table.todo:
@@ -72,8 +64,6 @@ def planned_study(
             warn(f"{choice.label} is left out: {choice.reason}")
     left_out = len(table.outcomes) - len(table.todo)
     started = StudyStarted(scan.source.path, len(table.todo), left_out, study.name)
-    if study.rows is None:
-        return Planned(data, table, started)
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
     fbp = Trial("method", BASELINE, n_views, settings={"filter": ramp}, choice=whole)
     others = (trial(method, whole) for method in scan.methods if method != BASELINE)
@@ -81,42 +71,12 @@ def planned_study(
     return Planned(data, table, started, (fbp, *others))
 
 
-def _view_set(seed: int, draws: int, prepared: PreparedProjections) -> ViewSet:
-    """The views of a scan that was taken, which rows choose from."""
-    geometry = prepared.geometry
-    turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
-    places = np.concatenate((geometry.shifts, turns), axis=1)
-    clear = clearest(np.mod(geometry.angles, geometry.period), prepared.projections.data)
-    return ViewSet(geometry.angles, geometry.period, seed, draws, places, clear)
-
-
-def clearest(angles: F64, lines: F32) -> int:
-    """The middle, in degrees, of the 40 degrees in which the densest hundredth of a view's rays meets least matter.
-
-    Args:
-        angles: [view], radians within half a turn.
-        lines: [view, row, col].
-    """
-    dense = np.array([np.percentile(view[:: max(1, len(view) // 16)], 99) for view in lines])
-    middles = np.arange(20, 161)
-    near = np.abs(np.degrees(angles) - middles[:, None]) <= 20
-    counts = near.sum(axis=1)
-    means = np.divide(near @ dense, counts, out=np.full(middles.size, np.inf), where=counts > 0)
-    return int(middles[np.argmin(means)])
-
-
-def _notes(study: Study, n_views: int, ramp: Filter) -> list[str]:
-    if study.rows is None:
-        return [
-            "exposure: s of a view. light: of the beam, over the configuration's. scan time: s from the first view to "
-            "the end of the last. dose: photons a pixel in the open beam while views are exposed; the shutter is open "
-            "in between, too. blur: px at the edge of the field. Views held out are standing ones that no row has."
-        ]
-    return [
+def _note(n_views: int, ramp: Filter) -> str:
+    return (
         f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method (fbp: {ramp}): "
         "they say what fewer views lose, not which method is better. That volume has noise, too, which rows share as "
         "far as they share its views. SNR and CNR are not those of beamline recon; a smoother volume has more."
-    ]
+    )
 
 
 def _notes_on_methods(settings: Mapping[str, Mapping[str, Plain]], seconds: float | None) -> list[str]:

@@ -15,7 +15,6 @@ from beamline.core.files import REPORT, write_whole
 from beamline.core.machine import machine_line
 from beamline.core.text import csv_text
 from beamline.features.trials.trial import HELD_OUT, LEAST_GAIN, Outcome, TrialTable
-from beamline.features.trials.view_choices import DOSE, SCAN_TIME
 from beamline.report.figures import WIDTH, new_figure, png
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
@@ -32,12 +31,6 @@ FIGURES = {
     "ssim_all": ("SSIM all", "against the same volume"),
     "snr": ("SNR rims", "dB, of the whole dense and empty region, with their rims"),
     "cnr": ("CNR rims", "dB, of the same regions"),
-    "rmse": ("RMSE", "of the activity"),
-    "signal_to_background": ("S/B", "hot regions over the body"),
-    "sbr_error": ("S/B err", "its largest error, of a hot region, relative"),
-    "recovery": ("hot", "contrast of hot regions over the truth's"),
-    "spillover": ("cold", "level of cold regions over the body's"),
-    "variation": ("noise", "standard deviation of the body over its level"),
     HELD_OUT: ("held out", METRICS[HELD_OUT].label),
     "resolution": ("FSC", "period in {} to which two halves of the views agree"),
 }
@@ -65,17 +58,15 @@ def page_of(table: TrialTable) -> str:
 
 def columns(table: TrialTable) -> list[str]:
     """Headings of the table."""
-    facts = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.facts))
-    return [*facts, "s", "CPU s", "MB", *(words for name, (words, _) in FIGURES.items() if name in table.metrics)]
+    return ["s", "CPU s", "MB", *(words for name, (words, _) in FIGURES.items() if name in table.metrics)]
 
 
 def cells(table: TrialTable, outcome: Outcome) -> list[str]:
     """The values of a row under `columns`, as text."""
-    facts = [f"{value:.4g}" for value in outcome.trial.facts.values()]
     memory = "–" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
     shown = [name for name in FIGURES if name in table.metrics]
     figures = [_figure(name, outcome.metrics[name]) if name in outcome.metrics else "–" for name in shown]
-    return [*facts, _seconds(outcome.seconds), _seconds(outcome.cpu_seconds), memory, *figures]
+    return [_seconds(outcome.seconds), _seconds(outcome.cpu_seconds), memory, *figures]
 
 
 def _figure(name: str, value: float) -> str:
@@ -252,16 +243,8 @@ def quality_plot(table: TrialTable) -> bytes:
 
 def _costs(table: TrialTable) -> dict[str, Callable[[Outcome], float]]:
     """The costs that a picture shows, by the label of their axis. Frames that several views share are counted once."""
-    if any(outcome.trial.facts for outcome in table.compared):
-        return {
-            "dose (photons a pixel)": lambda outcome: outcome.trial.facts[DOSE],
-            "scan time (s)": lambda outcome: outcome.trial.facts[SCAN_TIME],
-        }
-    light, unit, each = table.light, "frames", 1.0
-    if light is not None:
-        unit, each = ("photons a pixel", light.photons) if light.gray is None else ("Gy", light.gray)
     return {
         "time (s)": lambda outcome: outcome.seconds,
         "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
-        f"dose ({unit})": lambda outcome: outcome.trial.frames * each,
+        "dose (frames)": lambda outcome: outcome.trial.frames,
     }

@@ -39,7 +39,7 @@ def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> 
     data, table = opened_scan(scan, "tradeoff", "What accuracy costs", warn, held_out=True)
     geometry = data.geometry
     gaussians = default_count(geometry, geometry.sample_pitch)
-    methods = scan.methods or names_compared(data.prepared.emission is not None)
+    methods = scan.methods or names_compared()
     if scan.seconds is None:
         trials = plan(methods, geometry.n_views, gaussians, depth)
     else:

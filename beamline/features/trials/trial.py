@@ -11,7 +11,6 @@ import numpy as np
 
 from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
-from beamline.projections.scan_statistics import Light
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
 
@@ -55,11 +54,6 @@ class Trial:
     def frames(self) -> int:
         """Frames of the scan that it takes, each counted once: its dose."""
         return self.views if self.choice is None else self.choice.frames
-
-    @property
-    def facts(self) -> Mapping[str, float]:
-        """How its views were taken, by heading."""
-        return {} if self.choice is None else self.choice.facts
 
     def build(self) -> Method:
         """The method with the settings of the trial.
@@ -161,7 +155,6 @@ class TrialTable:
         scan: facts for people, by name.
         question: that the table answers; empty: none.
         stopped: it was interrupted before all trials were done.
-        light: of a frame; None: the dose is counted in frames.
         notes: sentences on what the figures mean.
     """
 
@@ -175,7 +168,6 @@ class TrialTable:
     command: str
     question: str = ""
     stopped: bool = False
-    light: Light | None = None
     notes: Sequence[str] = ()
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
@@ -234,8 +226,6 @@ class TrialTable:
             **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "frames")},
             "window": 1 if trial.choice is None else trial.choice.window,
             **{name: trial.settings.get(name) for each in every for name in each.settings},
-            **({} if self.light is None else self.light.of(trial.frames)),
-            **{name: trial.facts.get(name) for each in every for name in each.facts},
             "status": outcome.status,
             "seconds_asked": trial.seconds_asked,
             **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},

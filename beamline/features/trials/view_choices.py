@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,10 @@ from recon.base.views import parse_views
 COUNTS = 360, 180, 90, 45
 SECTORS = ((30, 150, 120), (45, 135, 90), (60, 120, 60))
 """First and last degree, and views at one a degree: the counts fall with the sector."""
-CLEAR_DEG = 40, 30
-"""Widths of sectors about the direction in which the sample is clearest."""
 EQUAL_COUNTS = 120, 60
 DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
 OVERLAPPING = 180  # Number of overlapping windows of each width
-DOSE, SCAN_TIME = "dose", "scan time"  # facts: photons a pixel in the open beam; s
-_APART = 0.25  # px between views of a window: a mean of views that lie further apart is blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,16 +28,12 @@ class ViewChoice:
         groups: [view][window]: each view is the mean of these views of the scan; None: left out.
         family: choices of the same family are draws of the same kind; empty: it stands alone.
         reason: why it is left out.
-        facts: on how its views were taken, by heading.
-        arc: radians that the stage turned during an exposure, which the model of the views holds.
     """
 
     label: str
     groups: Sequence[Sequence[int]] | None
     family: str = ""
     reason: str = ""
-    facts: Mapping[str, float] = field(default_factory=dict)
-    arc: float = 0.0
 
     @property
     def window(self) -> int:
@@ -68,16 +60,12 @@ class ViewSet:
         period: radians after which views see the same rays, see `Geometry.period`.
         seed: of the first random draw.
         draws: how often a random choice is repeated.
-        places: [view, place], px, how far poses move the image or its edge; None: views lie alike.
-        clear: degrees within a period, the direction in which the sample is clearest.
     """
 
     angles: NDArray[np.float64]
     period: float
     seed: int = 0
     draws: int = 3
-    places: NDArray[np.float64] | None = None
-    clear: int = 90
 
 
 @dataclass(frozen=True)
@@ -86,13 +74,13 @@ class Study:
 
     Attributes:
         name: on the command line; `title`: of its page.
-        rows: all rows, those that the scan is too small for with the reason; None: each row is a scan of its own.
+        rows: all rows, those that the scan is too small for with the reason.
     """
 
     name: str
     title: str
     question: str
-    rows: Callable[[ViewSet], Sequence[ViewChoice]] | None = None
+    rows: Callable[[ViewSet], Sequence[ViewChoice]]
 
 
 def fixed_views(views: ViewSet) -> list[ViewChoice]:
@@ -102,9 +90,8 @@ def fixed_views(views: ViewSet) -> list[ViewChoice]:
 
 def sector(views: ViewSet) -> list[ViewChoice]:
     """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
-    sectors = [*SECTORS, *((views.clear - width // 2, views.clear + width // 2, width) for width in CLEAR_DEG)]
-    falling = [_sector(views, low, high, n) for low, high, n in sectors]
-    equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, count in sectors if n != count]
+    falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
+    equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, count in SECTORS if n != count]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
 
 
@@ -135,7 +122,6 @@ STUDIES = {
         Study("sector", "A narrower sector", "What does a narrower range of angles cost, beside fewer views?", sector),
         Study("random", "Views at random", "Are views at random angles worse than evenly spread ones?", random),
         Study("window-average", "Averaged views", "What do means of neighbouring views gain and cost?", window_average),
-        Study("dose", "Equal time, equal dose", "Fewer views of longer exposure: what do noise, blur and time cost?"),
     )
 }
 
@@ -182,9 +168,4 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     if together.sum() < 2:
         return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
     groups = groups[together]
-    apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
-    if apart > _APART:
-        return ViewChoice(
-            label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
-        )
     return ViewChoice(label, groups.tolist())

@@ -39,7 +39,6 @@ from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.features.trials import fourier_shell_correlation, soft_cylinder
-from recon.prep.counts import weighted_lines
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution
@@ -94,25 +93,21 @@ def load(path: Path) -> Any:
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
     """The views of a row of a study, each the mean of a window of views.
 
-    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
-    of an emission are added. A ray weighs as the least of its window.
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. A ray
+    weighs as the least of its window.
     """
     groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
-    if choice.window == 1 and prepared.emission is None:
+    if choice.window == 1:
         return middle
     angles = prepared.geometry.angles[groups].mean(axis=1)
     angles.setflags(write=False)
     geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
-    emission = None if prepared.emission is None else prepared.emission.summed(groups, geometry)
     weights: F32 | None = whole.weights
-    if emission is not None:
-        lines, weights = weighted_lines(emission)
-    else:
-        lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
-        weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
+    lines = np.stack([math.log(choice.window) - logsumexp(-whole.data[group], axis=0) for group in groups])
+    weights = None if weights is None else np.stack([weights[group].min(axis=0) for group in groups])
     means = replace(middle.projections, data=lines, weights=weights)
-    return replace(middle, projections=means, geometry=geometry, emission=emission)
+    return replace(middle, projections=means, geometry=geometry)
 
 
 def run(
@@ -155,11 +150,7 @@ def _views_of(trial: Trial, data: TrialData) -> PreparedProjections:
     if trial.choice is None:
         angles, period = data.geometry.angles, data.geometry.period
         return data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
-    prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
-    if not trial.choice.arc:
-        return prepared
-    views = prepared.geometry
-    return replace(prepared, geometry=views.seen_with(replace(views.width, arc=trial.choice.arc), views.skew))
+    return averaged(data.prepared, trial.choice)
 
 
 def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dict[str, float], list[float]]:
@@ -167,8 +158,6 @@ def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dic
     figures, squared = dict[str, float](), list[float]()
     if data.truth is not None:
         figures = {"psnr": metrics.psnr(data.truth, volume), "ssim3d": metrics.ssim3d(data.truth, volume)}
-        if data.prepared.emission is not None:
-            figures |= metrics.contrast(data.truth, volume)
     if (reference := data.references.get(method)) is not None:
         figures["psnr_all"] = metrics.psnr(reference, volume)
         figures["ssim_all"] = metrics.ssim3d(reference, volume)

@@ -67,11 +67,9 @@ def _ply(data: bytes) -> Reals:
         raise ValueError("it has no faces")
     count, index = (_TYPES[name] for name in lists[0][2:4])
     if ["format", "ascii", "1.0"] in words:
-        lines = body.decode().splitlines()
-        at = [name for name, _ in own]
-        rows = np.array([line.split() for line in lines[: n["vertex"]]], np.float64)
-        faces = np.array([line.split() for line in lines[n["vertex"] : n["vertex"] + n["face"]]], np.int64)
-        return _corners(rows[:, [at.index(axis) for axis in "xyz"]], faces[:, 1:])
+        lines, at = [line.split() for line in body.decode().splitlines()], [name for name, _ in own]
+        rows, faces = np.array(lines[: n["vertex"]], np.float64), lines[n["vertex"] : n["vertex"] + n["face"]]
+        return _corners(rows[:, [at.index(axis) for axis in "xyz"]], np.array(faces, np.int64)[:, 1:])
     if ["format", "binary_little_endian", "1.0"] not in words:
         raise ValueError("a PLY is text or binary little-endian")
     vertices = np.frombuffer(body, np.dtype(own), n["vertex"])

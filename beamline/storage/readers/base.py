@@ -37,26 +37,6 @@ class NotUsed(NamedTuple):
     doubt: bool
 
 
-class Used(NamedTuple):
-    """A field of a file that is used: its path, its value, and its purpose."""
-
-    where: str
-    value: str
-    use: str
-
-
-class EmissionCounts(NamedTuple):
-    """Float32 [view, row, col] each: counts, survival and background as in `recon.Emission`."""
-
-    counts: NDArray[np.float32]
-    survival: NDArray[np.float32]
-    background: NDArray[np.float32]
-
-
-EmissionOf = Callable[[NDArray[np.int64], slice], EmissionCounts]
-"""What was counted in some frames and rows."""
-
-
 class ScanSource(ABC):
     """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
 
@@ -85,11 +65,9 @@ class ScanSource(ABC):
         pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
         not_used: what the file states of geometry, units, order and validity, and what is not used.
-        used: what it states of each frame, and of exposure, current, energy and geometry, and what is used.
         energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
         currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
             NaN where unknown, None where there is no monitor.
-        emission: the counts of a sample that emits, whose line integrals the pixels are; None: it does not emit.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
@@ -117,10 +95,8 @@ class ScanSource(ABC):
     pixel_mask: Mask | None = None
     frames_per_view: int = 1
     not_used: tuple[NotUsed, ...] = ()
-    used: tuple[Used, ...] = ()
     energies: NDArray[np.float64] | None = None
     currents: NDArray[np.float64] | None = None
-    emission: EmissionOf | None = None
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None

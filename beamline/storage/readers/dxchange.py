@@ -13,16 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
-from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
-from beamline.storage.readers.stated import (
+from beamline.storage.readers.fields import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
     EXCHANGE_LENGTH_UNITS,
     EXCHANGE_TIME_UNITS,
-    in_use,
     stated_in,
 )
+from beamline.storage.readers.nexus import differing
+from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
@@ -62,7 +61,6 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
         source.not_used = stated_in(EXCHANGE, file, source)
-        source.used = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
             source.not_used += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)

@@ -265,18 +265,14 @@ def _mirrored(detector: h5py.Group) -> tuple[tuple[bool, bool], str]:
         item = datasets.dataset(turns, name)
         if item is None or datasets.attribute(item, "transformation_type") != "rotation" or item.size != 1:
             continue
-        angle = float(np.degrees(datasets.radians(item, default="degrees"))[0]) % 360
-        axis = _direction(item)
+        angle, axis = float(np.degrees(datasets.radians(item, default="degrees"))[0]) % 360, _direction(item)
         if not np.isfinite(angle) or min(angle, 360 - angle) < 1e-6:
             continue
         if vertical not in (1, 2) or axis is None or abs(angle - 180) > 1e-6:
             others.append(f"{name} {angle:g}°")
-        elif axis == vertical:
-            cols = not cols
-        elif axis == (0 if vertical == 2 else 2):  # the beam
-            rows, cols = not rows, not cols
-        else:
-            rows = not rows
+            continue
+        rows ^= axis != vertical
+        cols ^= axis in (vertical, 0 if vertical == 2 else 2)  # the beam
     return (rows, cols), ", ".join(others)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.frames import Frames, Read
-from beamline.storage.readers.wrapped import UNPACKED
+from beamline.storage.readers.transforms import UNPACKED
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.views import spread

@@ -32,6 +32,7 @@ from beamline.storage.readers.base import (
     count_in_blocks,
     frame_indices,
 )
+from beamline.storage.readers.fields import NXTOMO, UPRIGHT, stated_in
 from beamline.storage.readers.nexus import (
     Places,
     choose,
@@ -42,7 +43,6 @@ from beamline.storage.readers.nexus import (
     read_geometry,
     require_order,
 )
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, stated_in
 from beamline.storage.structure import drawn_on
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
@@ -156,18 +156,7 @@ class NXtomoSource(ScanSource):
         if self._ours:
             finer = datasets.dataset(places.entry, "frame_log/kind")
         key = places.image_key if finer is None else finer
-        if self._ours:
-            committed = self._file[layout.COMMITTED]
-            hdf5.look_again(committed)
-            n = int(committed[()])
-            if n < 0:
-                raise ValueError(f"{n} frames are committed")
-            if n > self.n:
-                for item in (places.data, key, places.angle, None if key is places.image_key else places.image_key):
-                    if item is not None:
-                        hdf5.look_again(item)
-        else:
-            n = int(places.data.shape[0])
+        n = self._committed(key) if self._ours else int(places.data.shape[0])
         angles = datasets.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
         keys = np.ravel(datasets.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
@@ -189,6 +178,19 @@ class NXtomoSource(ScanSource):
         self._checksums = self._column("digest/checksum", np.empty(0))[:n] if self._ours else np.empty(0)
         seconds = self._seconds(places.detector, "count_time")
         self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
+        return n
+
+    def _committed(self, key: h5py.Dataset) -> int:
+        """The frames that the writer of our file counts; where they are more than before, their datasets are read
+        anew."""
+        places, committed = self._places, self._file[layout.COMMITTED]
+        hdf5.look_again(committed)
+        n = int(committed[()])
+        if n < 0:
+            raise ValueError(f"{n} frames are committed")
+        if n > self.n:
+            for item in {places.data, key, places.angle, places.image_key} - {None}:
+                hdf5.look_again(item)
         return n
 
     @property
@@ -255,7 +257,6 @@ class NXtomoSource(ScanSource):
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
             why = f"it is another scan of this file: --data-path {where}"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
-        self.used = in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
 

@@ -16,24 +16,25 @@ from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.changed import AveragedSource, angles_of_frames, overlaid, stated_frames_per_view
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
-from beamline.storage.readers.supplied import (
+from beamline.storage.readers.replacements import (
     Angles,
     Images,
     assign,
     load_angles,
     load_images,
+    overlaid,
     parse_angles,
     select_rows,
 )
-from beamline.storage.readers.wrapped import (
+from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
+from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
     cropped,
@@ -98,7 +99,7 @@ class SourceOptions:
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds. "0::2": every second view, as `wrapped.selected` says.
+            files in a folder then say no kinds. "0::2": every second view, as `transforms.selected` says.
         then: further files of the same scan, whose frames follow.
         side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
@@ -183,7 +184,6 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
 def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     """The scan with what the caller says instead of its files."""
-    quantity = options.quantity
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
         base = with_side_file(base, side)
@@ -197,22 +197,33 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = selected(base, views)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
         base = as_unsigned(base, dtype)
-    darks, flats = _references(base, options, None if side is None else side.white)
-    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
-        base, counts_photons = marked_source(base, no_data)
-        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
-    if any(given is not None for given in (angles, darks, flats, quantity)):
-        base = overlaid(
-            base,
-            darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
-            flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
-            quantity="counts" if quantity == "transmission" else quantity,
-        )
+    base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
     if options.horizontal_axis:
         base = turned(base)
     return base if options.cols is None else cropped(base, options.cols)
+
+
+def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | None, *, replaced: bool) -> ScanSource:
+    """The scan with the darks, flats and quantity that the caller states, and without pixels that have no data.
+
+    Args:
+        replaced: the caller states something else of its frames.
+    """
+    quantity = options.quantity
+    darks, flats = _references(base, options, None if side is None else side.white)
+    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
+        base, counts_photons = marked_source(base, no_data)
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
+    if not replaced and darks is None and flats is None and quantity is None:
+        return base
+    return overlaid(
+        base,
+        darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
+        flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
+        quantity="counts" if quantity == "transmission" else quantity,
+    )
 
 
 def _angle_table(

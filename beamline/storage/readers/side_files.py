@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import SETTINGS, decoded, require_regular
-from beamline.core.text import with_points
+from beamline.core.text import NUMBER, with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
 from drivers.base.frame import FrameKind
@@ -224,7 +224,7 @@ def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str
     names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:
-        numbers = (re.match(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text) for text in with_points(texts))
+        numbers = (re.match(rf"\s*[-+]?{NUMBER}", text) for text in with_points(texts))
     except ValueError as error:
         raise DataError(f"{path}: {error}.") from error
     return {name: number and float(number[0]) for name, number in zip(names, numbers, strict=True)}
@@ -238,15 +238,20 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
     if lacking := [getattr(keys, name) for name in ("sod", "sdd", "pixel", "count") if not (number[name] or 0) > 0]:
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
-    n, scale, span = int(count), number["scale"] or 1.0, number["span"] or _ROUND.get(keys.maker)
-    step = number["step"]
-    if step is None and span is not None:
-        step = span / n
-    angles = _listed_angles(path, n) if keys.maker == "Nikon" else None
-    if angles is None and step is not None:
-        angles = (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)
+    n, scale = int(count), number["scale"] or 1.0
+    angles = _degrees(path, keys, number, n)
     radians = None if angles is None else np.radians(angles)
     return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number["white"])
+
+
+def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
+    """Of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
+    if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
+        return listed
+    step, span = number["step"], number["span"] or _ROUND.get(keys.maker)
+    if step is None and span is not None:
+        step = span / n
+    return None if step is None else (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 from beamline.storage.hdf5 import ALTERED
-from beamline.storage.readers.base import NotUsed, Used
+from beamline.storage.readers.base import NotUsed
 from beamline.storage.structure import PACKED, is_blank
 
 _MOST_PAGES = 100_000
@@ -86,8 +86,8 @@ def upright(images: NDArray[Any], orientation: int) -> NDArray[Any]:
     return images[..., ::-1, :] if orientation in (3, 4, 7, 8) else images
 
 
-def stated(path: Path, tif: tifffile.TiffFile) -> tuple[tuple[Used, ...], tuple[NotUsed, ...]]:
-    """What a TIFF says of its orientation, and its copies that are not used.
+def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
+    """The images of a TIFF that are not used: copies, and those of other files.
 
     Raises:
         DataError: its OME metadata say that pages go along several axes, which of them the views are is not known.
@@ -98,13 +98,11 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[tuple[Used, ...], tuple[
         listed += math.prod(sizes.values())
         if len(sizes) > 1:
             raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, along one.")
-    images, turned = images_of(tif), orientation(tif)
-    copies = sum(len(part.levels) for part in tif.series) - len(images)
-    used = (Used("orientation (tag 274)", str(turned), "images are turned upright"),) if turned != 1 else ()
+    copies = sum(len(part.levels) for part in tif.series) - len(images_of(tif))
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
         notes += [("images of an OME set in other files", listed - len(tif.pages), True)]
-    return used, tuple(NotUsed(where, str(n), why, doubt) for where, n, doubt in notes)
+    return tuple(NotUsed(where, str(n), why, doubt) for where, n, doubt in notes)
 
 
 def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:

@@ -29,6 +29,8 @@ _LEAST_LIGHT = 1e-3  # of the beam
 _FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
 _BESIDE, _RETRACED = 3, 1.5  # pairs about such frames; times a step: symmetric samples 0.1 to 1.2, two sides 1.75 to 3
+_MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
+_MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
 _STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
 _EQUAL = 1e-6  # 1 minus the correlation of equal frames, which rounding makes a little more or less than 0
 ORDER = "angle-order"
@@ -113,7 +115,7 @@ def coarse_views(source: ScanSource) -> CoarseViews | None:
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     kinds = set(source.image_key.tolist())
     counts = source.quantity == "counts"
-    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+    if source.quantity == "unknown" or source.shifts is not None:
         return None
     if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
         return None
@@ -281,6 +283,8 @@ def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
     near = seen.lit_pairs(rows[order[beside]], rows[order[beside + 1]])
     if far and near and seen.typical(near) > UNLIKE * seen.typical(far):
         yield _in_another_order(seen, jumps, far[0], near[0])
+    elif (elsewhere := _alike_elsewhere(seen, rows[order])) is not None:
+        yield elsewhere
     elif seen.source.cone is None and (pair := _mirrored_neighbours(seen, rows[order])) is not None:
         yield Finding(
             "warning",
@@ -314,6 +318,39 @@ def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> Pair | N
         if not retraced and mirrored[0] < min(2 * usual[at] * allowed[at], unlike[at] / UNLIKE):
             return pairs[at]
     return None
+
+
+def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
+    """Most views look more like one that is far from them than like their neighbours; rows by ascending angle.
+
+    Of two measured scans (the tooth, Diamond) as if taken in 2, 3, 4 and 6 passes, 5 of 8 show it, those of two passes
+    never; as they were taken, none.
+    """
+    some = _some_lit(seen, rows)
+    if some.size < PAIRS:
+        return None
+    degrees = seen.degrees[some] % 360
+    unlike = np.array([[seen.unlike((int(one), int(other))) for other in some] for one in some])
+    apart = np.abs((degrees - degrees[:, None] + 180) % 360 - 180)
+    far = np.where(apart > max(OTHER * 180, 2 * float(np.median(np.diff(degrees)))), unlike, np.nan)
+    if not np.isfinite(far).any():
+        return None
+    usual, beside = float(np.nanmedian(far)), np.diagonal(unlike, 1)
+    far = np.nan_to_num(far, nan=np.inf)
+    like, neighbours = far.argmin(axis=1), np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
+    odd = far.min(axis=1) < np.minimum(neighbours, usual / UNLIKE)
+    # A sample with a plane of symmetry looks the same from directions that mirror each other: their sums are equal.
+    sums = np.radians(degrees[odd] + degrees[like[odd]])
+    if odd.mean() < _MOST or abs(np.exp(1j * sums).mean()) > _MIRRORED:
+        return None
+    first = int(np.flatnonzero(odd)[0])
+    return Finding(
+        "warning",
+        ORDER,
+        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more alike than neighbours, as {odd.sum()} "
+        f"of {some.size} views looked at do. Unless the sample is symmetric, the angles are not in the order of the "
+        "frames, or the sample went round more often than they state.",
+    )
 
 
 def _stated(seen: CoarseViews, pair: Pair) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.references import ReferenceFrame
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.wrapped import in_words, of_energies
+from beamline.storage.readers.transforms import in_words, of_energies
 from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32

@@ -128,7 +128,7 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and source.emission is None and (problem := _not_line_integrals(source)):
+    if source.quantity == "line_integrals" and (problem := _not_line_integrals(source)):
         yield Finding("error", "quantity", problem)
     elif source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
@@ -159,7 +159,7 @@ def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
 def axis_vertical(source: ScanSource) -> Iterator[Finding]:
     """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
-    if source.emission is not None or source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+    if source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
         return
     depths = _depths(source, spread(views, TURNED))
     if not depths.size:
@@ -241,7 +241,7 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
     """
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     angles = source.angles[views]
-    if source.emission is not None or source.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
+    if source.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
         return
     some = np.arange(views.size)[:: -(-views.size // SHAPES)]
     depths = _depths(source, views[some]) if np.isfinite(angles).all() and source.shape[1] >= _LEAST else np.zeros(0)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beamline.monitor.flats_with_sample import lit_places
 from beamline.monitor.references import BRIGHT, ReferenceLimits, lights_in_turn
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.readers.wrapped import selected
+from beamline.storage.readers.transforms import selected
 from beamline.storage.rules import Finding
 from beamline.storage.rules.references import BRIGHTER, VIEWS, ReferenceGroups, cells_of, mean_cells
 from drivers.base.frame import FrameKind

@@ -9,11 +9,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
 from beamline.core.installed import version
@@ -43,13 +42,11 @@ class Pixels:
 class Slices:
     """The slices of a volume in stored form, one by one.
 
-    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite; `checksums`
-    are those of the slices passed.
+    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite.
     """
 
     def __init__(self, volume: Volume, pixels: Pixels) -> None:
         self._data, self.pixels, self.shape, self.outside = volume.data, pixels, volume.grid.shape, 0
-        self.checksums = list[int]()
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for z in range(self.shape[0]):
@@ -57,9 +54,7 @@ class Slices:
                 values = np.asarray(self._data[z : z + 1][0], np.float32)
             except OSError as error:
                 raise DataError(f"Slice {z} of the volume cannot be read ({error}).") from error
-            stored = self._stored(values)
-            self.checksums.append(checksum(stored))
-            yield stored
+            yield self._stored(values)
 
     def _stored(self, values: NDArray[np.float32]) -> NDArray[Any]:
         dtype, window = self.pixels.dtype, self.pixels.window
@@ -71,11 +66,6 @@ class Slices:
         greatest = np.iinfo(dtype).max
         grey = (np.nan_to_num(values, nan=low).astype(np.float64) - low) * (greatest / (high - low))
         return np.clip(np.rint(grey), 0, greatest).astype(dtype)
-
-
-def checksum(values: NDArray[Any]) -> int:
-    """CRC-32 of voxels in memory order."""
-    return int(zlib_ng.crc32(np.ascontiguousarray(values)))
 
 
 class VolumeFormat(Protocol):
@@ -103,28 +93,6 @@ class VolumeFormat(Protocol):
         Raises:
             DataError: cut off or damaged.
         """
-
-
-@runtime_checkable
-class VolumeScale(Protocol):
-    """A volume stored in chunks, read box by box.
-
-    Attributes:
-        coarser: the same with fewer voxels.
-        whole_chunks: a part of a chunk costs as much as all of it.
-    """
-
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-    @property
-    def chunk(self) -> tuple[int, int, int]: ...
-    @property
-    def dtype(self) -> np.dtype[Any]: ...
-    @property
-    def coarser(self) -> tuple[VolumeScale, ...]: ...
-    @property
-    def whole_chunks(self) -> bool: ...
-    def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]: ...
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volume_file import read_volume
-from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
+from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
 from beamline.storage.volumes.registry import formats
 from beamline.storage.volumes.single_files import NexusVolume, Npy, NXtomoproc
 from beamline.storage.writers.recon_file import (
@@ -29,8 +28,6 @@ from beamline.storage.writers.recon_file import (
     write_reconstruction,
 )
 from recon.base.registry import did_you_mean
-
-_BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
 
 def format_of(path: Path) -> VolumeFormat:
@@ -59,8 +56,6 @@ def format_of(path: Path) -> VolumeFormat:
 def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
     """Write a volume in the format of the suffix of `path`, slice by slice; on an error no file remains.
 
-    Each slice is read back from the file and compared by its checksum; those of HDF5 as bytes, see `DiskFile`.
-
     Args:
         pixels: default: float32.
         replace: a file takes the place of an older one; a folder never does.
@@ -84,18 +79,7 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
     with whole_file(path, replace=replace) as partial:
         kind.write(partial, record, slices)
         bring_to_disk(partial)
-        _compare(kind, partial, slices)
     return slices.outside
-
-
-def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
-    """Raise OSError where a slice that is read back is not what was written."""
-    with kind.open(path) as written:
-        for first in range(0, len(slices.checksums), _BLOCK):
-            known = slices.checksums[first : first + _BLOCK]
-            for z, values in enumerate(written.volume.data[first : first + len(known)], first):
-                if checksum(values) != slices.checksums[z]:
-                    raise OSError(errno.EIO, f"slice {z} that is read back is not what was written")
 
 
 def volume_format(path: Path) -> VolumeFormat | None:

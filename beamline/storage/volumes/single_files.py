@@ -78,7 +78,7 @@ class NexusVolume:
             values = _plotted(file)
             assert values is not None
             spacing, first = axes_of(file, str(values.name))
-            record = bare_record(path, values, spacing)  # type: ignore[arg-type]
+            record = bare_record(path, values, spacing)
             if spacing is not None and first is not None:
                 half = [(n - 1) / 2 * edge for n, edge in zip(values.shape, spacing, strict=True)]
                 z, y, x = (low + middle for low, middle in zip(first, half, strict=True))

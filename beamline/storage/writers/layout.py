@@ -14,7 +14,7 @@
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
-      record/parts              of joined.h5: name, frames and digest of each file that it draws from
+      record/parts              of joined.h5: name and frames of each file that it draws from
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
       progress                  frames_committed, finished, status, missing_triggers, reason
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)

@@ -26,7 +26,6 @@ from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.disk_file import ToDisk
 from beamline.storage.flag_legend import mark_of, place_of
-from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
 from beamline.storage.writers.layout import ScanInfo
@@ -51,10 +50,6 @@ LAST = (
 )  # fmt: skip
 """Datasets that are written when a scan ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
-
-
-class _TouchedError(OSError):
-    """Another program has cut or deleted the file while it was written."""
 
 
 def _new_file(path: Path) -> h5py.File:
@@ -133,7 +128,7 @@ class NXtomoWriter:
             raise
         self._table = Rows(self._file)
         self._handle: int = self._file.id.get_vfd_handle()
-        self._to_disk, self._before = ToDisk(self._handle), os.fstat(self._handle)
+        self._to_disk, self._has_links = ToDisk(self._handle), os.fstat(self._handle).st_nlink > 0
         self._progress = self._file[layout.COMMITTED]
         # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
@@ -150,7 +145,7 @@ class NXtomoWriter:
             mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces, frame.aside,
         )  # fmt: skip
         try:
-            self._require_untouched()
+            self._require_there()
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
                 if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
@@ -187,12 +182,12 @@ class NXtomoWriter:
         """Commit the rows so far, regardless of `flush_every`; does nothing after a failed write."""
         if self._broken:
             return
-        self._require_untouched()
+        self._require_there()
         self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()
-        self._committed, self._before = self._rows, os.fstat(self._handle)
+        self._committed = self._rows
         self._to_disk(self._committed)
 
     def close(
@@ -263,8 +258,6 @@ class NXtomoWriter:
         self._to_disk.finish(self._committed)
         try:
             self._file.close()
-            if (head := superblock(self.path)) is None or head.missing:
-                raise _TouchedError(errno.EIO, "its content was changed")
         except FAILURES:
             self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
             raise
@@ -284,13 +277,10 @@ class NXtomoWriter:
                 os.dup2(nowhere.fileno(), self._handle)
                 self._file.close()
 
-    def _require_untouched(self) -> None:
-        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
-        now = os.fstat(self._handle)
-        if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
-            raise _TouchedError(errno.ENOENT, "it was deleted")
-        if now.st_size < self._before.st_size:
-            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
+    def _require_there(self) -> None:
+        """Raise OSError where another program has deleted the file: HDF5 would write on."""
+        if self._has_links and os.fstat(self._handle).st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "another program has deleted it")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""
@@ -306,12 +296,6 @@ class NXtomoWriter:
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
-        if isinstance(error, _TouchedError):
-            return DataError(
-                f"{self.path} was touched by another program while it was written: {error.strerror}. Of the "
-                f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
-                "the copy, and scan again."
-            )
         free = ""
         with suppress(OSError):  # the folder may have moved
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"

@@ -16,13 +16,10 @@ from recon.base.declared_types import Count, Natural, NonNegative, Positive
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
-from recon.base.work import Costs
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
-from recon.voxels.direct import direct_work
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, difference_weights, interleaved, iterative_memory
-from recon.voxels.work import on_volume, ordered_sweeps, sweep
 
 
 @dataclass(frozen=True)
@@ -44,9 +41,6 @@ class Sirt(VoxelMethod):
             if not problem.go_on(k + 1, math.sqrt(error) / scale):
                 break
         return x
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return Costs({self.name: ordered_sweeps(geometry, grid, self.iterations, 1)})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 4.5, 3.2, 3.1 * weighted)
@@ -75,9 +69,6 @@ class Sart(VoxelMethod):
             if not problem.go_on(k + 1, math.sqrt(error) / scale):
                 break
         return x
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return Costs({self.name: ordered_sweeps(geometry, grid, self.iterations, geometry.n_views)})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.5, 6.6, 4.1 * weighted)
@@ -125,10 +116,6 @@ class Cgls(VoxelMethod):
         if problem.nonnegative:
             np.maximum(x, 0, out=x)
         return x
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        step = sweep(geometry, grid) + on_volume("pass", grid, 3)
-        return Costs({self.name: (1 + self.iterations) * step})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
@@ -194,12 +181,6 @@ class AsdPocs(VoxelMethod):
             if decide("shorter", partial(bool, undone and error > goal)):
                 step *= self.alpha_decay
         return x
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        descent = on_volume("slope", grid, self.tv_steps) + on_volume("pass", grid, self.tv_steps + 6)
-        sweeps = ordered_sweeps(geometry, grid, self.iterations, geometry.n_views)
-        seen = (1 + self.iterations) * 0.5 * sweep(geometry, grid)  # projected without an adjoint
-        return Costs({self.name: direct_work(geometry, grid) + sweeps + seen + (self.iterations - 1) * descent})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 5.1, 7.8, 4.1 * weighted, filtered=True)

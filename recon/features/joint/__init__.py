@@ -8,5 +8,3 @@ METHODS = {
     "series": MethodEntry("recon.features.joint.methods", "TimeSeries", compared=False, several="times"),
     "materials": MethodEntry("recon.features.joint.methods", "EnergySeries", compared=False, several="materials"),
 }
-
-OPERATIONS = {"series": "recon.features.joint.methods"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -15,12 +14,10 @@ from recon.base.declared_types import Bound, Checked, Count, NonNegative, check_
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.base.work import Costs, SizedRun, Work
-from recon.features.joint.energy_fit import EnergyFit, EnergyViews
-from recon.features.joint.motion import Motion
-from recon.features.joint.proportions import SOLUTION_STEPS, STEPS, TRIAL_STEPS, fit_share
-from recon.features.joint.series import MOMENTS, SWEEPS, TimedViews, fit_series, of_moments, series_costs
-from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
+from recon.features.joint.energy_fit import EnergyViews
+from recon.features.joint.proportions import STEPS, fit_share
+from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
+from recon.features.joint.spectral import MATERIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
 _OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
@@ -43,7 +40,7 @@ class TimeSeries(Checked):
 
     name: ClassVar[str] = "series"
     label: ClassVar[str] = "Volumes in time"
-    traits: ClassVar[Traits] = Traits(in_time=True)
+    traits: ClassVar[Traits] = Traits(in_time=True, least_views=LEAST_VIEWS)
 
     volumes: Annotated[int, Bound(2)] = 2
     moves: bool | None = None
@@ -81,9 +78,6 @@ class TimeSeries(Checked):
 
     def toy(self) -> Self:
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
@@ -177,17 +171,6 @@ class EnergySeries:
     def toy(self) -> Self:
         return replace(self, materials=("matter",), states=(), sweeps=1)
 
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        few = min(grid.shape[0], TRIAL_ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
-
-        def swept(sweeps: float, share: float = 1.0) -> Work:
-            views = sweeps * geometry.n_views
-            return Work.of(f"series, energies {self.volumes}", views, views * share * math.prod(grid.shape))
-
-        # A step of the share takes about as long as a sweep.
-        share = swept(SOLUTION_STEPS) + swept(TRIAL_STEPS, few) if self.states else Work()
-        return Costs({self.name: swept(self.sweeps) + share}, swept(TRIAL_SWEEPS, few))
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         volumes = max(_VOLUMES * self.volumes, self.volumes + _OF_SHARE if self.states else 0)
         return volumes * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
@@ -269,28 +252,3 @@ def _because(still: float, moved: float, moves: bool) -> str:
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"
     return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
-
-
-def timed(which: str) -> tuple[SizedRun, ...]:
-    """Sweeps of so many volumes, as of "moving 3"."""
-    from recon.machine_speed import views_of_disc
-
-    kind, count = which.split()
-    volumes, sized = int(count), list[SizedRun]()
-    for cols in (32, 80):
-        geometry, grid, data = views_of_disc("parallel", 16, cols, 12 * volumes)
-        n, motion = geometry.n_views, None
-        if kind == "energies":
-            views = EnergyViews(data, geometry, np.arange(n) * volumes // n, np.eye(volumes) + 0.5)
-        else:
-            times, (nz, ny, nx) = np.arange(n, dtype=np.float64), grid.shape
-            knots = np.linspace(0, times[-1], volumes)
-            views, past = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
-            motion = Motion.none((ny, nx, nz), past, 3, 3) if kind == "moving" else None
-        fit = EnergyFit(views, grid, np.random.default_rng(0), motion)
-        sized.append(SizedRun(n, n * math.prod(grid.shape), partial(_sweep, fit, volumes)))
-    return tuple(sized)
-
-
-def _sweep(fit: EnergyFit, volumes: int) -> None:
-    list(fit.sweeps(np.full(volumes, 0.1), 1))

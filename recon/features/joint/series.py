@@ -19,15 +19,10 @@ from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.base.work import Costs, Work
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 from recon.features.joint.learnt_motion import (
-    JUDGED,
-    JUDGED_SWEEPS,
-    SWEEPS_OF_TURN,
     OfMoments,
     learnt_motion,
-    levels,
     unseen_squares,
 )
 from recon.features.joint.motion import Motion, moved
@@ -45,7 +40,7 @@ _TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24
 _TURN = 4  # sweeps that the steps of a motion take, beside its own
 _FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
 SWEEPS = 60
-_LEAST_VIEWS = 12  # for each volume: views held out must see it, too
+LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
 
 
@@ -277,36 +272,10 @@ def smooth_factors(
 
 def refuse_few(knots: int, n: int) -> None:
     """Raise ValueError if so many views are too few for so many volumes."""
-    if not 2 <= knots <= n // _LEAST_VIEWS:
+    if not 2 <= knots <= n // LEAST_VIEWS:
         raise ValueError(
-            f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
+            f"{knots} volumes of {n} views: expected 2 volumes or more, and {LEAST_VIEWS} views or more for each"
         )
-
-
-def series_costs(geometry: Geometry, knots: int, motion: bool | None, sweeps: int = SWEEPS) -> Costs:
-    """The work of `fit_series`: without motion, and with it, where that is undecided.
-
-    Raises:
-        ValueError: the views do not suffice for so many volumes.
-    """
-    refuse_few(knots, geometry.n_views)
-    cols, grid = geometry.detector_shape[1], Grid.matching(geometry)
-    voxels = math.prod(grid.shape)
-    few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
-
-    def swept(moves: bool, sweeps: float, share: float = 1.0) -> Work:
-        views = sweeps * geometry.n_views
-        return Work.of(f"series, {'moving' if moves else 'still'} {knots}", views, views * share * voxels)
-
-    learning = sum((swept(True, n * (SWEEPS_OF_TURN + _TURN), wide**-3) for wide, n in levels(cols)), Work())
-    rest = swept(False, sweeps + _FACTORS[1]) + swept(False, sweeps + _FACTORS[0], few)
-    volumes = {"rest": rest, "moving": learning + swept(True, sweeps)}
-    choice = swept(False, _TRIALS, few)
-    if motion is not None:
-        return Costs({"moving" if motion else "rest": volumes["moving" if motion else "rest"]}, choice)
-    coarse = max(1, round(cols / JUDGED)) ** -3
-    judging = learning + swept(False, JUDGED_SWEEPS, coarse) + swept(True, JUDGED_SWEEPS, coarse)
-    return Costs(volumes, choice + judging)
 
 
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:

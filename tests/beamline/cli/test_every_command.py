@@ -15,9 +15,8 @@ CONTEXT = click.Context(main)
 COMMANDS = {name: command for name in own_commands() if (command := main.get_command(CONTEXT, name)) is not None}
 TAKES_FILE = {
     "batch": "FILE -o out", "export": "FILE -o out.nrrd", "ingest": "FILE out.h5",
-    "materials": "FILE FILE --spectra FILE -o out.h5", "render": "FILE -o out.h5", "study": "fixed-views FILE",
-    "simulate": "FILE -o out.h5", "surface": "FILE -o out.stl", "sweep": "FILE axis=1:3:1",
-    "voxelise": "FILE -o out.h5", "xafs": "FILE --from 8.30 --to 8.42",
+    "materials": "FILE FILE --spectra FILE -o out.h5", "study": "fixed-views FILE",
+    "simulate": "FILE -o out.h5", "sweep": "FILE axis=1:3:1",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
 NO_FILE = {"completion", "config", "demo", "ioc", "pause", "resume", "stop", "abort", "runs"}

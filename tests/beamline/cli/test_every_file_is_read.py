@@ -14,7 +14,7 @@ from beamline.page.volume import ShownVolume
 from beamline.reconstruct.measure import read_truth
 from beamline.simulate import volumes_beside
 from beamline.storage.volumes.files import opened_volume
-from tests.beamline.cli.small_scan import beamline, succeeds
+from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
 pytestmark = pytest.mark.slow  # half a minute for all pairs
@@ -34,17 +34,11 @@ WINDOW = ("--bits", "16", "--window", "-1:6")
 
 SCANS: dict[str, tuple[str, ...]] = {
     "simulated.h5": ("simulate", "scene.yaml", "-o"),
-    "emission.h5": ("simulate", "pet", "--frames", "14", "-o"),
     "ingested.h5": ("ingest", "exchange.h5"),
-    "archived.h5": ("archive", "recorded.h5", "-o"),
-    "rendered.h5": ("render", "fit.h5", "-o"),
-    "rendered_else.h5": ("render", "fit.h5", "--angles", "0:180:9", "-o"),
 }
 FLOATS: dict[str, tuple[str, ...]] = {
     "fbp.h5": ("recon", "simulated.h5", "-m", "fbp", "--no-report", "-o"),
     "fbp.tif": ("recon", "simulated.h5", "-m", "fbp", "--no-report", "-o"),
-    "fine.h5": ("voxelise", "fit.h5", "-o"),
-    "fine.nrrd": ("voxelise", "fit.h5", "-o"),
     "truth.h5": ("simulate", "scene.yaml", "--truth"),
     **{f"copy{suffix}": ("export", "fbp.h5", "-o") for suffix in (".h5", ".tif", ".npy", ".nrrd", ".zarr", "")},
 }
@@ -87,7 +81,6 @@ SCAN_READERS = {
     "validate": _command("validate", "FILE", "--deep"),
     "monitor": _command("monitor", "FILE"),
     "ingest": _command("ingest", "FILE", "OUT.h5"),
-    "archive": _command("archive", "FILE", "-o", "OUT.h5"),
     "recon": _command("recon", "FILE", "-m", "fbp", "--no-report", "-o", "OUT.h5"),
     "statistics": _command("info", "FILE", "--statistics"),
 }
@@ -117,7 +110,6 @@ VOLUME_READERS = {
     "info": _command("info", "FILE"),
     "validate": _command("validate", "FILE"),
     "export": _command("export", "FILE", "-o", "OUT.nrrd"),
-    "surface": _command("surface", "FILE", "-o", "OUT.stl"),
     "segment": _command("segment", "FILE", "--crop", "none", "--margin", "0", "-o", "OUT.h5"),
     "view": _viewed,
     "truth": _as_truth,
@@ -146,18 +138,8 @@ def test_the_voxel_of_every_copy_is_that_of_the_volume(written: Path) -> None:
             assert record.volume.grid.centre == pytest.approx(grid.centre, abs=1e-9), name
 
 
-def test_views_of_a_model_give_its_volume_again(written: Path, tmp_path: Path) -> None:
-    """Nothing is stated on the way: quantity, axis and pixel size are in the file."""
-    succeeds("recon", "rendered_else.h5", "-m", "fbp", "--no-report", "-o", str(tmp_path / "v.h5"))
-    with opened_volume(tmp_path / "v.h5") as again, opened_volume(Path("fine.h5")) as model:
-        assert again.length_unit == "mm" and again.volume.grid.spacing == pytest.approx(model.volume.grid.spacing)
-        pair = np.ravel(again.volume.data[:]), np.ravel(model.volume.data[:])
-        assert np.corrcoef(*pair)[0, 1] > 0.97
-
-
 OTHERS: dict[str, tuple[str, ...]] = {
     "model.ply": ("export", "fit.h5", "--gaussians", "-o"),
-    "mesh.stl": ("surface", "fbp.h5", "-o"),
     "sheet.png": ("monitor", "simulated.h5", "--sheet"),
     "histogram.png": ("info", "simulated.h5", "--statistics", "-o"),
     "checkpoint.h5": ("recon", "simulated.h5", "-m", "r2", "--steps", "9", "-o", "v.h5", "--no-report", "--checkpoint"),

@@ -13,8 +13,8 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.reconstruct import budget, checkpoints, job, pipeline
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.assess.time_model import Speeds
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
+from recon.forecast import Pace
 from recon.splatting import optimise as fit
 from recon.splatting import train
 from recon.splatting.initialise import place
@@ -140,7 +140,7 @@ def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
         return run(method, problem, control)
 
     monkeypatch.setattr(direct.Fbp, "run", interrupted)
-    monkeypatch.setattr(budget, "speeds_of", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
+    monkeypatch.setattr(budget, "paces_of", lambda *_: {"fbp": Pace(0.1, 0.0, 0)})
     result = succeeds("recon", "scan.h5", "--budget", "20s", "-o", "out.h5", "--no-report")
     assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output
     parameters = read_reconstruction(folder / "out.h5").parameters

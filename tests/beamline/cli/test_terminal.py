@@ -1,6 +1,5 @@
 """A bar where a terminal is, few plain lines where there is none, and every event as words or nothing."""
 
-import errno
 import io
 import math
 import re
@@ -60,13 +59,6 @@ class HungUp(io.StringIO):
 
     def write(self, text: str) -> int:
         raise OSError(self.number, "no")
-
-
-def test_a_terminal_that_closes_does_not_end_the_work() -> None:
-    said = ("state", {"state": "acquiring", "message": "Acquiring"})
-    shown(HungUp(errno.EIO), said, ("frame", FRAME), said)
-    with pytest.raises(OSError, match="no"):
-        shown(HungUp(errno.ENOSPC), said)
 
 
 def test_the_figures_an_operator_watches() -> None:

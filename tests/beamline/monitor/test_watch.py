@@ -1,20 +1,16 @@
 """The checks together: silent on clean scans, several flags on one frame, means of the latest references."""
 
-import sys
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
-from beamline.monitor import watch
 from beamline.monitor import watch as scan
 from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.frames import StuckCheck, TimingCheck
-from beamline.monitor.watch import rehearse, start
 from drivers.base.frame import Frame, FrameKind
-from recon.base.jit import _Kernel
 
 CONTEXT = ScanContext(saturation=65535, pixels=100)
 
@@ -108,39 +104,3 @@ def test_a_check_that_raises_names_itself_and_the_others_go_on(fake: Any) -> Non
         scan.look(monitor, frame, digest(frame.counts, CONTEXT.saturation, 4))
     after, _ = scan.look(scan.without(monitor, "stuck"), frame, digest(frame.counts, CONTEXT.saturation, 4))
     assert [check.name for check in after.checks] == ["timing"]
-
-
-OF_REALS = {"_sum_reals", "_count_reals"}  # frames of other programs
-# Compiled with the kernel that calls them.
-IN_KERNELS = {"_folded", "_place", "_longest"}
-
-
-@pytest.mark.parametrize("step", [float("nan"), 0.002])  # rad: a scan's may be that of the toy, or another
-def test_a_rehearsal_runs_every_kernel_that_frames_of_counts_need(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
-    monkeypatch.setattr(watch, "REHEARSED", set())
-    monitor = start(ScanContext(65535, 2048**2, period=0.1, step=step))
-    kernels = {
-        name: kernel
-        for module in [m for name, m in sys.modules.items() if name.startswith("beamline.monitor.")]
-        for name, kernel in vars(module).items()
-        if isinstance(kernel, _Kernel) and name not in OF_REALS | IN_KERNELS
-    }
-    assert kernels.keys() >= {"_count_greys", "_highest", "_grow", "_rival"}
-    ran, call = set[_Kernel](), _Kernel.__call__
-    monkeypatch.setattr(_Kernel, "__call__", lambda kernel, *args: (ran.add(kernel), call(kernel, *args))[1])
-    rehearse(monitor)
-    assert {name for name, kernel in kernels.items() if kernel not in ran} == set()
-    assert monitor.before is None and monitor.recent == ()
-
-
-def test_the_next_scan_of_the_process_by_the_same_checks_waits_for_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monitor, looks = start(ScanContext(65535, 2048**2, period=0.1)), list[int]()
-    look = watch.look
-    monkeypatch.setattr(watch, "REHEARSED", set())
-    monkeypatch.setattr(watch, "look", lambda *args: (looks.append(1), look(*args))[1])
-    rehearse(monitor)
-    first = len(looks)
-    rehearse(start(ScanContext(4095, 512**2, step=0.5)))
-    assert 0 < first == len(looks)
-    rehearse(start(monitor.context, monitor.checks[1:]))
-    assert len(looks) == 2 * first

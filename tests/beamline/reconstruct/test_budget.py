@@ -9,23 +9,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import recon
 from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
-from beamline.reconstruct.budget import binned, within
+from beamline.reconstruct.budget import Choice, binned, choices, paces_of, within
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
-from recon.assess.time_model import CURVES, PRESETS, Choice, Speeds
+from recon.assess.time_model import PRESETS
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
+from recon.forecast import Pace
 from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
@@ -41,6 +44,7 @@ from tests.slow_cases import others_slow
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
+PACE = 0.7  # of an iteration of OS-SIRT-TV over a sweep of FISTA-TV
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +64,15 @@ def _spend(
     return within(budget, prepared, methods, 0, RunControl(now=now), said.append)[0]
 
 
-def _as_fast_as(monkeypatch: pytest.MonkeyPatch, *speeds: float) -> None:
-    monkeypatch.setattr(module, "speeds_of", lambda *_: Speeds(*speeds))
+def _as_fast_as(monkeypatch: pytest.MonkeyPatch, fbp: float, start: float, step: float, sweep: float) -> None:
+    """Seconds of FBP, of the start of a fit beside it, of a step, and of a sweep over voxels."""
+    paces = {
+        "fbp": Pace(fbp, 0.0, 0),
+        "r2": Pace(fbp + start, step, 0),
+        "fista-tv": Pace(0.0, sweep, 0),
+        "os-sirt-tv": Pace(0.0, PACE * sweep, 0),
+    }
+    monkeypatch.setattr(module, "paces_of", lambda methods, *_: {m.name: paces[m.name] for m in methods})
 
 
 @pytest.mark.parametrize("budget", others_slow([5.0, 8.0, 12.0], 2))
@@ -69,14 +80,13 @@ def test_the_time_is_used_and_not_exceeded(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
-    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
     monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
     done = _spend(prepared, budget, SteppedClock(100.0, 0.01))
     assert done.settings["chosen_method"] == "r2"
     assert 0.9 * budget < done.seconds <= budget
     assert done.volume.grid == Grid.matching(prepared.geometry)
     assert f"of {budget:.3g} s" in done.chosen
-    assert done.settings["measured_step_s"] == 0.01
     assert done.settings["kernel"] is FitSettings().kernel
     assert np.isfinite(done.history[-1].held_out)  # six views were not chosen
 
@@ -85,7 +95,7 @@ def test_iterations_on_voxels_take_a_sample_that_is_wider_than_the_field(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In a box as wide as the sample; and where pixels must not be binned they are not."""
-    _as_fast_as(monkeypatch, 0.01, 0.1, 0.001, 0.1, 0.001)
+    _as_fast_as(monkeypatch, 0.01, 0.2, 0.001, 0.001)
     found, views = prepared.projections, prepared.geometry
     inner = replace(found, data=np.ascontiguousarray(found.data[..., 11:31]), masked=found.masked[:, 11:31])
     cut = Geometry.parallel(views.angles, (6, 20), axis_col=views.axis_col - 11)
@@ -100,14 +110,8 @@ def test_iterations_on_voxels_take_a_sample_that_is_wider_than_the_field(
 def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is measured once on a machine is not counted."""
     clock = SteppedClock(100.0, 0.01)
-
-    def slow(*_: object) -> Speeds:
-        clock.time += 7.0
-        return Speeds(4320.0, 50.0, 3.0, 10.0, 9.0)
-
-    monkeypatch.setattr(module, "speeds_of", slow)
+    _as_fast_as(monkeypatch, 4320.0, 60.0, 3.0, 9.0)
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
     binned_pixels = done.settings["chosen_binning"]
@@ -123,7 +127,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More steps than were best on other scans follow the noise."""
-    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
     monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))
     monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, SteppedClock(100.0, 0.1), methods=(R2(),))
@@ -134,10 +138,37 @@ def test_a_fit_with_much_time_ends_with_its_plan(
 def test_the_shortest_fit_is_said_to_be_late_too(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
+    _as_fast_as(monkeypatch, 20.0, 60, 3.0, 9.0)
     warned: list[str] = []
     _spend(_cone(prepared, 3.0), 0.001, SteppedClock(100.0, 0.01), warned)
     assert len(warned) == 1 and "the cheapest choice, r2, binned" in warned[0]
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e2), st.floats(1e-3, 1e2), st.integers(1, 64))
+def test_a_choice_takes_no_more_than_its_time_where_any_does(
+    seconds: float, fbp: float, step: float, largest: int
+) -> None:
+    """Nothing is binned that need not be; and a longer time takes no fewer steps."""
+    paces = {"fbp": Pace(fbp, 0.0, 0), "r2": Pace(3 * fbp, step, 0)}
+    able, longer = (choices(paces, time, largest) for time in (seconds, 2 * seconds))
+    if len(able) > 1 or able[0].seconds <= seconds:
+        assert all(each.seconds <= seconds for each in able)
+        assert able[0].binning == 1 or fbp / (able[0].binning / 2) ** 3 > seconds
+    assert all(each.binning <= largest for each in able) and longer[0].binning <= able[0].binning
+    steps = [{each.method: each.steps for each in some} for some in (able, longer)]
+    assert longer[0].binning < able[0].binning or all(n <= steps[1][name] for name, n in steps[0].items())
+
+
+def test_paces_come_from_steps_that_are_run(prepared: PreparedProjections) -> None:
+    """On a clock that ticks at each look; a method that refuses the views is left out, unless all do."""
+    now = SteppedClock(100.0, 0.01)
+    paces = paces_of([R2(), Fbp(), FistaTv()], prepared.geometry, prepared.box, now)
+    assert set(paces) == {"r2", "fbp", "fista-tv"} and paces["fbp"].each == 0
+    assert all(pace.fixed > 0 for pace in paces.values()) and paces["r2"].each > 0
+    short = _cone(prepared, 2.8)
+    assert set(paces_of([Fbp(), FistaTv()], short.geometry, short.box, now)) == {"fista-tv"}
+    with pytest.raises(ValueError, match="fbp"):
+        paces_of([Fbp()], short.geometry, short.box, now)
 
 
 @pytest.fixture
@@ -151,9 +182,6 @@ def high(prepared: PreparedProjections) -> PreparedProjections:
     return replace(
         prepared, projections=replace(prepared.projections, data=data + noise), geometry=views, held_out=None
     )
-
-
-PACE = next(c.pace for c in CURVES if c.method == OsSirtTv.name and c.binning == 1)
 
 
 @dataclass(frozen=True)
@@ -176,7 +204,7 @@ def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_res
     high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = SteppedClock(100.0)
-    _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
+    _as_fast_as(monkeypatch, 0.5, 2e06, 1.0, 1.0)
     for factor, expected in ((1.0, "os-sirt-tv"), (3.0, "fbp")):
         costly = Costly(clock=clock, factor=factor)
         begin = clock.time
@@ -195,12 +223,11 @@ def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_res
 def test_without_a_trial_the_curves_of_other_scans_decide(
     prepared: PreparedProjections, high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
+    _as_fast_as(monkeypatch, 0.5, 2e06, 1.0, 1.0)
     few = _spend(prepared, 20.0, SteppedClock(100.0), methods=(OsSirtTv(), Fbp()))
     assert few.method == "os-sirt-tv"
     because = few.settings["chosen_because"]
-    assert because.endswith("nothing was tried: the scan has too few rows for a trial in this time")
-    assert because.startswith("expected by other scans, dB above FBP: os-sirt-tv ")
+    assert because.startswith("os-sirt-tv was best on other scans; nothing was tried: the scan has too few rows")
     clock = SteppedClock(100.0)
     slow = Costly(clock=clock)
     monkeypatch.setattr(Costly, "run", lambda self, problem, control: _wait(clock, 12.0, problem))
@@ -216,7 +243,7 @@ def _wait(clock: SteppedClock, seconds: float, problem: ReconProblem) -> Reconst
 def test_a_method_on_voxels_ends_in_time_with_what_it_has(
     high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _as_fast_as(monkeypatch, 0.1, 1e6, 1.0, 1e6, 0.1)
+    _as_fast_as(monkeypatch, 0.1, 2e06, 1.0, 0.1)
     done = _spend(high, 3.0, SteppedClock(100.0, 0.1), methods=(FistaTv(),))
     last = done.history[-1]
     assert 1 < last.step < last.steps and done.seconds <= 3.5 and done.settings["chosen_because"] == ""
@@ -257,7 +284,7 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections)
 def test_a_cone_is_placed_as_its_parallel_likeness_is(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
+    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
     both = (prepared, _cone(prepared, 2 * np.pi))
     counts = [_spend(views, 3.0, SteppedClock(100.0, 0.01)).settings["gaussians_at_start"] for views in both]
     assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
@@ -267,7 +294,7 @@ def test_a_cone_is_placed_as_its_parallel_likeness_is(
 def test_a_slow_machine_takes_the_direct_method_of_binned_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, views: str
 ) -> None:
-    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
+    _as_fast_as(monkeypatch, 20.0, 60, 3.0, 9.0)
     cone = {"of a cone": 0.0, "that lean": 0.02}
     seen = _cone(prepared, 2 * np.pi, tilt=cone[views]) if views in cone else prepared
     done = _spend(seen, 5.0, SteppedClock(100.0, 0.01))
@@ -280,7 +307,7 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Less than a short scan of a cone is for neither FBP nor FDK."""
-    _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
+    _as_fast_as(monkeypatch, 20.0, 60, 3.0, 9.0)
     done = _spend(_cone(prepared, 2.8), 5.0, SteppedClock(100.0, 0.01))
     assert done.settings["chosen_method"] == "r2" and done.method == "r2" and done.settings["chosen_binning"] == 4
     assert done.history[-1].step > 0 and 0 < done.settings["gaussians_at_start"] < 100
@@ -299,8 +326,8 @@ def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) 
 @pytest.mark.slow
 def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
-    _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr(module, "plans", lambda *_: [Choice("r2", "steps", 2, 1.0, 100, 1.0, 0.5)])
+    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
+    monkeypatch.setattr(module, "choices", lambda *_: [Choice("r2", 100, 2, 0.5)])
     np.save(tmp_path / "truth.npy", SCAN.truth(Grid(SCAN.shape[:1] + 2 * SCAN.shape[1:], 1.0)))
     options = ReconOptions(
         SourceOptions(tmp_path / "scan.h5"), OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),

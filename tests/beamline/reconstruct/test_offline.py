@@ -25,10 +25,10 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import ReconRecord, read_checkpoint, read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
-from recon.assess.time_model import Speeds
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
+from recon.forecast import Pace
 from recon.methods import build, by_name
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
@@ -142,7 +142,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
         asked.append({"method": method or R2(), "geometry": geometry})
 
     monkeypatch.setattr(job, "warm_up", compiled)
-    monkeypatch.setattr(budget, "speeds_of", lambda *_: Speeds(0.1, 0.1, 0.01, 0.1, 0.01))
+    monkeypatch.setattr(budget, "paces_of", lambda *_: {"r2": Pace(0.3, 0.01, 0)})
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
     _made(_options(tmp_path, selection=selection, **changes))
     assert len(asked) == 1

@@ -15,7 +15,6 @@ import pytest
 from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct import run as in_time
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import fit_within, warnings_told
@@ -23,7 +22,6 @@ from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import setting
-from recon.features.neural.methods import NAF
 from recon.splatting.r2 import R2
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -32,17 +30,10 @@ from tests.clock import SteppedClock
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 40))
-SWEEP = 10.0  # s
 
 
 def _prepared() -> PreparedProjections:
     return prepared_views(np.ones((VIEWS.n_views, *VIEWS.detector_shape), np.float32), VIEWS)
-
-
-@pytest.fixture
-def sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sweeps that take ten seconds."""
-    monkeypatch.setattr(in_time, "first_sweep_seconds", lambda *_: SWEEP)
 
 
 def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, float, list[str]]:
@@ -56,29 +47,19 @@ def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, f
     return float(setting(method, "seconds")), 100.0 + seconds - before_report.deadline, said
 
 
-@pytest.mark.usefixtures("sweeps")
 def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:
     left, after, said = _within(100.0, spent=20.0)
-    measuring = SWEEP / 2 * 16 / VIEWS.n_views  # of sixteen views there, not back
+    measuring = 5  # a twentieth
     assert left + 20 + measuring + after == pytest.approx(100)
     assert 5 <= after <= 20 and said == []
     without_report, _, _ = _within(100.0, spent=20.0, report=False)
     assert without_report == pytest.approx(100 - 20 - measuring, abs=0.1)
 
 
-@pytest.mark.usefixtures("sweeps")
 def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> None:
     left, _, said = _within(12.0, spent=9.0)
     assert left == 0
     assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
-
-
-@pytest.mark.usefixtures("sweeps")
-def test_a_method_without_a_start_is_told_of_none() -> None:
-    said: list[str] = []
-    target = OutputPaths(Path("out.h5"), None)
-    fit_within(NAF(seconds=12.0), 12.0, _prepared(), target, (100.0, 0.0), SteppedClock(109.0), said.append)
-    assert len(said) == 1 and "nothing is left for the NAF method" in said[0] and "start" not in said[0]
 
 
 def test_warnings_of_python_are_told_as_sentences() -> None:

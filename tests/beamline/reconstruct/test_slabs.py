@@ -185,7 +185,7 @@ def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over
     """Views of 200 rows; the later half stands 100 rows higher."""
     Path("poses.csv").write_text("view,shift_row_px\n" + "".join(f"{n},{100 * (n >= 30)}\n" for n in range(60)))
     seen = list[tuple[Geometry, Grid]]()
-    monkeypatch.setattr(estimate, "costs_of", lambda method, parts, decided: seen.extend(parts))
+    monkeypatch.setattr(estimate, "forecast", lambda method, geometry, grid, now: seen.append((geometry, grid)))
     dry = ("recon", "scan.h5", "-m", "sirt", "--dry-run", "-o", "out.h5")
     stepped = beamline(*dry, "--poses", "poses.csv")
     assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1][1].shape[0] == 300, stepped.output

@@ -229,7 +229,7 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
 def test_a_check_that_hangs_ends_the_scan_with_the_frames_before(monkeypatch: pytest.MonkeyPatch) -> None:
     free = threading.Event()
     monkeypatch.setattr(module, "look_past_failures", lambda *_: free.wait(60))
-    monkeypatch.setattr(module, "STALL", 0.05)
+    monkeypatch.setattr(module, "CHECKED_WITHIN", 0.05)
     recorder = record(Writer())
     recorder.put(frame(0))
     with pytest.raises(DataError, match=r"has not come back from a frame.*first 0 frames are safe"):

@@ -273,16 +273,6 @@ def test_processes_of_their_own_refuse_it_too(stale: Path, tmp_path: Path) -> No
     assert code != 0 and "part-3" in (tmp_path / "batch" / "batch.csv").read_text() + said
 
 
-def _other_pixels(run: Path) -> None:
-    with h5py.File(run / "part-2" / "scan.h5", "r+") as file:
-        file["/entry/digest/checksum"][3] += 1
-
-
-def _other_angle(run: Path) -> None:
-    with h5py.File(run / "scan.h5", "r+") as file:
-        file[layout.ANGLE][FIRST] += 1
-
-
 def _fewer_frames(run: Path) -> None:
     with h5py.File(run / "part-2" / "scan.h5", "r+") as file:
         file[layout.COMMITTED][()] -= 1
@@ -305,9 +295,7 @@ def _without_its_parts(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_other_pixels, "part-2/scan.h5 has .* frames that are not"),
-        (_other_angle, "scan.h5 has .* frames that are not"),
-        (_fewer_frames, "part-2/scan.h5 has .* frames that are not"),
+        (_fewer_frames, "part-2/scan.h5 has .* frames, not the"),
         (_gone, "part-3/scan.h5 is not there"),
         (_torn, "is cut off"),
         (_without_its_parts, "does not say what its parts are"),

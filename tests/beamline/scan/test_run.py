@@ -264,25 +264,6 @@ def test_two_scans_in_one_process_carry_their_own_metadata(tmp_path: Path) -> No
     assert starts[1][0] > starts[0][1] + 4000
 
 
-def test_another_device_at_the_port_of_the_run_before_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = {"model": "Zaber device 1", "serial": "11", "port": "/dev/ttyUSB0"}
-    for serial, port, warned in (
-        ("11", "/dev/ttyUSB0", False),
-        ("22", "/dev/ttyUSB0", True),
-        ("22", "/dev/ttyUSB0", False),
-        ("33", "/dev/ttyUSB1", False),
-    ):
-        now = said | {"serial": serial, "port": port}
-        monkeypatch.setattr(fakes.Stage, "describe", lambda stage, now=now: now)
-        ran = Ran(tmp_path, FakeInstrument())
-        assert ran.error is None
-        messages = ran.warnings
-        assert bool(messages) is warned
-        if warned:
-            assert "at /dev/ttyUSB0 there is model Zaber device 1, serial 22" in messages[0]
-            assert "it was model Zaber device 1, serial 11. If cables or ports were swapped" in messages[0]
-
-
 def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said = {"model": "m", "found_at_opening": "displaced while it stood (WM)"}
     monkeypatch.setattr(fakes.Stage, "describe", lambda stage: said)

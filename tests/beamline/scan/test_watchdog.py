@@ -29,7 +29,7 @@ from tests.clock import wait_until
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.simulators.wires.transports import serve_tcp
 
-FREEZES = (("zaber", "scan"), ("zaber", "watchdog")) if os.name == "posix" else ()
+FREEZES = (("zaber", "scan"),) if os.name == "posix" else ()
 OTHERS = (("pi_gcs", ""), ("pm16c", ""), *FREEZES)
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}
 SCAN = """
@@ -40,7 +40,6 @@ from beamline.instrument.connect import shutter_of, stage_alone
 from beamline.scan import watchdog
 from beamline.scan.watchdog import watched
 from drivers.base.clock import Clock, SystemClock
-watchdog.UNANSWERED = 10
 if len(sys.argv) > 2:
     watchdog.COMMAND = (sys.executable, "-c", sys.argv[2])
 folder, by_hand = Path(sys.argv[1]), []
@@ -68,7 +67,6 @@ posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets
 def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
     tmp_path: Path, kind: str, frozen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also one that is killed when the watchdog beside it is frozen, and its replacement is not there yet."""
     clock = SystemClock()
     line = TriggerLine(clock)
     template, outputs = config_folder() / "instrument.yaml", kind != "pm16c"
@@ -90,10 +88,6 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
             time.sleep(0.2)
             assert line.angle_at(clock.now()) > 0
             assert controller.output_is_high(2) is outputs
-            if frozen == "watchdog":
-                (first,) = children_with("beamline.scan.watchdog", scan.pid)
-                first.suspend()
-                wait_until(lambda: children_with("beamline.scan.watchdog", scan.pid) not in ([], [first]))
             scan.send_signal(signal.SIGSTOP) if frozen == "scan" else scan.kill()
         wait_until(lambda: log.exists() and "disarmed" in log.read_text(encoding="utf-8"))
         text = log.read_text(encoding="utf-8")
@@ -194,20 +188,16 @@ def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: 
     assert told == [] and not (tmp_path / WATCHDOG_LOG).exists()
 
 
-@pytest.mark.parametrize(
-    ("then", "what", "paused"),
-    [("0", "has ended (code 0)", False), ("0", "has ended", True), ("__import__('time').sleep(99)", "does not", False)],
-)
-def test_a_watchdog_that_died_or_froze_is_told_and_replaced_or_the_scan_pauses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: str, what: str, paused: bool
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_watchdog_that_died_is_told_and_replaced_or_the_scan_pauses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paused: bool
 ) -> None:
     monkeypatch.setattr(watchdog, "BEAT", 0.01)
-    monkeypatch.setattr(watchdog, "UNANSWERED", 5)
-    monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", f"print('ready', flush=True); {then}"))
+    monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", "print('ready', flush=True)"))
     told, stop, pause = list[str](), StopRequest(), PauseRequest()
     with watched(tmp_path, lambda event: told.append(event.data["message"]), stop, pause if paused else None):
         wait_until(lambda: any(", too" in text for text in told))
-    assert sum(what in text and "another one is started" in text for text in told) == watchdog.AGAIN
+    assert sum("has ended (code 0)" in text and "another one is started" in text for text in told) == watchdog.AGAIN
     assert ("no watchdog runs" in pause.reason) is paused and not stop.stopping
 
 

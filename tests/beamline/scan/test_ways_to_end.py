@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from beamline.core.errors import BeamlineError, exit_code
 from beamline.monitor.check import Flag, Level, Look
 from beamline.monitor.field import MassCheck
-from beamline.scan import recorder
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
@@ -81,7 +80,6 @@ class Broken:
 
 def _ran(runs: Path, place: str, which: int, nth: int, once: bool = False, mode: str = "fly") -> Ran:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recorder, "COMPILES", 600.0)  # on a busy machine
         broken = Broken(patch, place, which, nth, once)
         return Ran(runs, broken.instrument, f"scan.mode={mode}", heard=broken.heard)
 

@@ -31,7 +31,7 @@ class Rings:
         "--rings",
         "none",
         "Remove stripes of the sinograms, which make rings. sort: small stripes. vo: dead columns, large and small "
-        "stripes. wavelet: by their wavelet coefficients. auto: the kinds that it detects. Layers of the sample around "
+        "stripes. auto: the kinds that it detects. Layers of the sample around "
         "the axis are kept.",
         choices=get_args(Way),
     )

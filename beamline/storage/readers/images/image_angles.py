@@ -52,28 +52,49 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     """
     stems = [name.rpartition("/")[2].rpartition(".")[0] for name in names]
     numbers = [[*_NUMBER.finditer(stem)] for stem in stems]
-    worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
-    chosen = [row[0] for row in worded if len(row) == 1]
-    if not (words := any(worded)):
-        chosen = [match for stem in stems if (match := _THOUSANDTHS.search(stem))] or _with_signs(numbers)
+    chosen, words = _chosen(stems, numbers)
     if not chosen or len(chosen) != len(stems):
         return NamedAngles([*names])
     degrees, doubt = _read(chosen)
     if np.ptp(degrees) < _LEAST_SPAN or np.abs(degrees).max() > _FARTHEST:
         return NamedAngles([*names])
-    distinct = np.unique(degrees)
     others = [[each["value"] for each in row if each is not its] for row, its in zip(numbers, chosen, strict=True)]
     another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
-    if words and are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3):
-        doubt = "the number beside the word counts the images"
-    elif not words and chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not in_even_steps(distinct)):
-        doubt = doubt or "the numbers that have signs are in no even steps within a turn"
-    elif distinct.size < _DISTINCT * degrees.size:
-        doubt = doubt or f"{degrees.size} names give only {distinct.size} angles; are signs or decimals lost?"
+    doubt = _doubt_of_series(chosen, np.unique(degrees), doubt, words=words, another=another)
     if doubt:
         doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
     return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
+
+
+def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
+    """The number of each name that may be its angle, fewer than names where some have none; and whether by a word."""
+    worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
+    if any(worded):
+        return [row[0] for row in worded if len(row) == 1], True
+    return [match for stem in stems if (match := _THOUSANDTHS.search(stem))] or _with_signs(numbers), False
+
+
+def _doubt_of_series(
+    chosen: list[re.Match[str]], distinct: NDArray[np.float64], doubt: str, *, words: bool, another: bool
+) -> str:
+    """Why the numbers of a series may be no angles; "" where they are.
+
+    Args:
+        distinct: degrees, ascending.
+        doubt: of their signs and decimals.
+        words: a word stands beside them.
+        another: another number differs from name to name, and counts no images.
+    """
+    counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
+    uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not in_even_steps(distinct))
+    if words and counted:
+        return "the number beside the word counts the images"
+    if not words and uneven:
+        return doubt or "the numbers that have signs are in no even steps within a turn"
+    if distinct.size < _DISTINCT * len(chosen):
+        return doubt or f"{len(chosen)} names give only {distinct.size} angles; are signs or decimals lost?"
+    return doubt
 
 
 def _without(name: str, angle: re.Match[str]) -> str:
@@ -95,33 +116,46 @@ def _is_minus(number: re.Match[str]) -> bool:
 
 
 def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
-    """Degrees, and why they may be others; "" where they are sure.
-
-    A hyphen in some names is a sign. One in all of them separates where it stands between a word and numbers of one
-    width from 0 on, as no sign stands before 0.
-    """
+    """Degrees, and why they may be others; "" where they are sure."""
     degrees = np.array([float(re.sub("[,p_]", ".", each["value"].lower())) for each in chosen])
     before = [each.string[: each.start("mark" if each["mark"] else "value")] for each in chosen]
-    minus, wholes = np.array([*map(_is_minus, chosen)]), [each["whole"] for each in chosen]
+    minus = np.array([*map(_is_minus, chosen)])
     if minus.all():
-        mark, joined = chosen[0]["mark"].rstrip("_ ").lower(), all(text[-1:].isalnum() for text in before)
-        padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
-        if joined and (mark in "mn" or (0 in degrees and padded)):
+        if _separates(chosen, before, zero=0 in degrees):
             minus[:] = False
-        elif mark in "mn-\u2013":
+        elif (mark := _mark(chosen[0])) in "mn-\u2013":
             what = mark if mark in "mn" else "hyphen"
             return degrees, f"the {what} before the number may be a minus sign, or separate"
-    parts = [each["part"] or "" for each in chosen]
+    if doubt := _doubt_of_decimals(chosen, before):
+        return degrees, doubt
+    if len({re.sub(r"\d+", "", text) for text in before}) > 1:
+        return degrees, "names differ before the angle, as by a sign that was replaced"
+    return np.where(minus, -degrees, degrees), ""
+
+
+def _mark(number: re.Match[str]) -> str:
+    return number["mark"].rstrip("_ ").lower()
+
+
+def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
+    """Whether the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
+    stands before 0. A hyphen in some names only is a sign."""
+    wholes = [each["whole"] for each in chosen]
+    padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
+    return all(text[-1:].isalnum() for text in before) and (_mark(chosen[0]) in "mn" or (zero and padded))
+
+
+def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
+    """Why what stands beside the points of the numbers, or beside the numbers, may be no decimals, or some."""
+    parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
-        return degrees, "one side of their point or comma counts the images"
+        return "one side of their point or comma counts the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
     for beside in (following, [_PRECEDING.search(text) for text in before]):
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not in_even_steps(halves):
-            return degrees, "the number beside each counts no images; are the two a whole number and its decimals?"
-    if len({re.sub(r"\d+", "", text) for text in before}) > 1:
-        return degrees, "names differ before the angle, as by a sign that was replaced"
-    return np.where(minus, -degrees, degrees), ""
+            return "the number beside each counts no images; are the two a whole number and its decimals?"
+    return ""
 
 
 def in_even_steps(ascending: NDArray[Any]) -> bool:

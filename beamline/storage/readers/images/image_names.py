@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_angles import NamedAngles, angles_in, in_even_steps
+from beamline.storage.readers.images.image_angles import NamedAngles, angles_in
 from drivers.base.frame import FrameKind
 
 _REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
@@ -175,33 +175,31 @@ def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     for i, name in enumerate(names):
         of_template.setdefault(_template(name), []).append(i)
     for rows in of_template.values():
-        digits = [re.findall(r"\d+", names[i]) for i in rows]
-        columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
-        if not columns or len({len(each) for each in digits}) > 1:
+        column = _counting([names[i] for i in rows])
+        if column is None:
             return None
-        varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
-        counting = [n for n in varying if len(set(columns[n])) == len(rows)]
-        dates = {n for n in varying if min(columns[n]) >= _DATE}
-        if not counting or set(varying) - {*counting} - dates:
-            return None
-        closest = min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))
-        numbers[rows] = columns[closest]
+        numbers[rows] = column
     return numbers if np.unique(numbers).size == len(names) or len(of_template) > 1 else None
+
+
+def _counting(names: list[str]) -> list[int] | None:
+    """The number that counts names of one template most closely."""
+    digits = [re.findall(r"\d+", name) for name in names]
+    columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=False)]
+    if not columns or len({len(each) for each in digits}) > 1:
+        return None
+    varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
+    counting = [n for n in varying if len(set(columns[n])) == len(names)]
+    dates = {n for n in varying if min(columns[n]) >= _DATE}
+    if not counting or set(varying) - {*counting} - dates:
+        return None
+    return columns[min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))]
 
 
 def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     """The numbers of images that count frames, not dates."""
     numbers = _numbers(names)
     return None if numbers is None or np.ptp(numbers) > COUNTED * numbers.size else numbers
-
-
-def two_orders(names: Sequence[str]) -> bool:
-    """Whether names have two numbers that count the images in even steps, each in a different order."""
-    digits = [re.findall(r"\d+", name) for name in names]
-    if len({len(each) for each in digits}) != 1:
-        return False
-    columns = [np.array([int(each[-18:]) for each in column], np.int64) for column in zip(*digits, strict=True)]
-    return len({tuple(np.argsort(column)) for column in columns if in_even_steps(np.sort(column))}) > 1
 
 
 def _several_series(path: object, names: Sequence[str]) -> str:

@@ -28,8 +28,8 @@ from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.images.image_names import NamedImages, in_order
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
     SUFFIXES,
@@ -50,13 +50,6 @@ _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
-_SECOND_NUMBER = NotUsed(
-    "a second number in the names of the images",
-    "which counts them in another order than the first",
-    "images are in the order of the number that counts closest; if angles are in the order of the other, leave one of "
-    "them out of the names",
-    True,
-)
 
 
 class TiffSeriesSource(ScanSource):
@@ -77,7 +70,7 @@ class TiffSeriesSource(ScanSource):
             references, series = self._files[: images.references], self._files[images.references :]
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
-                self.used, self.not_used = stated(path, tif)
+                self.not_used = stated(path, tif)
             some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
@@ -85,8 +78,6 @@ class TiffSeriesSource(ScanSource):
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
-        if two_orders(images.plain):
-            self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
@@ -203,7 +194,6 @@ class TiffSeriesSource(ScanSource):
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
     try:
-        _refuse_more(path, _entries(path))
         return zipfile.ZipFile(path)
     except UNREADABLE as error:
         raise DataError(f"{path} cannot be read as a zip file ({hdf5.reason(error)}).") from error
@@ -212,19 +202,6 @@ def _open_zip(path: Path) -> zipfile.ZipFile:
 def _refuse_more(path: Path, n: int) -> None:
     if n > MOST_FILES:
         raise DataError(f"{path} holds more than {MOST_FILES} files: it is no scan. Give the folder of its images.")
-
-
-def _entries(path: Path) -> int:
-    """How many files a .zip says at its end that it holds (APPNOTE 4.3.14 and 4.3.16); to read its list takes long."""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 2**16 - 42))
-        tail = file.read()
-        end = tail.rfind(b"PK\5\6")
-        n = 0 if end < 0 else int.from_bytes(tail[end + 10 : end + 12], "little")
-        if n == 0xFFFF and tail[end - 20 : end - 16] == b"PK\6\7":
-            file.seek(int.from_bytes(tail[end - 12 : end - 4], "little"))
-            n = int.from_bytes(file.read(56)[32:40], "little")
-    return n
 
 
 def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:

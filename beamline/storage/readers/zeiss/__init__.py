@@ -102,7 +102,8 @@ def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
             return _source(path, file, own_angles)
 
 
-def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
+def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[Any], int]:
+    """Images, rows and columns, the type of a pixel, and how many images were planned. DataError: they cannot be."""
     info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
     lost = [name for name, value in info.items() if value is None]
     if lost:
@@ -115,8 +116,14 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
     if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
         raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
+    return (max(n, 0), rows, cols), _TYPES[kind], planned
+
+
+def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
+    shape, dtype, planned = _header(path, file)
+    n, rows, cols = shape
     _refuse(path, file)
-    stacks = [FrameStack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
+    stacks = [FrameStack(FrameKind.PROJECTION, "ImageData", _Views(file, path, shape, dtype))]
     reference = _TYPES.get(
         file.number("ReferenceData/DataType") or file.number("ReferenceData/ImageInfo/DataType") or 0
     )

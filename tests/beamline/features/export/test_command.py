@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image, ImageSequence
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
-from tests.beamline.cli.small_scan import SCAN, beamline, left
-from tests.beamline.scans import write_exchange
+from tests.beamline.cli.small_scan import beamline, left
 
 VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
 
@@ -26,17 +24,6 @@ def volume(folder: Path) -> Path:
     record = bare_record(folder / "scan.h5", VALUES, (0.5, 0.5, 0.5))
     write_volume(folder / "v.h5", replace(record, parameters={"method": "fbp"}))
     return folder
-
-
-def test_a_film_of_a_scan_shows_its_line_integrals_by_angle(folder: Path) -> None:
-    order = np.random.default_rng(5).permutation(SCAN.angles.size)
-    write_exchange(folder / "mixed.h5", replace(SCAN, angles=SCAN.angles[order]))
-    result = beamline("export", "mixed.h5", "-o", "f.gif", "--film", "views", "--window", "0:2", "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout.splitlines()[-1])["images"] == SCAN.angles.size
-    with Image.open(folder / "f.gif") as gif:
-        images = np.stack([np.asarray(image.convert("L"), float) for image in ImageSequence.Iterator(gif)])
-    assert np.abs(images / 255 * 2 - SCAN.line_integrals()).max() < 0.02
 
 
 def test_values_stay_as_they_are(volume: Path) -> None:
@@ -76,16 +63,11 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "v.png"], 2, "'.png' is not known"),
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),
-        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
+        (["-o", "g.tif", "--bits", "8"], 2, "lie in"),
         (["-o", "g.tif", "--window", "0:1"], 2, "needs --bits 8"),
         (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
         (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "not a window"),
         (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
-        (["-o", "v.gif"], 2, "--film goes with the suffixes .gif and .mp4"),
-        (["-o", "v.tif", "--film", "z"], 2, "--film goes with the suffixes .gif and .mp4"),
-        (["-o", "v.tif", "--fps", "3"], 2, "--fps is of --film"),
-        (["-o", "v.gif", "--film", "z", "--bits", "8"], 2, "its images have 8 bits"),
-        (["-o", "v.gif", "--film", "views"], 5, "is a volume, made by"),
     ],
 )
 def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[str], code: int, said: str) -> None:

@@ -12,12 +12,12 @@ import pytest
 import tifffile
 
 from beamline.features.files import validate as described
-from beamline.storage.readers import no_data, wrapped
+from beamline.storage.readers import no_data, transforms
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 
 def test_info_unpacks_no_large_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (wrapped, no_data):
+    for module in (transforms, no_data):
         monkeypatch.setattr(module, "UNPACKED", 2**22)
     image = io.BytesIO()
     tifffile.imwrite(image, np.zeros((4096, 4096), np.uint16))
@@ -36,7 +36,7 @@ def test_info_does_not_wait_for_frames_that_each_cost_the_whole_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_exchange(tmp_path / "a.h5", TwoCylinders())
-    monkeypatch.setattr(wrapped, "UNPACKED", 100)
+    monkeypatch.setattr(transforms, "UNPACKED", 100)
     (said,) = [message for message in described.describe(path)["findings"] if "too long" in message]
     assert "beamline validate" in said
     monkeypatch.undo()

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
-import sys
 from dataclasses import replace
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
 
 import h5py
 import numpy as np
@@ -158,36 +154,6 @@ def test_a_picture_that_fails_leaves_nothing(here: Path, monkeypatch: pytest.Mon
     result = beamline("segment", "can.npy", *MARGIN)
     assert result.exit_code == 5 and "No space left" in result.stderr
     assert left(here) == {"can.npy"}
-
-
-@pytest.mark.skipif(importlib.util.find_spec("napari") is not None, reason="napari is installed")
-def test_napari_that_is_not_there_is_refused_before_the_work(here: Path) -> None:
-    np.save(here / "can.npy", can())
-    result = beamline("segment", "can.npy", "--napari")
-    assert result.exit_code == 2 and "pip install" in result.stderr and left(here) == {"can.npy"}
-    assert len(result.stderr.splitlines()) == 1
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_napari_gets_the_volume_and_its_labels(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    layers: dict[str, tuple[np.ndarray, tuple[float, ...]]] = {}
-
-    class Viewer:
-        def add_image(self, data: np.ndarray, scale: tuple[float, ...], name: str) -> None:
-            layers[name] = data, scale
-
-        add_labels = add_image
-
-    napari = ModuleType("napari")
-    napari.__spec__ = ModuleSpec("napari", None)
-    napari.__dict__.update(Viewer=Viewer, run=lambda: None)
-    monkeypatch.setitem(sys.modules, "napari", napari)
-    np.save(here / "can.npy", can())
-    result = beamline("segment", "can.npy", *MARGIN, "--voxel-um", "10", "--napari")
-    assert result.exit_code == 0, result.output
-    assert layers["particles"][0].max() == len(WHOLE)
-    assert layers["volume"][0].shape == layers["particles"][0].shape
-    assert layers["volume"][1] == layers["particles"][1] == (VOXEL,) * 3
 
 
 @pytest.mark.usefixtures("undrawn")

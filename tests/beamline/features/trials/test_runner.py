@@ -25,11 +25,9 @@ from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
 from beamline.features.trials.worker import DATA, VOLUME, TrialData, dump
-from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
-from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import left
@@ -92,17 +90,6 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
     assert names == ["tradeoff_started", *["trial"] * len(rows), "done"]
     said, first = next(e.data for e in events if e.event == "trial"), table.outcomes[0].trial
     assert {name: said[name] for name in first.settings} == first.settings and said["views"] == first.views
-
-
-def test_each_trial_has_the_photons_of_its_views(tmp_path: Path, made_up: object) -> None:
-    options = _options(tmp_path, light=LightAsked(2.0))
-    table = run_tradeoff(options)
-    with options.source.open() as source:
-        counts = source.read(range(len(source.image_key))).astype(float)
-        flats, darks = (counts[source.image_key == kind].mean() for kind in (FrameKind.FLAT, FrameKind.DARK))
-    assert "in 30 views" in table.scan["light"]
-    for row, outcome in zip(_rows(tmp_path / "out"), table.outcomes, strict=True):
-        assert float(row["photons"]) == pytest.approx(2 * (flats - darks) * outcome.trial.views)
 
 
 def test_with_a_truth_no_view_is_held_out(tmp_path: Path, made_up: object) -> None:
@@ -208,7 +195,6 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
         ({"folder": Path()}, DataError, "never overwritten"),
         ({"folder": Path("no/such/folder")}, DataError, "does not exist"),
         ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"light": LightAsked(1.0, "water")}, ConfigError, "--dose-in needs"),
         ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
     ],
 )

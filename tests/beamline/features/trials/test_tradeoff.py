@@ -58,18 +58,6 @@ def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> No
     assert {"r2", "fbp"} <= {trial.method for trial in quick_trials}
 
 
-def test_a_dry_run_says_what_would_run_and_writes_nothing(folder: Path, quick_trials: list[Trial]) -> None:
-    asked = ("scan.h5", "--axis", "20.7", "--methods", "fbp,sirt", "--dry-run")
-    result = beamline("tradeoff", *asked)
-    assert result.exit_code == 0, result.output
-    said = [line.split("  ")[0] for line in result.stdout.splitlines() if line.startswith(("fbp", "sirt"))]
-    assert said[:2] == ["fbp, 27 views", "sirt, 27 views, 60 iterations"] and len(said) == 5
-    assert "scan_tradeoff: tradeoff.csv" in result.stdout and not quick_trials
-    assert left(folder) == {"scan.h5"}
-    event = json.loads(beamline("tradeoff", *asked, "--json").stdout.splitlines()[-1])
-    assert event["event"] == "done" and [trial["label"] for trial in event["trials"]] == said
-
-
 SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
 
 

@@ -21,7 +21,7 @@ from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.methods import by_name, names_of_one_volume, taking
+from recon.methods import by_name, names_of_one_volume
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
@@ -159,10 +159,7 @@ def test_iterations(data: TrialData, method: str) -> None:
 
 @pytest.mark.parametrize(
     "method",
-    [
-        *(name for name in names_of_one_volume() if not by_name(name).traits.direct and name not in taking("rays")),
-        pytest.param("intratomo", marks=pytest.mark.slow),  # fields share their steps
-    ],
+    [name for name in names_of_one_volume() if not by_name(name).traits.direct],
 )
 def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
     """On a clock that goes on by a tenth of a second whenever it is asked."""

@@ -40,7 +40,6 @@ ON_VIEWS = [TiltAndLens(0.5), TiltAndLens(0.5, LENS), Phase(**PAGANIN), Phase(**
 ON_ALL = {
     "sort": Rings("sort"),
     "vo": Rings("vo"),
-    "wavelet": Rings("wavelet"),
     "auto": Air("auto"),
     "surface": Air("surface:1"),
     "fit": Hardening("fit"),

@@ -6,14 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.features.models.command import write_mesh
 from beamline.storage.meshes import read_mesh
-from recon.features.surfaces import Mesh
-from tests.simulators.samples.voxels.test_files import sphere
 
 TEXT = {
     "a.stl": "solid a\n facet normal 0 0 1\n  outer loop\n   vertex 0 0 0\n   vertex 1 0 0\n   vertex 0 2 0\n"
@@ -46,40 +41,3 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, name: str, text: str,
     (tmp_path / name).write_text(text, "utf-8")
     with pytest.raises(DataError, match=said):
         read_mesh(tmp_path / name)
-
-
-def _indexed(triangles: np.ndarray) -> Mesh:
-    vertices, faces = np.unique(triangles.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True)
-    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32))
-
-
-@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
-def test_what_we_write_is_read(tmp_path: Path, suffix: str) -> None:
-    mesh = _indexed(sphere(60, 0.2))
-    write_mesh(tmp_path / f"ball{suffix}", mesh, "mm")
-    np.testing.assert_allclose(read_mesh(tmp_path / f"ball{suffix}"), mesh.vertices[mesh.faces], rtol=1e-7)
-    (tmp_path / f"cut{suffix}").write_bytes((tmp_path / f"ball{suffix}").read_bytes()[:-30])
-    with pytest.raises(DataError, match="as a mesh"):
-        read_mesh(tmp_path / f"cut{suffix}")
-
-
-def test_a_sphere_comes_back_from_its_scan(tmp_path: Path) -> None:
-    """Mesh, scan without noise, FBP, surface: the distance of its corners from the sphere, in voxels."""
-    radius, pixel = 0.2, 0.01
-    write_mesh(tmp_path / "ball.stl", _indexed(sphere(5000, radius)), "mm")
-    scene = (
-        "phantom: {kind: mesh, file: ball.stl, attenuation: 2.0, voxel_mm: 0.005}\nbeam: {photons_per_s: 1.0e+5}\n"
-        "detector: {shape: [56, 64], pixel_size_um: 10.0}\nscan: {views: 120, fly: false, darks: 1, flats: 1}\n"
-    )
-    (tmp_path / "scene.yaml").write_text(scene, "utf-8")
-    for words in (
-        ("simulate", "scene.yaml", "-o", "scan.h5"),
-        ("recon", "scan.h5", "-m", "fbp", "--filter", "ram-lak", "--axis", "31.5", "-o", "out.h5"),
-        ("surface", "out.h5", "-o", "found.ply"),
-    ):
-        placed = [str(tmp_path / word) if "." in word and not word[0].isdigit() else word for word in words]
-        done = CliRunner().invoke(main, placed)
-        assert done.exit_code == 0, done.output
-    found = read_mesh(tmp_path / "found.ply").reshape(-1, 3)
-    off = (np.linalg.norm(found, axis=1) - radius) / pixel
-    assert np.sqrt(np.mean(off**2)) < 0.1

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.monitor.checks import ALARM_SHIFT
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.changed import JOINED_DEG, AveragedSource
+from beamline.storage.readers.averaged import JOINED_DEG, AveragedSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import cropped
+from beamline.storage.readers.transforms import cropped
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import TwoCylinders, write_exchange

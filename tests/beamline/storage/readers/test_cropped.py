@@ -14,7 +14,7 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.wrapped import cropped
+from beamline.storage.readers.transforms import cropped
 from beamline.storage.rules.treatment import treatment_of
 from recon.prep.resample import Distortion
 from tests.beamline.array_source import ArraySource

@@ -112,8 +112,9 @@ GOLDEN = np.arange(64) * 111.246
         (EVEN, EVEN[MIXED], "error", "not in the order of the frames"),
         (EVEN, np.r_[EVEN[:54], np.zeros(10)], "error", "not in the order of the frames"),
         (EVEN, np.where(np.arange(64) == 40, 0, EVEN), "warning", "not between those of their neighbours: frames 48"),
+        (EVEN[PASSES], EVEN, "warning", "look more alike than neighbours"),
     ],
-    ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong"],
+    ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
 )
 def test_angles_in_another_order_than_the_frames_are_told(
     balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], severity: str, says: str

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 import recon
 from recon.features.rings import (
     REMOVERS,
-    _analysed,
-    _synthesised,
     by_vo,
     remove_rings_in_place,
     rings_seen,
@@ -91,14 +89,6 @@ def test_a_wide_stripe_is_shifted_and_the_rest_untouched(clean: F32) -> None:
     assert ((mended == clean + stripe).all(axis=0)).mean() > 0.8
 
 
-def test_the_wavelets_are_orthogonal() -> None:
-    values = np.random.default_rng(0).normal(size=(32, 48))
-    for axis in (0, 1):
-        low, high = _analysed(values, axis)
-        assert (low**2).sum() + (high**2).sum() == pytest.approx((values**2).sum())  # orthogonal
-        np.testing.assert_allclose(_synthesised(low, high, axis), values, atol=1e-10)
-
-
 def test_auto_removes_detected_stripes_and_reports_it(clean: F32, gains: F32) -> None:
     shuffled = np.random.default_rng(7).permutation(len(ANGLES))  # views in any order
     for views, said in ((clean, "no stripes seen"), (clean + gains, "removed by")):
@@ -164,7 +154,7 @@ def test_auto_mends_dead_columns_and_sorts_nothing_where_there_are_no_other_stri
 def test_tooth_loses_its_rings_and_keeps_its_crack(shared_data: Path) -> None:
     views, geometry = tooth_views(shared_data)
     scores, cracks = {}, {}
-    for way in ("none", "sort", "vo", "wavelet"):
+    for way in ("none", "sort", "vo"):
         clean = views.copy()
         remove_rings_in_place(clean, geometry.angles, way)
         image = recon.reconstruct(clean, geometry, recon.Fbp("shepp-logan")).volume.data[0]
@@ -174,7 +164,7 @@ def test_tooth_loses_its_rings_and_keeps_its_crack(shared_data: Path) -> None:
         across = image[290:316, 375:416:10]
         cracks[way] = float((np.median(across, axis=0) - across[7:20].min(axis=0)).mean())
     assert "--rings auto" in rings_seen(views, geometry.angles, geometry.axis_col)
-    assert all(scores[way] < 0.45 * scores["none"] for way in ("sort", "vo", "wavelet")), scores
+    assert all(scores[way] < 0.45 * scores["none"] for way in ("sort", "vo")), scores
     assert all(cracks[way] > 0.9 * cracks["none"] for way in cracks), cracks
 
 

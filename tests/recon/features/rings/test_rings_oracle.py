@@ -38,10 +38,6 @@ def _oracle(width: int) -> Mapping[str, tuple[Callable[[F32], F32], ...]]:
             theirs.remove_all_stripe,
             lambda s: theirs.remove_all_stripe(s, 3.0, 2 * width + 1, width),
         ),
-        "wavelet": (
-            theirs.remove_stripe_based_wavelet_fft,
-            lambda s: theirs.remove_stripe_based_wavelet_fft(s, 2, 1, "db5"),
-        ),
     }
 
 

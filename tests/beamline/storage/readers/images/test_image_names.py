@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.images.image_angles import angles_in
 from beamline.storage.readers.images.image_names import kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.supplied import load_images
+from beamline.storage.readers.replacements import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12
@@ -114,16 +114,6 @@ def test_two_numbers_that_do_not_go_along_are_several_series(tmp_path: Path, pat
     _written(tmp_path, [pattern.format(tile=i // 6, i=i, of_tile=i % 6) for i in range(VIEWS)])
     with pytest.raises(DataError, match=r"several series.*--frames darks=0:5"):
         open_scan(tmp_path)
-
-
-@pytest.mark.parametrize("other", ["{at:04d}", "{at}", "{tenths:05d}"])
-@pytest.mark.parametrize("first", [True, False])
-def test_two_numbers_that_count_in_two_orders_are_told(tmp_path: Path, other: str, first: bool) -> None:
-    pattern = f"a_{other}_{{i:04d}}.tif" if first else f"a_{{i:04d}}_{other}.tif"
-    passes = [at for start in range(3) for at in range(start, VIEWS, 3)]
-    _written(tmp_path, [pattern.format(i=i, at=at, tenths=50 * at) for i, at in enumerate(passes)])
-    with open_scan(tmp_path) as source:
-        assert [field.where for field in source.not_used] == ["a second number in the names of the images"]
 
 
 @pytest.mark.parametrize("pattern", ["a_{i:04d}_{along:04d}.tif", "a_{i:04d}_{away}.tif", "a_{i:04d}_{other}.tif"])

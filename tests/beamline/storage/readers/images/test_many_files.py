@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -39,17 +38,6 @@ def test_a_page_of_another_shape_among_many_is_named(tmp_path: Path, odd: int) -
     with pytest.raises(DataError, match=r"\(5, 6\)"), open_scan(_pages(tmp_path / "a.tif", 9, odd)) as source:
         assert source.image_key.size == 9
         source.read(slice(None))
-
-
-@pytest.mark.parametrize("n", [6, 70_000])  # the latter are counted in another place
-def test_an_archive_of_more_files_than_any_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int) -> None:
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        for i in range(n):
-            archive.writestr(f"{i}.tif", b"")
-    assert tiff_series._entries(tmp_path / "a.zip") == n
-    monkeypatch.setattr(tiff_series, "MOST_FILES", 5)
-    with pytest.raises(DataError, match="holds more than 5 files"):
-        open_scan(tmp_path / "a.zip")
 
 
 def test_a_folder_of_more_files_than_any_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,142 @@
+"""Scans whose views are means of several frames."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import ConfigError
+from beamline.storage.hdf5 import UnreadableError
+from beamline.storage.readers.base import Attributes, ScanSource, frame_indices, read_known
+from beamline.storage.readers.frames import BY_FRAME, Frames, Read
+from drivers.base.frame import FrameKind
+
+JOINED_DEG = "frames_per_view_joined_deg"
+"""Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
+_EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds
+
+
+class AveragedSource(Frames):
+    """A ScanSource whose projections are means of those of `base`; darks and flats are unchanged, invalid frames are
+    omitted.
+
+    A view is up to `n` projections that follow one another, closer in angle than the last frames of a view and the
+    first of the next. So a view that lacks frames takes none of its neighbour's. Of a growing file a view is there once
+    a frame of the next one is, or its n-th.
+
+    The mean is that of the frames without an alarm, or of all where each has one. Whole numbers are summed as such,
+    real ones in float64; their mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be
+    read have no part in it.
+    """
+
+    def __init__(self, base: ScanSource, n: int) -> None:
+        """Raises ConfigError where no view would have more than one frame."""
+        self._base, self._n, self._groups = base, n, list[list[int]]()
+        super().__init__(
+            base,
+            pixels=self._mean,
+            dtype=np.dtype(np.float32),
+            numbers=None,
+            frames_per_view=n,
+            frame_bytes=lambda each: each * n,
+            image_key=self._kinds,
+            **dict.fromkeys(("exposures", "triggers", "framestamps"), lambda known: known[self._first()]),
+            **dict.fromkeys(("angles", *BY_FRAME), self._means),
+            attributes=self._and_joined,
+            flags=lambda flags: None if flags is None else flags.of_groups(self._used),
+            part_starts=lambda starts: np.unique(np.searchsorted(self._first(), starts)),
+            damaged=lambda rows: frozenset(i for i, group in enumerate(self._used) if rows.issuperset(group)),
+            replaces=lambda rows: None,  # such frames are gone
+            altered=frozenset(),
+        )
+        if base.plan.get("frames_per_view") == n and "angles_deg" in base.plan:
+            self.plan = {**base.plan, "angles_deg": base.plan["angles_deg"][::n]}
+        if base.finished and not any(len(group) > 1 for group in self._groups):
+            views = int((base.image_key == FrameKind.PROJECTION).sum())
+            raise ConfigError(
+                f"--frames-per-view {n}: no two of the {views} projections of {base.path} that follow one another are "
+                "closer in angle than views are. Leave it out. Nothing was read."
+            )
+
+    def _update(self) -> None:
+        keys, flags = self._base.image_key, self._base.flags
+        self._groups += self._since(self._apart(), self._groups[-1][-1] + 1 if self._groups else 0)
+        usable = ([row for row in group if keys[row] != FrameKind.INVALID] for group in self._groups)
+        self._usable = [rows or group for rows, group in zip(usable, self._groups, strict=True)]
+        alarmed = np.zeros(keys.size, np.bool_) if flags is None else flags.alarmed
+        self._used = [[row for row in rows if not alarmed[row]] or rows for rows in self._usable]
+        super()._update()
+
+    def _first(self) -> NDArray[np.int64]:
+        """The first row of base of each view."""
+        return np.array([group[0] for group in self._groups], np.int64)
+
+    def _apart(self) -> float:
+        """Radians from a view's first frame from which on a frame is of another view."""
+        views = self._base.image_key == FrameKind.PROJECTION
+        planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
+        angles = planned if planned.size > self._n else self._base.angles[views]
+        steps = np.abs(angles[self._n :] - angles[: -self._n])
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        return float(np.median(steps)) * (1 - 0.5 / self._n) if steps.size else np.inf
+
+    def _since(self, apart: float, first: int) -> list[list[int]]:
+        """The rows of base from `first` on, by view; without those of a view that may still get frames."""
+        keys, angles, groups = self._base.image_key, self._base.angles, list[list[int]]()
+        view, may_grow = list[int](), False
+        for row in (first + np.flatnonzero(keys[first:] != FrameKind.INVALID)).tolist():
+            near = may_grow and keys[row] == FrameKind.PROJECTION and not abs(angles[row] - angles[view[0]]) >= apart
+            if not near:
+                groups.append(view := [])
+            view.append(row)
+            may_grow = bool(keys[row] == FrameKind.PROJECTION) and len(view) < self._n
+        return groups[:-1] if may_grow and not self._base.finished else groups
+
+    def _kinds(self, keys: NDArray[np.int32]) -> NDArray[np.int32]:
+        return keys[[rows[0] for rows in self._usable]]
+
+    def _means(self, known: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        """Values [row] of this scan: means over the frames averaged into each row."""
+        if known is None:
+            return None
+        return np.array([known[rows].mean(axis=0) for rows in self._used]).reshape(-1, *known.shape[1:])
+
+    def _and_joined(self, known: Attributes) -> Attributes:
+        """The scan's attributes, with how many frames were left out, and the largest angle between two of a view."""
+        angles, out = self._base.angles, sum(map(len, self._usable)) - sum(map(len, self._used))
+        joined = float(np.degrees(max((np.ptp(angles[rows]) for rows in self._groups if len(rows) > 1), default=0.0)))
+        facts = {"frames_per_view": self._n, "frames_left_out_by_alarms": out, JOINED_DEG: joined}
+        return {**known, **{name: value for name, value in facts.items() if value}}
+
+    def _mean(self, read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
+        base = self._base
+        wanted = [self._used[i] for i in frame_indices(frames, len(self._used)).tolist()]
+        shape = len(wanted), len(range(self.shape[0])[rows]), self.shape[1]
+        whole = base.dtype.kind == "u" and base.dtype.itemsize <= _EXACT
+        total, counted = np.zeros(shape, np.uint32 if whole else np.float64), np.zeros(len(wanted))
+        for turn in range(max(map(len, wanted), default=0)):
+            views = [i for i, group in enumerate(wanted) if turn < len(group)]
+            images = read_known(base, [wanted[i][turn] for i in views], rows)
+            bad = base.damaged | base.unreadable.keys()
+            for i, image in zip(views, images, strict=True):
+                if wanted[i][turn] not in bad or bad.issuperset(wanted[i]):  # the last one where all are
+                    np.add(total[i], image, out=total[i], casting="unsafe")
+                    counted[i] += 1
+        for group in wanted:
+            if group and base.unreadable.keys() >= set(group):
+                raise UnreadableError(base.unreadable[group[0]])
+        return (total / np.maximum(counted, 1)[:, None, None]).astype(np.float32)
+
+
+def stated_frames_per_view(source: ScanSource) -> int:
+    """Frames per view by the plan in the file; 1 if it has no plan."""
+    stated = source.plan.get("frames_per_view", 1)
+    return stated if isinstance(stated, int) and stated > 1 else 1
+
+
+def angles_of_frames(angles: NDArray[np.float64], source: ScanSource, n: int) -> NDArray[np.float64]:
+    """Angles [frame]: if one is given for each view, it applies to the view's n frames."""
+    views = int((source.image_key == FrameKind.PROJECTION).sum())
+    return np.repeat(angles, n) if angles.size * n == views else angles

@@ -1,0 +1,316 @@
+"""Fields of foreign files that bear on geometry, units, order and validity, and what we do with each.
+
+`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `stated_in` for those that a file states
+and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import printable
+from beamline.storage import datasets
+from beamline.storage.readers.base import NotUsed, ScanSource
+from drivers.base.frame import FrameKind
+
+Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
+"""Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
+
+EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
+EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
+EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
+_HALF_PIXEL = 0.5  # what moves by less is not seen
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A field of a file format.
+
+    Attributes:
+        where: its path below the entry, or below the root of Data Exchange; "detector/" is the detector that is read.
+        use: what we do with it, or, if `used` is False, why its value changes nothing or what to do about it.
+        used: it is read.
+        units: of a number that is used: those that are known.
+        matters: of one that is not used: whether its value may change the volume; None: it cannot.
+    """
+
+    where: str
+    use: str
+    used: bool = True
+    matters: Matters | None = None
+    units: Mapping[str, float] | None = None
+
+
+def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
+    """The fields stated in a file but ignored; a value that may change the volume is a doubt.
+
+    Numbers that would be used, were their unit known, are among them.
+    """
+    views = int((source.image_key == FrameKind.PROJECTION).sum())
+    unused = list[NotUsed]()
+    for field in fields:
+        item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
+        if item is None or item.size == 0:
+            continue
+        if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
+            unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
+            continue
+        value, why, doubt = np.asarray(datasets.values_of(item)), field.use, True
+        if not field.used:
+            doubt = field.matters is not None and field.matters(value, item, source)
+        elif value.size not in (1, source.image_key.size, views):
+            why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
+        else:
+            why = _unit_problem(field, value, item, source)
+        if why:
+            unused.append(NotUsed(field.where, _text(value, datasets.attribute(item, "units")), why, doubt))
+    return tuple(unused)
+
+
+def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> str:
+    """Why a number that would be used is not; "" where its unit is known, or nothing is stated."""
+    stated = datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source)
+    if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
+        return ""
+    if value.dtype.kind not in "uifb":
+        return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
+    unit = datasets.attribute(item, "units")
+    return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+
+
+def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
+    if where.startswith("detector/"):
+        where = f"{detector}/{where.removeprefix('detector/')}"
+    return datasets.dataset(root, where)
+
+
+def _text(value: NDArray[Any], units: str) -> str:
+    if value.size == 1:
+        first = value.reshape(-1)[0]
+        text = f"{first:.6g}" if value.dtype.kind == "f" else datasets.text(first)
+    elif value.dtype.kind in "uif" and value.size and value.ndim == 1:
+        text = f"{np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if np.isfinite(value).any() else "nan"
+    else:
+        text = " x ".join(map(str, value.shape)) + " values"
+    return printable(f"{text} {units}".strip())
+
+
+def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    return value.dtype.kind in "uifb" and bool(np.nan_to_num(value.astype(np.float64)).any())
+
+
+def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
+    factor = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
+    if value.dtype.kind not in "uif" or value.size != source.image_key.size:
+        return False
+    places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)
+    span = float(np.ptp(places)) if places.size and np.isfinite(places).all() else 0.0
+    if factor is None or source.pixel_size_mm is None:
+        return span > 0
+    return span * factor > _HALF_PIXEL * source.pixel_size_mm
+
+
+def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    return value.dtype.kind in "uif" and value.size > 0 and float(np.ptp(value.astype(np.float64))) > _HALF_PIXEL
+
+
+def _off_middle(along: int) -> Matters:
+    def matters(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+        """A central ray of a cone more than a twentieth of the detector beside its middle."""
+        if (
+            source.cone is None
+            or value.size != 1
+            or datasets.attribute(item, "units").lower() not in ("", "pixel", "px")
+        ):
+            return False
+        n = source.shape[along]
+        return abs(float(value.reshape(-1)[0]) - (n - 1) / 2) > 0.05 * n
+
+    return matters
+
+
+def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    """More than 1 % from 1: an optical magnification that nothing in the file's pixel sizes tells apart."""
+    return value.dtype.kind in "uif" and value.size == 1 and abs(float(value.reshape(-1)[0]) - 1) > 0.01
+
+
+_POSES = "give the shifts of views with --poses"
+_POINTS = "NeXus does not say where it points on the detector; a CSV of shifts for --poses does"
+UPRIGHT = "the detector is taken to stand upright to the beam"
+_ENERGY = "energy, where the beams above state none"
+_WAVELENGTH = "energy, where no beam states one"
+_DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
+
+NXTOMO: tuple[Entry, ...] = (
+    Entry("definition", "tells the kind of the file; the structure decides, not the name"),
+    Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
+    Entry("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
+    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
+    Entry("detector/count_time", "exposure of each frame", units=datasets.TIME_UNITS),
+    Entry(
+        "detector/x_pixel_size",
+        "width of a pixel: at the sample for a parallel beam, on the detector for a cone",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "detector/y_pixel_size",
+        "height of a pixel; slices of a parallel beam are as far apart, others are refused",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "sample/x_pixel_size",
+        "width of a pixel at the sample; goes before the detector's",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "sample/y_pixel_size",
+        "height of a pixel at the sample; goes before the detector's",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "detector/distance",
+        "from the sample to the detector: phase, and the magnification of a cone",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry(
+        "instrument/source/distance",
+        "from the source to the sample, of either sign, also of an NXsource of another name: a cone beam, unless it "
+        "magnifies by less than 1 % and a ray leaves its parallel by less than half a pixel in the whole field",
+        units=datasets.LENGTH_UNITS,
+    ),
+    Entry("detector/x_flipped", "frames are mirrored left to right as they are read"),
+    Entry("detector/y_flipped", "frames are mirrored upside down as they are read"),
+    Entry(
+        "detector/transformations",
+        "half turns about the axes, by the direction of `gravity`, mirror the frames; other turns are named",
+    ),
+    Entry("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
+    Entry("sample/name", "name in reports"),
+    Entry("title", "name in reports"),
+    Entry("start_time", "shown"),
+    Entry("end_time", "shown"),
+    Entry("instrument/name", "shown"),
+    Entry("control/data", "ring current of each frame, or another monitor of the beam: --ring-current use"),
+    Entry("instrument/beam/incident_energy", "energy", units=datasets.ENERGY_UNITS),
+    Entry("beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
+    Entry("sample/beam/incident_energy", _ENERGY, units=datasets.ENERGY_UNITS),
+    Entry("instrument/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("sample/beam/incident_wavelength", _WAVELENGTH, units=datasets.WAVELENGTH_UNITS),
+    Entry("instrument/monochromator/energy", "energy, where the beam states none", units=datasets.ENERGY_UNITS),
+    Entry(
+        "instrument/monochromator/wavelength",
+        "energy, where nothing else states it",
+        units=datasets.WAVELENGTH_UNITS,
+    ),
+    Entry(
+        "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
+    ),
+    Entry("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
+    Entry("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
+    Entry("detector/field_of_view", "the views show whether the field is half", False),
+    Entry("detector/half_acquisition", "the views show whether the field is half", False),
+    Entry("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
+    Entry("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
+    Entry("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Entry("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Entry("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
+    Entry("detector/polar_angle", UPRIGHT, False, _true),
+    Entry("detector/azimuthal_angle", UPRIGHT, False, _true),
+    Entry("detector/x_translation", _POINTS, False, _moves),
+    Entry("detector/y_translation", _POINTS, False, _moves),
+    Entry("sample/x_translation", _POINTS, False, _moves),
+    Entry("sample/y_translation", _POINTS, False, _moves),
+    Entry("sample/z_translation", _POINTS, False, _moves),
+    Entry("sample/distance", "the sample is taken to be at the rotation axis", False),
+    Entry("sample/propagation_distance", "follows from the distances of source and detector", False),
+    Entry("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
+    Entry("detector/flatfield_applied", _DONE, False, _true),
+    Entry("detector/pixel_mask_applied", "defective pixels are searched", False),
+    Entry("detector/pixel_mask", "pixels of whole numbers that are not 0 in it are filled; others are searched"),
+    Entry("detector/flatfield", "flats are the frames whose image_key is 1", False),
+    Entry("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
+    Entry("detector/countrate_correction_applied", "frames are taken as they are", False),
+    Entry("detector/saturation_value", "saturation is judged by the frames", False),
+    Entry("detector/underload_value", "frames are taken as they are", False),
+    Entry("detector/bit_depth_readout", "saturation is judged by the frames", False),
+    Entry("detector/sequence_number", "frames are taken in the order of the file", False),
+    Entry("detector/frame_start_number", "frames are taken in the order of the file", False),
+    Entry("detector/real_x_pixel_size", "x_pixel_size is used", False),
+    Entry("detector/real_y_pixel_size", "y_pixel_size is used", False),
+)
+
+EXCHANGE: tuple[Entry, ...] = (
+    Entry("implements", "shown"),
+    Entry("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
+    Entry("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
+    Entry("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
+    Entry("exchange/theta", "angle of each projection, by its `units`; degrees without them"),
+    Entry("exchange/title", "name in reports"),
+    Entry("measurement/sample/name", "name in reports"),
+    Entry(
+        "measurement/instrument/monochromator/energy",
+        "energy by its `units`; without them joule, as the format says",
+        units=EXCHANGE_ENERGY_UNITS,
+    ),
+    Entry(
+        "measurement/instrument/detector/x_pixel_size",
+        "width of a pixel by its `units`; without them metre, as the format says. It is on the detector: times "
+        "x_binning, over objective/magnification",
+        units=EXCHANGE_LENGTH_UNITS,
+    ),
+    Entry(
+        "measurement/instrument/detector/y_pixel_size",
+        "height of a pixel, as x_pixel_size",
+        units=EXCHANGE_LENGTH_UNITS,
+    ),
+    Entry("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
+    Entry("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
+    Entry("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
+    Entry("exchange/theta_white", "where flats stand among the views, which then have the flats around them"),
+    Entry("exchange/theta_dark", "where darks stand among the views"),
+    Entry("exchange/data_shift_x", _POSES, False, _shifts),
+    Entry("exchange/data_shift_y", _POSES, False, _shifts),
+    Entry("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
+    Entry("exchange/y", "pixels are taken to be evenly spaced; y_pixel_size is used", False),
+    Entry("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
+    Entry("measurement/instrument/source/current", "one value for the whole scan", False),
+    Entry(
+        "measurement/instrument/detector/exposure_time",
+        "exposure of darks, flats and views, or of each view; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
+    ),
+    Entry(
+        "process/acquisition/flat_fields/flat_exposure_time",
+        "exposure of flats, where different_flat_exposure says that it is another; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
+    ),
+    Entry("process/acquisition/flat_fields/flat_field_mode", "Both: flats were taken before and after the views"),
+    Entry("process/acquisition/flat_fields/num_flat_fields", "how many each time; of Both, half of data_white"),
+    Entry("process/acquisition/flat_fields/different_flat_exposure", "Different: flats have flat_exposure_time"),
+    Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
+    Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
+    Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
+    Entry("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
+    Entry("measurement/sample/geometry/translation/distances", _POSES, False),
+    Entry(
+        "measurement/sample/geometry/orientation/value", "the rotation axis is taken to stand along the columns", False
+    ),
+    Entry(
+        "measurement/instrument/interferometer/number_of_grid_steps", "phase steps are not combined", False, _disagrees
+    ),
+    Entry(
+        "measurement/instrument/detection_system/objective/resolution",
+        "not in the format; give it as --pixel-size-um",
+        False,
+    ),
+    Entry("process/acquisition/rotation/start", "theta is used", False),
+    Entry("process/acquisition/rotation/step", "theta is used", False),
+)

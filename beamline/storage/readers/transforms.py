@@ -1,0 +1,267 @@
+"""Scans that are read otherwise than they are stored: some columns, other kinds or types, or the frames of several."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.readers.base import WHOLE, ScanSource, TakesTooLongError, frame_indices
+from beamline.storage.readers.frames import Frames, Read
+from drivers.base.frame import FrameKind
+
+UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+
+
+def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
+    """The scan for callers that only describe it: TakesTooLongError where `over` returns True before a read, or a read
+    would take long or much memory. The order of dimensions or the chunks of a file can make any frame cost all of it.
+    """
+
+    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
+        n = frame_indices(frames, int(base.image_key.size)).size * len(range(base.shape[0])[rows])
+        if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
+            raise TakesTooLongError(
+                "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
+                "validate` looks at them."
+            )
+        return read(frames, rows)
+
+    return Frames(base, pixels=pixels)
+
+
+def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
+    """Columns `cols` of a scan, the last not included; column numbers, such as the axis and regions of flags, count
+    from the first of them.
+
+    Raises:
+        ConfigError: they do not lie in the detector.
+    """
+    first, end = cols
+    if not 0 <= first < end <= base.shape[1]:
+        raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
+
+    def moved(flags: FrameFlags | None) -> FrameFlags | None:
+        if flags is None or flags.regions is None:
+            return flags
+        there = flags.regions[..., :1] >= 0  # below 0: no region
+        return replace(flags, regions=flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32))
+
+    return Frames(
+        base,
+        pixels=lambda read, frames, rows: read(frames, rows)[..., first:end],
+        cols=cols,
+        shape=(base.shape[0], end - first),
+        axis_col=None if base.axis_col is None else base.axis_col - first,
+        flags=moved,
+    )
+
+
+def turned(base: ScanSource) -> ScanSource:
+    """A scan with its frames rotated by a quarter turn: a horizontal rotation axis becomes vertical.
+
+    What was the last column is the first row. Any rows take reading whole frames.
+
+    Raises:
+        DataError: a scan with flags, which has a vertical axis.
+    """
+    if base.flags is not None:
+        raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
+    sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
+    return Frames(
+        base,
+        pixels=lambda read, frames, rows: np.ascontiguousarray(np.rot90(read(frames), axes=(1, 2))[:, rows]),
+        shape=base.shape[::-1],
+        axis_col=None,
+        pixel_size_mm=sizes[0],
+        row_pitch_mm=sizes[1],
+        shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],
+    )
+
+
+def keyed(base: ScanSource, kinds: str) -> ScanSource:
+    """A scan whose kinds of frames are assigned by the caller, or which has only the frames of one energy.
+
+    Args:
+        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without views
+            all other frames are projections, else invalid. "energy=20" makes frames of other energies invalid, by the
+            file.
+
+    Raises:
+        DataError: they are no such text, lie outside the scan, or the file states no such energy.
+    """
+    words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
+    named = [word for word in words if not word.startswith(_ENERGY)]
+    keys = _stated_keys(",".join(named), int(base.image_key.size)) if named else base.image_key.copy()
+    for word in words:
+        if word.startswith(_ENERGY):
+            own["energy_kev"], others = _of_one_energy(base, word)
+            keys[others] = FrameKind.INVALID
+    if base.quantity == "unknown" and base.dtype.kind in "ui" and {*keys.tolist()} >= {1, 2}:
+        own["quantity"] = "counts"
+    return Frames(base, image_key=keys, **own)
+
+
+def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
+    """The kinds and the views that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
+    words = [] if frames is None else frames.split(",")
+    matches = [_VIEWS.fullmatch(word) for word in words]
+    taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]
+    if len(taken) != 1:
+        return frames, None
+    return ",".join(word for word, match in zip(words, matches, strict=True) if not match) or None, taken[0]
+
+
+def selected(base: ScanSource, views: slice) -> ScanSource:
+    """Some views of a scan, counted from 0 without darks and flats; the others are invalid frames.
+
+    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the views were, so that
+    those of the same turn are selected, counted from 0, too. Else all of them are.
+
+    Raises:
+        DataError: no view is left.
+    """
+    keys, n = base.image_key.copy(), int((base.image_key == FrameKind.PROJECTION).sum())
+    first, end, step = views.indices(n)
+    if first >= end:
+        raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
+    for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
+        rows = np.flatnonzero(keys == kind)
+        in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
+        keys[np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn)] = FrameKind.INVALID
+    return Frames(base, image_key=keys)
+
+
+def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
+    """The kind of each of n frames by what the caller says."""
+    stated, named = np.full(n, -1), _ranges(kinds, n)
+    for kind, first, end in named:
+        if (stated[first:end] >= 0).any():
+            raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
+        stated[first:end] = kind
+    others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
+    return np.where(stated < 0, others, stated).astype(np.int32)
+
+
+def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:
+    """keV of "energy=20", and the frames of other energies."""
+    try:
+        kev = float(word.removeprefix(_ENERGY))
+    except ValueError:
+        raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
+    known = source.energies
+    if known is None:
+        raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
+    others = np.abs(known - kev) > _SAME_ENERGY * kev
+    if not (np.isfinite(known) & ~others).any():
+        raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
+    return kev, others
+
+
+def in_words(energies: NDArray[np.float64]) -> str:
+    """How many frames have which energy, such as "45 at 20 keV and 45 at 30 keV"."""
+    parts = of_energies(energies)
+    listed = [f"{n} at {kev:.6g} keV" for kev, n in parts[:_LISTED]]
+    listed += [f"and more up to {parts[-1][0]:.6g} keV"] if len(parts) > _LISTED else []
+    return ", ".join(listed)
+
+
+def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
+    """(keV, number of frames) of each energy; energies within a part in ten thousand are the same."""
+    known = np.sort(energies[np.isfinite(energies)])
+    parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)
+    return [(float(np.median(part)), int(part.size)) for part in parts if part.size]
+
+
+_ENERGY = "energy="
+_SAME_ENERGY = 1e-4  # as a monochromator repeats one
+_LISTED = 6  # energies in a sentence
+_VIEWS = re.compile(r"\s*(-?\d{1,9})?:(-?\d{1,9})?(?::([1-9]\d{0,8})?)?\s*")  # a slice of Python
+_KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
+
+
+def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
+    """Kind and rows [first, end) of each range in `kinds`; DataError for what is none."""
+    ranges = []
+    for word in kinds.split(","):
+        name, _, places = word.strip().partition("=")
+        for place in places.split("+"):
+            match = re.fullmatch(r"\s*(\d{1,9})?:(\d{1,9})?\s*", place)
+            first, end = (int(match[1] or 0), int(match[2] or n)) if match else (0, 0)
+            if name not in _KINDS or not first < end <= n:
+                raise DataError(
+                    f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
+                    "such as darks=0:5,flats=5:10+95:100, frames counted from 0 in the order of the scan, or 0::2 for "
+                    "every second view."
+                )
+            ranges.append((_KINDS[name], first, end))
+    return ranges
+
+
+def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
+    """A scan of unsigned counts that `base` stores as a signed type, so that large counts appear negative."""
+    fact = f"int{8 * dtype.itemsize} that wrapped, read as {dtype}"
+    return Frames(
+        base,
+        pixels=lambda read, frames, rows: unsigned(read(frames, rows), dtype),
+        dtype=dtype,
+        attributes=lambda known: {**known, "pixels": fact},
+    )
+
+
+def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The same bits as unsigned counts."""
+    if images.dtype.itemsize == dtype.itemsize:
+        return images.view(dtype)
+    return (images & np.iinfo(dtype).max).astype(dtype)
+
+
+def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
+    """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
+    signed.
+
+    Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
+    without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
+    noise around 0, or marks pixels without data by one value, has not wrapped. Four bytes may hold those of two, where
+    a file has views as int16 beside flats as uint16.
+    """
+    if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
+        return None
+    negative = images[images < 0]
+    if negative.size == 0 or negative.min() == negative.max():
+        return None
+    size = images.dtype.itemsize
+    if size == 4 and images.min() >= -(2**15) and images.max() < 2**16:
+        size = 2
+    dtype = np.dtype(f"{images.dtype.byteorder}u{size}")
+    counts = unsigned(images, dtype)
+    signed, plain = (np.abs(np.diff(some.astype(np.int64), axis=-1)).sum() for some in (images, counts))
+    return dtype if plain < signed or (plain == signed and np.median(images) < 0) else None
+
+
+def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> ScanSource:
+    """The frames of `earlier`, which are complete, and then of `last`, whose path and metadata the scan has.
+
+    Args:
+        path: of the scan, where somebody said that the files are one, taken without a pause; None: they are parts,
+            between which beam and camera may have changed.
+
+    Raises:
+        DataError: frames are of another shape or type.
+    """
+    for source in earlier:
+        if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
+            raise DataError(
+                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, {last.path} "
+                f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
+            )
+    in_order = all(source.in_order for source in (*earlier, last))
+    own: dict[str, Any] = {} if path is None else {"path": path, "part_starts": np.zeros(1, np.int64)}
+    return Frames(*earlier, last, in_order=in_order, **own)

@@ -1,0 +1,208 @@
+"""Measured: energies with absorption or radiographs, of a text table, an HDF5 file or a series of scans."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import text_in
+from beamline.scan.energies import scans_of
+from beamline.storage.hdf5 import open_hdf5, readable
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import open_scan
+from drivers.base.frame import FrameKind
+from splatline_spectral.contrast import ContrastRegions, Reals, Series, XafsCurve, line_integrals
+
+PixelBox = tuple[int, int, int, int]
+FramePart = tuple[slice, slice]
+Read = Callable[[int, FramePart], Reals]  # line integrals [row, col] of an energy, of a part of the frame
+
+_MOST_VIEWS = 32  # evenly spread: more say little more of a region, and take long to read
+_EV_BEYOND, _KEV_BELOW = 500.0, 0.05
+"""keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
+_KEV = {"keV": 1.0, "eV": 1e-3}
+
+
+@contextmanager
+def open_measured(
+    path: Path, span: tuple[float, float], region: PixelBox | None, around: PixelBox | None, unit: str | None
+) -> Iterator[Series | XafsCurve]:
+    """The curve or the radiographs of a file or of a series of scans, which is open within the context.
+
+    Args:
+        path: a text table of energy and absorption; HDF5 with `energy` [n] and `mu` [n], or `frames` [n, row, col] with
+            `flats` ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]); or the folder of a
+            series of scans.
+        span: keV, the first and the last energy.
+        region, around: (first row, row after the last, first column, column after the last) of the material, and of its
+            surroundings, from which the material is excluded. None: the whole frame, and no surroundings.
+        unit: of the energies, "keV" or "eV"; None: as in the file, else keV.
+
+    Raises:
+        ConfigError: a region is not in the frame, or has no surroundings.
+        DataError: not such a file, or an energy occurs twice.
+    """
+    if path.is_file() and not h5py.is_hdf5(path):
+        table = read_table(path)
+        yield _sorted_curve(path, _in_kev(path, table[:, 0], unit), table[:, 1], span)
+        return
+    if path.is_dir():
+        energies, shape, read = _of_scans(scans_of((path,), lambda message: None))
+        yield _series(path, _order(path, energies, span), energies, _regions(path, shape, region, around), read)
+        return
+    with open_hdf5(path) as file, readable(path):
+        if "energy" not in file or not {"mu", "frames"} & {*file}:
+            raise DataError(f"{path} needs datasets energy, and mu or frames (with flats). Nothing was written.")
+        stated = {"ev": "eV", "kev": "keV"}.get(str(file["energy"].attrs.get("units", "")).lower())
+        energies = _in_kev(path, np.ravel(file["energy"][()]), unit or stated)
+        if "mu" in file:
+            yield _sorted_curve(path, energies, np.ravel(file["mu"][()]), span)
+            return
+        frames = file["frames"]
+        flats = file.get("flats")
+        if frames.ndim != 3 or len(frames) != energies.size:
+            raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
+        if flats is None or flats.shape not in (frames.shape, frames.shape[1:]):
+            raise DataError(f"{path}: frames need flats of {frames.shape} or {frames.shape[1:]}. Nothing was written.")
+
+        def read(n: int, part: FramePart) -> Reals:
+            darks = file.get("darks")
+            dark = np.zeros(1) if darks is None else np.atleast_3d(darks[(..., *part)].T).mean(-1).T
+            flat = counts_in(flats[part] if flats.ndim == 2 else flats[(n, *part)])
+            return line_integrals(counts_in(frames[(n, *part)]) - dark, flat - dark)
+
+        regions = _regions(path, frames.shape[1:], region, around)
+        yield _series(path, _order(path, energies, span), energies, regions, read)
+
+
+def read_table(path: Path) -> Reals:
+    """[n, 2] of two columns of text, energy and absorption, apart by commas, semicolons, tabs or blanks.
+
+    Lines before the first number, and those that begin with # or %, are skipped.
+    """
+    rows: list[tuple[float, float]] = []
+    for number, line in enumerate(text_in(path).splitlines(), start=1):
+        if not line.strip() or line.lstrip()[0] in "#%":
+            continue
+        try:
+            energy, absorption, *_ = re.split(r"[,;\s]+", line.strip())
+            rows.append((float(energy), float(absorption)))
+        except ValueError:
+            if rows:
+                raise DataError(
+                    f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption."
+                ) from None
+    return np.array(rows, dtype=np.float64).reshape(-1, 2)
+
+
+def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
+    """Energies, shape of the frames, and the mean line integrals over views from all sides: these show a region of the
+    detector alike at all energies, though each scan has angles of its own.
+    """
+    energies, shapes = list[float](), set[tuple[int, int]]()
+    for path in scans:
+        with open_scan(path) as source:
+            if source.energy_kev is None:
+                raise DataError(f"{path} does not state its energy (instrument/beam/incident_energy of NXtomo).")
+            energies.append(source.energy_kev)
+            shapes.add(source.shape)
+    if len(shapes) != 1:
+        raise DataError(f"The scans have frames of {sorted(shapes)} pixels; expected one size. Nothing was written.")
+
+    def read(n: int, part: FramePart) -> Reals:
+        with open_scan(scans[n]) as source:
+            dark = _mean(source, FrameKind.DARK, part)
+            flat = _mean(source, FrameKind.FLAT, part) - dark
+            views = _some(source, FrameKind.PROJECTION)
+            flats = source.exposures[source.image_key == FrameKind.FLAT]
+            scale = np.nanmean(source.exposures[views]) / np.nanmean(flats)
+            flat = flat * (scale if np.isfinite(scale) else 1.0)
+            total = sum(line_integrals(_frame(source, view, part) - dark, flat) for view in views)
+        return np.asarray(total / views.size, np.float64)
+
+    return np.array(energies), shapes.pop(), read
+
+
+def _some(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
+    frames = np.flatnonzero(source.image_key == kind)
+    if not frames.size:
+        raise DataError(f"{source.path} has no {kind.name.lower()}s. Nothing was written.")
+    return frames[np.unique(np.linspace(0, frames.size - 1, _MOST_VIEWS).round().astype(int))]
+
+
+def _frame(source: ScanSource, index: int, part: FramePart) -> Reals:
+    return counts_in(source.read(np.array([index]), part[0])[0][:, part[1]])
+
+
+def _mean(source: ScanSource, kind: FrameKind, part: FramePart) -> Reals:
+    return np.asarray(np.mean([_frame(source, index, part) for index in _some(source, kind)], axis=0))
+
+
+def counts_in(values: Any) -> Reals:
+    """NaN where integers are the largest of their type: the pixel may be saturated."""
+    counts = np.asarray(values, dtype=np.float64)
+    if values.dtype.kind in "ui":
+        counts[values == np.iinfo(values.dtype).max] = np.nan
+    return counts
+
+
+def _order(path: Path, energies: Reals, span: tuple[float, float]) -> NDArray[np.intp]:
+    """The energies within the span, rising; DataError where one occurs twice."""
+    order = np.argsort(energies, kind="stable")
+    order = order[(energies[order] >= span[0]) & (energies[order] <= span[1])]
+    if not (np.diff(energies[order]) > 0).all():
+        raise DataError(f"{path} has an energy more than once; average the values of each. Nothing was written.")
+    return order
+
+
+def _sorted_curve(path: Path, energies: Reals, absorption: Reals, span: tuple[float, float]) -> XafsCurve:
+    if energies.shape != absorption.shape or not np.isfinite(absorption).all():
+        raise DataError(f"{path}: expected a finite absorption for each of {energies.size} energies.")
+    order = _order(path, energies, span)
+    return XafsCurve(energies[order], np.asarray(absorption, np.float64)[order], unit="as in the file")
+
+
+def _series(path: Path, order: NDArray[np.intp], energies: Reals, regions: ContrastRegions, read: Read) -> Series:
+    mask = regions.inside if regions.around is None else regions.inside | regions.around
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    # Only these rows and columns, and their neighbours, are read.
+    part = slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
+    seen = ContrastRegions(regions.inside[part], None if regions.around is None else regions.around[part])
+    return Series(path.name, order.size, ((float(energies[n]), read(int(n), part)) for n in order), seen)
+
+
+def _regions(path: Path, shape: tuple[int, int], region: PixelBox | None, around: PixelBox | None) -> ContrastRegions:
+    inside = _mask(shape, region or (0, shape[0], 0, shape[1]))
+    beside = None if around is None else _mask(shape, around) & ~inside
+    if beside is not None and not beside.any():
+        raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
+    return ContrastRegions(inside, beside)
+
+
+def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
+    if box[1] > shape[0] or box[3] > shape[1]:
+        raise ConfigError(
+            f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "
+            "Nothing was written."
+        )
+    mask = np.zeros(shape, dtype=np.bool_)
+    mask[box[0] : box[1], box[2] : box[3]] = True
+    return mask
+
+
+def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
+    energies = np.asarray(values, np.float64) * _KEV[unit or "keV"]
+    if not ((energies >= _KEV_BELOW) & (energies <= _EV_BEYOND)).all():
+        raise DataError(
+            f"{path}: energies from {energies.min():g} to {energies.max():g} keV are impossible, expected "
+            f"{_KEV_BELOW:g} to {_EV_BEYOND:g}; their unit is given by --unit. Nothing was written."
+        )
+    return energies

@@ -1,0 +1,252 @@
+"""forecast: seconds of a reconstruction, from a few iterations that are timed on a part of its views and voxels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.method import Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.volume import Grid
+from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE
+from recon.splatting.fit_method import FitMethod
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import count_for, joined_for
+from recon.splatting.settings import growth
+from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, TRIALS, choice_sweeps
+from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.priors import STEPS
+
+VOXELS = 2**20
+"""Of the part that is timed: as many as caches of a processor do not hold several times."""
+
+_ROWS, _VIEWS = 48, 128  # of the part, at most
+_ITERATIONS, _PATCH_STEPS, _FIT_STEPS = 4, 2 * STEPS, 12  # that are timed; of the first one only its end is known
+_LEAST_COLS = 32
+_NOISE = np.float32(0.01)  # of views, whose weight of total variation is else 0
+_RENDER = 1 / 3  # of a view's share in a step of a fit, which renders it and goes back for the gradient
+
+
+class Forecast(NamedTuple):
+    """Seconds of a reconstruction.
+
+    Attributes:
+        choice: of the trials that choose a method or the weight of a prior.
+        volumes: after them, by the name of the method whose volume it may become; the data decide among them.
+    """
+
+    choice: float
+    volumes: Mapping[str, float]
+
+    @property
+    def least(self) -> float:
+        return self.choice + min(self.volumes.values())
+
+    @property
+    def most(self) -> float:
+        return self.choice + max(self.volumes.values())
+
+
+class Pace(NamedTuple):
+    """Seconds before and after the iterations of a run, and of each iteration; and the number that is planned."""
+
+    fixed: float
+    each: float
+    planned: int
+
+    @property
+    def total(self) -> float:
+        return self.fixed + self.planned * self.each
+
+    def times(self, fixed: float, each: float) -> Pace:
+        return Pace(fixed * self.fixed, each * self.each, self.planned)
+
+
+def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Forecast | None:
+    """Seconds that a method takes for these views and voxels; None: it makes several volumes, and must be tried.
+
+    Kernels are compiled before, by `recon.warm_up`.
+
+    Args:
+        now: s; of a clock of processor time, those of a machine on which nothing else runs.
+
+    Raises:
+        ValueError: the method does not take the views.
+    """
+    return None if method.traits.several else Timing(geometry, grid, now).of(method)
+
+
+class Timing:
+    """Iterations of methods for some views and voxels, timed on a part of these as each is asked for."""
+
+    def __init__(self, geometry: Geometry, grid: Grid, now: Clock, voxels: int = VOXELS) -> None:
+        self._geometry, self._grid, self._now, self._voxels = geometry, grid, now, voxels
+        self._part = part_of(geometry, grid, voxels)
+        self._scale = _work(geometry, grid) / _work(self._part.geometry, self._part.grid)
+        self._trial_share = choice_sweeps(geometry) / CHOICE_SWEEPS
+        self._trial = part_of(geometry, grid, voxels, TRIAL_ROWS)
+        self._paces: dict[str, Pace] = {}
+
+    def of(self, method: Method) -> Forecast:
+        """As `forecast`."""
+        candidates = candidates_of(method)
+        if len(candidates) > 1:
+            return self._of_choice(candidates)
+        if (limit := getattr(method, "seconds", None)) is not None:
+            return Forecast(0.0, {method.name: limit})
+        if method.traits.direct:
+            return Forecast(0.0, {method.name: self.direct(method)})
+        if isinstance(method, FitMethod):
+            return self._of_fit(method)
+        return Forecast(self.trials(method), {method.name: self.pace(method).total})
+
+    def whole(self, method: Method) -> Pace:
+        """All seconds beside the steps, without trials of a finish, and those of each step."""
+        if method.traits.direct:
+            return Pace(self.direct(method), 0.0, 0)
+        if isinstance(method, FitMethod):
+            pace = self.fit(method)
+            return pace._replace(fixed=pace.fixed + self._smooth.fixed + FINISH_SWEEPS * self._smooth.each)
+        pace = self.pace(method)
+        return pace._replace(fixed=pace.fixed + self.trials(method))
+
+    def direct(self, method: Method) -> float:
+        """Seconds of a direct method, whose kernels depend on the number of columns."""
+        straight = self._geometry.is_straight and not self._geometry.is_cone
+        part = part_of(self._geometry, self._grid, None) if straight else self._part
+        begin = self._now()
+        method.run(part, RunControl(now=self._now))
+        return (self._now() - begin) * _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
+
+    def pace(self, method: Method, of_trial: bool = False) -> Pace:
+        """Of an iterative method in all voxels, at the speed of a part of them, or of the rows of a trial."""
+        key = f"{of_trial} {method!r}"
+        if key not in self._paces:
+            part, first = self._trial if of_trial else self._part, getattr(method, "first_sweeps", 0)
+            pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
+            scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
+            # Steps that are not over all views take as long whatever their number, by samples along rays.
+            along = max(self._grid.shape) / max(part.grid.shape)
+            self._paces[key] = pace.times(scale, scale if hasattr(method, "iterations") else along)
+        return self._paces[key]
+
+    @property
+    def _smooth(self) -> Pace:
+        return self.pace(FistaTv())
+
+    def trials(self, method: Method) -> float:
+        """Seconds of the trials that choose its prior."""
+        sweeps: int = getattr(method, "trial_sweeps", 0)
+        if not (self._trial_share and sweeps):
+            return 0.0
+        smooth = self.pace(FistaTv(), of_trial=True).each
+        if isinstance(method, PnpDct):
+            patches = TRIALS * method.trial_steps * self.pace(PnpDct(), of_trial=True).each
+            return self._trial_share * ((CHOICE_SWEEPS + TRIAL_SWEEPS) * smooth + patches)
+        return self._trial_share * sweeps * smooth
+
+    def fit(self, method: FitMethod) -> Pace:
+        """Of a fit without its finish."""
+        field = Grid.for_fit(self._geometry, self._grid)
+        given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
+        usual = count_for(field, self._geometry.is_cone)
+        count, part = given or usual, self._part
+        joined = method.fit.joined_pixels or joined_for(
+            field, self._geometry.is_cone, max(count, usual), self._geometry.detector_shape
+        )
+        here = count_for(Grid.for_fit(part.geometry, part.grid), part.geometry.is_cone)
+        some, short = max(1, round(here * count / usual)), cast(Any, method)
+        short = replace(short, gaussians=some, finish=0, fit=replace(method.fit, joined_pixels=joined))
+        grown = ((1 + growth(method.fit)) / 2) ** (1 / 3)  # Gaussians are added as it goes on
+        covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), some)
+        return _timed(short, part, self._now, _FIT_STEPS).times(self._scale, grown * covers)
+
+    def _of_fit(self, method: FitMethod) -> Forecast:
+        usual = method.as_candidate()
+        pace = self.fit(usual)
+        if method.finish_sweeps == 0:
+            return Forecast(0.0, {method.name: pace.total})
+        rendered = 2 * _RENDER * self._geometry.n_views * pace.each / method.fit.views_per_step
+        finish = rendered + self._smooth.fixed + method.finish_sweeps * self._smooth.each
+        choice = self.trials(FistaTv() if method.finish is not None else PnpDct())
+        if method.finish is None:
+            finish += PnpDct.iterations * self.pace(PnpDct()).each
+        volumes = {method.name: pace.total + finish}
+        if method.by_content and self._trial_share:
+            short = pace._replace(planned=method.least_steps or 0).total
+            volumes |= {FistaTv.name: short + self._smooth.total, PnpDct.name: short + self.pace(PnpDct()).total}
+            tried = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
+            choice += self._trial_share * (tried + rendered + FINISH_SWEEPS * self.pace(FistaTv(), of_trial=True).each)
+        return Forecast(choice, volumes)
+
+    def _of_choice(self, candidates: tuple[Method, ...]) -> Forecast:
+        """Of a method that tries others: a fit's own trial judges them, too."""
+        each = [self.of(candidate) for candidate in candidates]
+        if not self._trial_share:
+            return each[-1]
+        volumes = {name: seconds for one in reversed(each) for name, seconds in one.volumes.items()}
+        if isinstance(candidates[-1], FitMethod):
+            return Forecast(each[-1].choice, volumes)
+        return Forecast(sum(one.choice + self._trial_share * max(one.volumes.values()) for one in each), volumes)
+
+
+def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:
+    """Some noisy views of a cylinder on some rows and columns, and the grid that matches them.
+
+    Args:
+        voxels: of the grid, about; None: all columns of all views, as direct methods need, which take them together.
+    """
+    rows, cols = geometry.detector_shape
+    height = min(rows, most_rows)
+    width = cols if voxels is None else min(cols, max(_LEAST_COLS, math.isqrt(voxels // height)))
+    each = 1 if voxels is None else -(-geometry.n_views // _VIEWS)
+    first = (rows - height) // 2
+    views = geometry.select(slice(None, None, each)).rows(first, first + height)
+    views = replace(views, detector_shape=(height, width), axis_col=(width - 1) / 2)
+    box = Grid.matching(views)
+    wider = grid.shape[1] / Grid.matching(geometry).shape[1]  # a sample that goes on beyond the field
+    nz, ny, nx = box.shape
+    box = replace(box, shape=(nz, round(wider * ny), round(wider * nx)))
+    across = np.arange(width) - (width - 1) / 2
+    lines = np.sqrt(np.maximum((0.35 * width) ** 2 - across**2, 0)) / width
+    noise = np.random.default_rng(0).standard_normal((views.n_views, height, width), np.float32)
+    data: F32 = lines.astype(np.float32) + _NOISE * noise
+    return ReconProblem(data, views, box, DataUse(), 0, "cpu")
+
+
+def _work(geometry: Geometry, grid: Grid) -> float:
+    """Proportional to that of a projection."""
+    return float(geometry.n_views * math.prod(grid.shape))
+
+
+def _covered(voxels: float, gaussians: float) -> float:
+    """Proportional to the pixels that Gaussians cover in a view, as wide as their distances."""
+    return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
+
+
+def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> Pace:
+    """The pace of the iterations up to `last` that come after so many others, without trials."""
+    reached: list[tuple[int, float]] = []
+    planned = last
+
+    def heard(progress: Progress) -> None:
+        nonlocal planned
+        if not progress.unit:
+            planned = progress.steps or last
+            reached.append((progress.step, now()))
+
+    control = RunControl(lambda: bool(reached) and reached[-1][0] >= last, heard, now=now, stop_trials=lambda: True)
+    begin = now()
+    method.run(part, control)
+    seconds = now() - begin
+    some = [mark for mark in reached if mark[0] >= (after + STEPS if after else 1)]
+    if len(some) < 2:
+        return Pace(0.0, seconds / planned, planned) if planned else Pace(seconds, 0.0, 0)
+    (step, at), (end, until) = some[0], some[-1]
+    each = (until - at) / (end - step)
+    return Pace(seconds - (end - after) * each, each, planned - after)
