@@ -88,8 +88,8 @@ def _unopened(
         )
     if head is not None and head.open_for_writing:
         return DataError(
-            f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, or its writer just "
-            f"died, try again in {QUIET:.0f} s. Nothing was read."
+            f"{path} is marked as being written. If a scan just begins or ends, or its writer just died, try again in "
+            f"{QUIET:.0f} s. Of a dead writer `h5clear -s {path}` clears the mark. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(held_sentence(path))

@@ -24,12 +24,13 @@ from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 
 MOST_OBJECTS, DEEPEST = 50_000, 64
+CLAIMED = 1e9  # bytes
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
 def require_harmless(file: h5py.File) -> None:
-    """Raise DataError for a file with more objects or deeper groups than any scan has, and for one that refers to a
-    path that is no regular file."""
+    """Raise DataError for a file with more objects or deeper groups than any scan has, for one that refers to a path
+    that is no regular file, that claims more data than it has, or whose values lie in another file as plain bytes."""
     path = Path(file.filename)
     for name in dict.fromkeys(_names(file, path)):
         # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
@@ -69,11 +70,25 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                 if info.type == h5py.h5o.TYPE_GROUP:
                     groups.append((h5py.h5g.open(group, name), depth + 1))
                 elif info.type == h5py.h5o.TYPE_DATASET:
-                    made = h5py.h5d.open(group, name).get_create_plist()
+                    dataset = h5py.h5d.open(group, name)
+                    made = dataset.get_create_plist()
+                    _refuse_claim(dataset, made, f"{path}: {name.decode('utf-8', 'replace')}")
                     if made.get_layout() == h5py.h5d.VIRTUAL:
                         yield from (other for other, _ in drawn_on(made) if other != ".")
-                    for i in range(made.get_external_count()):
-                        yield os.fsdecode(made.get_external(i)[0])
+
+
+def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
+    """DataError for a dataset that claims more than any compression makes of what is stored of it, or whose values are
+    the bytes of another file, which may be any file that the reader can open."""
+    if made.get_external_count():
+        raise DataError(f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5. Copy it.")
+    n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
+    if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
+        return
+    chunk = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else ()
+    piece, stored = math.prod(chunk) * dataset.dtype.itemsize, dataset.get_storage_size()
+    if n > PACKED * stored or is_blank(n, stored, piece):
+        raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
 def drawn_on(made: Any) -> Iterator[tuple[str, str]]:

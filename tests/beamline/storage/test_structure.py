@@ -37,17 +37,26 @@ def _virtual(file: h5py.File, name: str) -> None:
     file.create_virtual_dataset("entry/notes", layout)
 
 
-def _raw(file: h5py.File, name: str) -> None:
-    file.create_dataset("entry/notes", (3,), "i4", external=[(name, 0, 12)])
-
-
 @PIPES
-@pytest.mark.parametrize("draw", [_external, _virtual, _raw])
+@pytest.mark.parametrize("draw", [_external, _virtual])
 def test_a_scan_that_draws_on_a_pipe(tmp_path: Path, path: Path, draw: Callable[[h5py.File, str], None]) -> None:
     os.mkfifo(tmp_path / "pipe")
     with h5py.File(path, "r+") as file:
         draw(file, "pipe")
     with pytest.raises(DataError, match=r"links to .*or a pipe"):
+        open_scan(path)
+
+
+def test_values_that_are_the_bytes_of_another_file_and_claims_without_bytes(tmp_path: Path, path: Path) -> None:
+    (tmp_path / "secret").write_bytes(b"token")
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("entry/notes", (5,), "u1", external=[(str(tmp_path / "secret"), 0, 5)])
+    with pytest.raises(DataError, match=r"notes has its values in .*secret"):
+        open_scan(path)
+    with h5py.File(path, "r+") as file:
+        del file["entry/notes"]
+        file.create_dataset("entry/notes", (2**31,), "u1", chunks=(2**31,), compression="gzip")
+    with pytest.raises(DataError, match=r"claims 2\.15 GB"):
         open_scan(path)
 
 
