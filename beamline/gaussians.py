@@ -56,5 +56,5 @@ def read_model(path: Path) -> Model:
             arrays["centres"], arrays["widths"], arrays["densities"], arrays["rotations"],
             float(arrays["density_unit"]), Kernel(str(arrays["kernel"])),
         )  # fmt: skip
-        # Error bars and FBP are of the file's voxels, and the file is closed behind this.
-        return Model(gaussians, geometry, replace(record, deviation=None, fbp=None))
+        # Error bars are of the file's voxels, and the file is closed behind this.
+        return Model(gaussians, geometry, replace(record, deviation=None))

@@ -16,7 +16,6 @@ from recon.base.declared_types import NonNegative, check_settings
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import (
-    ChoosingMethod,
     DataUse,
     Method,
     Progress,
@@ -120,7 +119,7 @@ def predicts_best(
 
 def _candidate(method: Method) -> Method:
     """The method as it competes: one that would itself choose among others makes its own volume."""
-    return method.as_candidate() if isinstance(method, ChoosingMethod) else method
+    return method.as_candidate() if isinstance(method, FitMethod) else method
 
 
 def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | None:

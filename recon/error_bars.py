@@ -14,7 +14,7 @@ from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Method, ReconProblem, RunControl, SignedMethod
+from recon.base.method import Method, ReconProblem, RunControl, setting
 from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
@@ -171,7 +171,7 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve(
             refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
-            nonnegative=not (isinstance(method, SignedMethod) and method.allow_negative), watch=Watch(told),
+            nonnegative=not setting(method, "allow_negative", False), watch=Watch(told),
             decide=decide,
         )  # fmt: skip
         if stopped:

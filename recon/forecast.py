@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import ChoosingMethod, Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.method import Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
 from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE
 from recon.splatting.fit_method import FitMethod
@@ -167,7 +167,7 @@ class Timing:
         return _timed(short, part, self._now, _FIT_STEPS).times(self._scale, grown * covers)
 
     def _of_fit(self, method: FitMethod) -> Forecast:
-        usual = method.as_candidate() if isinstance(method, ChoosingMethod) else method
+        usual = method.as_candidate()
         pace = self.fit(usual)
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})

@@ -15,7 +15,7 @@ from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
-from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod, candidates_of
+from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of, setting
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
@@ -78,7 +78,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if isinstance(chosen, SignedMethod) and not chosen.allow_negative:
+    if not setting(chosen, "allow_negative", True):
         _warn_of_negative(data)
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)

@@ -57,22 +57,27 @@ def warm_up(
     if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
         cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
     data, views = toy_of(geometry, _SEVERAL if method.traits.several else 1)
-    weights = None
-    if weighted:
-        weights = np.ones(data.shape, np.float32)
-        weights[::2, 3, 4] = 0  # views with and without go different ways
+    where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
             toy = warmed.toy()
-            where = str([value.tolist() for value in arrays_of(views).values()])
             if (key := (type(toy), repr(toy), where, device, weighted)) not in _RECONSTRUCTED:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # of a toy nobody needs to be warned
-                    reconstruct(data, views, toy, device=device, use=DataUse(weights))
+                _reconstruct_silently(toy, data, views, device, weighted)
                 _RECONSTRUCTED.add(key)
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
+
+
+def _reconstruct_silently(toy: Method, data: F32, views: Geometry, device: str, weighted: bool) -> None:
+    """Reconstruct a toy, of which nobody needs to be warned."""
+    weights = None
+    if weighted:
+        weights = np.ones(data.shape, np.float32)
+        weights[::2, 3, 4] = 0  # views with and without go different ways
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        reconstruct(data, views, toy, device=device, use=DataUse(weights))
 
 
 @contextmanager

@@ -63,7 +63,7 @@ from click.testing import CliRunner
 from beamline.cli.recon import recon as command
 from beamline.features.trials.command import tradeoff
 from recon.methods import taking
-from beamline.reconstruct.outcome import label_of
+from beamline.reconstruct.scan_facts import label_of
 from beamline.features.trials.tradeoff import plan
 from recon import methods
 

@@ -175,18 +175,11 @@ class VolumeTile:
     ready: float
 
 
-def _fbp_of(path: Path, record: ReconRecord) -> Any:
-    if record.fbp is None:
-        raise DataError(f"{path} keeps no FBP beside its volume.")
-    return record.fbp
-
-
 class ShownVolume:
     """A volume file of any readable kind. All calls come from one thread (HDF5).
 
     Args:
         held: bytes of the copy of a file without scales, see `slices_of`.
-        fbp: the FBP that is kept beside a volume (`has_fbp`), instead of the volume.
         dataset: an array in a file with several; None: the volume.
         record: what is shown instead of a volume in the file, whose voxels are sliced along z.
 
@@ -198,7 +191,6 @@ class ShownVolume:
         self,
         path: Path,
         held: int = HELD,
-        fbp: bool = False,
         dataset: str | None = None,
         record: ReconRecord | None = None,
     ) -> None:
@@ -208,11 +200,9 @@ class ShownVolume:
                 record = opened.enter_context(
                     opened_reconstruction(path, 0) if seconds else opened_volume(path, dataset)
                 )
-            self.path, self._grid, self.has_fbp = path, record.volume.grid, record.fbp is not None
+            self.path, self._grid = path, record.volume.grid
             values: Any = record.volume.data
             self._name = path.name if dataset is None else f"{path.name}::{dataset}"
-            if fbp:
-                values, self._name = _fbp_of(path, record), f"{path.name}, FBP"
             self.shape: tuple[int, int, int] = values.shape
             each = [values] if record.series is None else record.series.each()
             self._seconds = seconds

@@ -12,10 +12,11 @@ from beamline.reconstruct.run import binned, run_on
 from recon.assess.time_model import USEFUL, duration_text
 from recon.auto import LEFT, ROWS, part_of, predicts_best
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
+from recon.base.method import Clock, DataUse, Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.forecast import Pace, Timing
 from recon.methods import with_settings
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.direct import has_direct_method
@@ -218,7 +219,7 @@ def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
     """The volume of a method by `end`."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
-    if isinstance(method, TimedMethod):
+    if isinstance(method, FitMethod):
         method = method.in_time(data, geometry, seed, lambda: end - now())
     trials = control.stop.by(now() + _OF_TRIALS * (end - now()), now)
     return run_on(method, prepared, Grid.matching(geometry), seed, replace(control.by(end), stop_trials=trials))

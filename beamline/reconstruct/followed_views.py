@@ -152,18 +152,21 @@ class AxisSearch:
         if views.size < self._next and not passed and not ended:
             return
         self._next, self.settled = views.size + views.size // 2, ended
-        last_chance = ended and self.col is None
-        try:
-            warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
-            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
-            if estimate.confident or last_chance:
-                self.col, self.estimate = axis_col, estimate
-        except DataError:  # the views do not cover enough angles yet
-            if last_chance:
-                raise
+        self._search(correction, views, ended and self.col is None)
         if self.col is None and np.pi / 2 <= self._turned < np.pi and not self._told:
             self._told = True
             self._warn(_UNKNOWN)
+
+    def _search(self, correction: ScanCorrection, views: NDArray[np.int64], last_chance: bool) -> None:
+        warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
+        try:
+            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
+        except DataError:  # the views do not cover enough angles yet
+            if last_chance:
+                raise
+            return
+        if estimate.confident or last_chance:
+            self.col, self.estimate = axis_col, estimate
 
 
 GROWTH = 1.25  # growth of the views between predictions

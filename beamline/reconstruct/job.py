@@ -20,22 +20,21 @@ from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.region import RegionOfRows
 from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on, without_outside
+from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
 from recon.base.geometry import Geometry
 from recon.base.method import (
-    BoundedMethod,
-    CheckpointedMethod,
     Ending,
     Method,
     Progress,
     Reconstruction,
     RunControl,
     candidates_of,
+    setting,
 )
 from recon.base.volume import Grid, Slab
 from recon.error_bars import method_on_voxels
@@ -236,7 +235,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     options, prepared, checkpoints, method = job.options, job.prepared, job.options.checkpoints, job.method
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
-        assert isinstance(method, CheckpointedMethod)  # other methods were refused
+        assert isinstance(method, FitMethod)  # other methods were refused
         settings, others = method.made_by
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.channels.warn)
@@ -248,7 +247,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
     control = RunControl(
         job.stop,
-        job.listener(method.seconds if isinstance(method, BoundedMethod) else None),
+        job.listener(setting(method, "seconds")),
         None if checkpoints.path is None else keep,
         resume=resume,
         now=job.channels.clock.now,
@@ -257,23 +256,34 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     result = runner_of(options)(method, prepared, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
-    chosen, started_from, asked = "", result.started_from, None
-    if isinstance(method, FitMethod) and options.quality is not None:
-        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
-    elif isinstance(method, FitMethod):
-        asked = method.gaussians
-    if isinstance(asked, int) and resume is None and started_from < asked:
+    if method.traits.held_out:
+        result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
+    resumed_from = "" if checkpoints.resume is None else str(checkpoints.resume)
+    return _ended(result, Ending(_is_early(job, result), resumed_from, lost), _of_preset(job, result))
+
+
+def _of_preset(job: Job, result: Reconstruction) -> str:
+    """The lengths that a preset chose; without one, a warning where a fit could not have the number asked for."""
+    method, started_from = job.method, result.started_from
+    if not isinstance(method, FitMethod):
+        return ""
+    if job.options.quality is not None:
+        return f"{job.options.quality}: {method.steps} steps from {started_from} Gaussians"
+    asked = method.gaussians
+    if isinstance(asked, int) and job.options.checkpoints.resume is None and started_from < asked:
         job.channels.warn(
             f"The fit started from {started_from} Gaussians, not from {asked}: the sample is too small for more."
         )
-    if method.traits.held_out:
-        result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
-    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
+    return ""
+
+
+def _is_early(job: Job, result: Reconstruction) -> bool:
+    """Whether a stop ended the method before its last step."""
+    method = job.method
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
-    finishes = method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
-    early = job.stop.stopped if finishes else job.stop.cut(reached, planned)
-    resumed_from = "" if checkpoints.resume is None else str(checkpoints.resume)
-    return _ended(result, Ending(early, resumed_from, lost), chosen)
+    if method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0):
+        return job.stop.stopped
+    return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))
 
 
 def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:

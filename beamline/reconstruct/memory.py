@@ -18,7 +18,8 @@ from beamline.projections.views import stated_geometry
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
-from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
+from recon.base.method import Method, candidates_of, volumes_of
+from recon.base.method import for_part as method_for_part
 from recon.base.registry import ADD_ONS, plugins
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
@@ -146,7 +147,7 @@ def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
     """The method for so many slices `of` a volume; `in_all` is the number of slices of all slabs, overlaps counted
     twice.
     """
-    return method.for_part(slices / of, slices / in_all) if isinstance(method, DividedMethod) else method
+    return method_for_part(method, slices / of, slices / in_all)
 
 
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:

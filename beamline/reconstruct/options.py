@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import tempfile
@@ -18,12 +17,10 @@ from beamline.reconstruct.region import AroundSample, Region, selection_around
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
-from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.method import EarlyStopMethod, Method, PresetMethod
-from recon.base.volume import Grid
+from recon.base.method import Method, PresetMethod, setting
 from recon.methods import names, streams
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
@@ -89,11 +86,6 @@ class OutputPaths:
                 f"{self.output.parent} cannot be written to ({error.strerror or error}). Name an output elsewhere with "
                 "-o. Nothing was read."
             ) from error
-
-    def takes_a_second(self, grid: Grid) -> bool:
-        """Whether the output is a file of this program, and its disk has room for a second volume of this size."""
-        room = shutil.disk_usage(self.output.parent).free > _ROOM * 4 * math.prod(grid.shape)
-        return self.written and room and self.output.suffix.lower() in RECON_SUFFIXES
 
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
         """Raise DataError before any work if the disk has no room for a volume of so many bytes and `meanwhile` bytes
@@ -216,7 +208,7 @@ class ReconOptions:
     @property
     def stops_early(self) -> bool:
         """Whether held-out views may end the method early."""
-        return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
+        return bool(setting(self.method, "early_stop", False))
 
     @property
     def streaming(self) -> FitMethod:

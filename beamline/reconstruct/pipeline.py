@@ -29,11 +29,11 @@ from beamline.reconstruct.job import (
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.options import FollowTiming, ReconOptions
-from beamline.reconstruct.outcome import ReportContext, ScanFacts, facts_of, partly_seen_warning
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
+from beamline.reconstruct.record import partly_seen_warning, write_result
 from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.result import write_result
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_told
+from beamline.reconstruct.scan_facts import ReportContext, ScanFacts, facts_of
 from beamline.reconstruct.slab_run import keeping
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource
@@ -41,7 +41,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
-from recon.base.method import BoundedMethod
+from recon.base.method import setting
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
@@ -191,9 +191,9 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         compile_kernels(options, prepared.geometry, sink, clock)
         phases.enter("reconstruction")
         before_report = Stop()
-        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
+        if (limit := setting(options.method, "seconds")) is not None:
             started = channels.started, channels.worked
-            method, before_report = fit_within(options.method, prepared, options.target, started, clock, warn)
+            method, before_report = fit_within(options.method, limit, prepared, options.target, started, clock, warn)
             options = replace(options, method=method)
         yield Job(
             options,

@@ -26,7 +26,7 @@ from recon.assess.time_model import duration_text
 from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
-from recon.base.method import BoundedMethod, DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
+from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
 from recon.base.volume import Grid, Slab, Volume, part_of, slabs_of
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import by_name, with_settings, with_trait
@@ -113,36 +113,36 @@ _MEASURING = 0.05  # of the seconds: looks at the volume, which are left out whe
 
 
 def fit_within(
-    method: BoundedMethod,
+    method: Method,
+    limit: float,
     prepared: PreparedProjections,
     target: OutputPaths,
     started: tuple[float, float],
     clock: Clock,
     warn: Warn,
-) -> tuple[BoundedMethod, Stop]:
+) -> tuple[Method, Stop]:
     """The fit with the seconds of its budget minus those of measuring, report and writing; and when these begin.
 
     If they are too few, `warn` gets a sentence before the fit.
 
     Args:
-        method: `seconds` are those of the call.
+        limit: seconds of the call.
         started: when the call began, by the clock and in seconds of this process's work.
     """
-    assert method.seconds is not None
     grid, pages = Grid.matching(prepared.geometry), target.report is not None
     spent = clock.now() - started[0]
     busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
     after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
-    measuring = _MEASURING * method.seconds
-    remaining = method.seconds - spent - measuring - after
+    measuring = _MEASURING * limit
+    remaining = limit - spent - measuring - after
     if remaining <= 0:
         warn(
-            f"{duration_text(method.seconds)} do not suffice for this scan: reading and correcting it took "
+            f"{duration_text(limit)} do not suffice for this scan: reading and correcting it took "
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "
             f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method, "
             "which makes one step."
         )
-    before_report = Stop(deadline=started[0] + method.seconds - after, now=clock.now)
+    before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
 
 

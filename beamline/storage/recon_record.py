@@ -70,7 +70,6 @@ class ReconRecord:
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
-        fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
         series: all volumes, where `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
         model: the Gaussians behind the volume and the geometry of their views (`result.arrays_of_model`); empty: none.
@@ -95,7 +94,6 @@ class ReconRecord:
     history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=dict)
     deviation: NDArray[np.float32] | None = None
-    fbp: NDArray[np.float32] | None = None
     kind: VoxelKind = VoxelKind.ATTENUATION
     series: VolumeSeries | None = None
     compared: Mapping[str, float] | None = None

@@ -6,9 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
 from recon.base.choices import Quality
 from recon.base.empirical import DEFAULT_STEPS
 
@@ -59,13 +56,6 @@ PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Prese
 def best_steps(method: str) -> int:
     """Steps of this method beyond which further ones fit the noise."""
     return USEFUL[method].most if method in USEFUL else DEFAULT_STEPS
-
-
-def record(seconds: ArrayLike, residuals: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(s, -20 log10 of the residual) for the valid entries of a fit's record."""
-    t, r = np.asarray(seconds, np.float64), np.asarray(residuals, np.float64)
-    known = np.isfinite(t) & (t > 0) & np.isfinite(r) & (r > 0)
-    return t[known], -20 * np.log10(r[known])
 
 
 def parse_budget(text: str) -> float:

@@ -482,13 +482,8 @@ def _checked(
         raise TypeError(f"a geometry has no {', '.join(sorted(unknown))}; expected {', '.join(Where.__annotations__)}")
     check_arguments(Where, where)
     axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
-    theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
+    theta = _checked_angles(angles)
     rows, cols = (operator.index(n) for n in detector_shape)
-    if theta.ndim != 1 or theta.size == 0:
-        raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
-    if not np.isfinite(theta).all():
-        bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
-        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
     if rows < 1 or cols < 1:
         raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
     if not (np.isfinite(pixel_pitch) and pixel_pitch > 0):
@@ -501,15 +496,27 @@ def _checked(
     moved = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
     if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
         raise ValueError(f"shifts must be finite pixels (col, row) [{theta.size}, 2], got shape {moved.shape}")
-    turned = []
-    for name, turn in (("roll", where.get("roll", 0.0)), ("tilt", where.get("tilt", 0.0))):
-        given = np.asarray(turn, np.float64)
-        if given.shape not in ((), (theta.size,)) or not np.isfinite(given).all():
-            raise ValueError(f"{name} must be finite radians, one for all views or [{theta.size}], got {given.shape}")
-        turned.append(_frozen(np.broadcast_to(given, theta.shape)))
+    roll, tilt = (_checked_turns(name, where.get(name, 0.0), theta.size) for name in ("roll", "tilt"))
     return Geometry(
-        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, *distances, _frozen(moved), turned[0], turned[1]
+        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, *distances, _frozen(moved), roll, tilt
     )  # fmt: skip
+
+
+def _checked_angles(angles: ArrayLike) -> F64:
+    theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
+    if theta.ndim != 1 or theta.size == 0:
+        raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
+    if not np.isfinite(theta).all():
+        bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
+        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
+    return theta
+
+
+def _checked_turns(name: str, turns: Any, views: int) -> F64:
+    given = np.asarray(turns, np.float64)
+    if given.shape not in ((), (views,)) or not np.isfinite(given).all():
+        raise ValueError(f"{name} must be finite radians, one for all views or [{views}], got {given.shape}")
+    return _frozen(np.broadcast_to(given, (views,)))
 
 
 def _frozen(values: F64) -> F64:

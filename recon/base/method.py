@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -327,14 +327,6 @@ class Method(Protocol):
 
 
 @runtime_checkable
-class DividedMethod(Method, Protocol):
-    """A method with settings that depend on its share of a volume."""
-
-    def for_part(self, share: float, of_time: float) -> Self:
-        """The method for this share of a volume, in this share of its seconds."""
-
-
-@runtime_checkable
 class PresetMethod(Method, Protocol):
     """A method with the trait `presets`."""
 
@@ -342,69 +334,18 @@ class PresetMethod(Method, Protocol):
         """The method with the settings of a preset, for a grid with `default_count` Gaussians by default."""
 
 
-@runtime_checkable
-class TimedMethod(Method, Protocol):
-    """A method that ends by itself within a given time."""
-
-    def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
-        """Start the method on these views; the result runs within the seconds that are then `left`."""
+M = TypeVar("M")
 
 
-@runtime_checkable
-class ChoosingMethod(Method, Protocol):
-    """A method that may take the volume of another one, where that predicts views held out as well."""
-
-    def as_candidate(self) -> Self:
-        """The same method, which makes its own volume whatever others predict."""
+def setting(method: Any, name: str, default: Any = None) -> Any:
+    """A setting that some methods have, such as `seconds`, `early_stop` or `allow_negative`."""
+    return getattr(method, name, default)
 
 
-@runtime_checkable
-class BoundedMethod(Method, Protocol):
-    """A method with a setting for the time of its whole run."""
-
-    @property
-    def seconds(self) -> float | None:
-        """Time limit of the run in s; None: no limit."""
-
-
-@runtime_checkable
-class EarlyStopMethod(Protocol):
-    """A method that views held out may end early."""
-
-    @property
-    def early_stop(self) -> bool:
-        """Whether views held out may end the method."""
-
-
-@runtime_checkable
-class SignedMethod(Protocol):
-    """A method with a setting for voxels below 0."""
-
-    @property
-    def allow_negative(self) -> bool:
-        """Whether it keeps negative voxels."""
-
-
-@runtime_checkable
-class ListedMethods(Protocol):
-    """A method that chooses among others."""
-
-    @property
-    def candidates(self) -> tuple[Method, ...]:
-        """The methods, the preferred one first."""
-
-
-@runtime_checkable
-class CheckpointedMethod(Method, Protocol):
-    """A method with the trait `checkpoints`."""
-
-    @property
-    def planned_steps(self) -> int | None:
-        """Number of steps; None if a time ends the method."""
-
-    @property
-    def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
-        """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
+def for_part(method: M, share: float, of_time: float) -> M:
+    """The method for this share of a volume, in this share of its seconds; itself if its settings depend on neither."""
+    divided = getattr(method, "for_part", None)
+    return method if divided is None else divided(share, of_time)
 
 
 def volumes_of(method: Any) -> int:
@@ -419,4 +360,4 @@ def volume_names_of(method: Any) -> tuple[str, ...]:
 
 def candidates_of(method: Method) -> tuple[Method, ...]:
     """The methods that `method` chooses among, the preferred one first; itself if it does not choose."""
-    return method.candidates if isinstance(method, ListedMethods) else (method,)
+    return tuple(setting(method, "candidates", (method,)))

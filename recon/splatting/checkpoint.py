@@ -16,6 +16,7 @@ from recon.splatting.optimise import FitState, settle
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import NAMES, FitSettings
 
+_GROUPS = ("parameters", "first", "second")
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
 _DECIDED = "decided."  # names of arrays of decisions begin so
@@ -31,7 +32,7 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
     settle(state)
     device = backend or Cpu()
     arrays: dict[str, NDArray[Any]] = {"statistic": device.numpy(state.statistic)}
-    for group in ("parameters", "first", "second"):
+    for group in _GROUPS:
         for name in NAMES:
             arrays[f"{group}.{name}"] = device.numpy(getattr(state, group)[name])
     arrays["counts"] = np.array([getattr(state, name) for name in _COUNTS], np.int64)
@@ -53,9 +54,29 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     Raises:
         ValueError: arrays are missing, disagree in length, or hold values that are not finite.
     """
+    _refuse_damaged(arrays)
     device = backend or Cpu()
-    groups = ("parameters", "first", "second")
-    wanted = [f"{group}.{name}" for group in groups for name in NAMES]
+    parts = {group: {name: device.array(arrays[f"{group}.{name}"]) for name in NAMES} for group in _GROUPS}
+    limit, step, seen = (int(v) for v in arrays["counts"])
+    unit, loss, residual = (float(v) for v in arrays["scalars"])
+    kernel = Kernel.of_exponent(float(arrays["kernel_exponent"]))
+    words = [int(word) for word in arrays["generator"]]
+    rng = np.random.default_rng(0)
+    rng.bit_generator.state = {
+        "bit_generator": "PCG64",
+        "state": {"state": words[0] | words[1] << 64, "inc": words[2] | words[3] << 64},
+        "has_uint32": words[4],
+        "uinteger": words[5],
+    }
+    return FitState(
+        parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
+        kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
+    )  # fmt: skip
+
+
+def _refuse_damaged(arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ValueError as `state_from`."""
+    wanted = [f"{group}.{name}" for group in _GROUPS for name in NAMES]
     others = ("statistic", "counts", "scalars", "kernel_exponent", "drawn", "generator")
     missing = [key for key in (*wanted, *others) if key not in arrays]
     if missing:
@@ -76,22 +97,6 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
     for key in wanted:
         if not np.isfinite(arrays[key]).all():
             raise ValueError(f"{key} of the checkpoint holds values that are not finite")
-    words = [int(word) for word in arrays["generator"]]
-    rng = np.random.default_rng(0)
-    rng.bit_generator.state = {
-        "bit_generator": "PCG64",
-        "state": {"state": words[0] | words[1] << 64, "inc": words[2] | words[3] << 64},
-        "has_uint32": words[4],
-        "uinteger": words[5],
-    }
-    parts = {group: {name: device.array(arrays[f"{group}.{name}"]) for name in NAMES} for group in groups}
-    limit, step, seen = (int(v) for v in arrays["counts"])
-    unit, loss, residual = (float(v) for v in arrays["scalars"])
-    kernel = Kernel.of_exponent(float(arrays["kernel_exponent"]))
-    return FitState(
-        parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
-        kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
-    )  # fmt: skip
 
 
 def decisions_of(made: Mapping[str, Sequence[Any]], names: Sequence[str]) -> dict[str, NDArray[Any]]:

@@ -4,23 +4,35 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
-from recon.base.method import BoundedMethod, CheckpointedMethod, EarlyStopMethod, SignedMethod
+from recon.base.method import Method
 
 if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
+    from collections.abc import Callable, Mapping
+
+    from recon.base.arrays import F32
     from recon.base.choices import Start
     from recon.base.geometry import Geometry
-    from recon.base.method import Clock
+    from recon.base.method import Clock, Plain
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.settings import FitSettings
     from recon.splatting.stream import StreamingFit
 
 
 @runtime_checkable
-class FitMethod(BoundedMethod, EarlyStopMethod, SignedMethod, CheckpointedMethod, Protocol):
+class FitMethod(Method, Protocol):
     """A fit of Gaussians with these settings, see `R2`."""
 
     @property
     def steps(self) -> int | None: ...
+
+    @property
+    def seconds(self) -> float | None: ...
+
+    @property
+    def early_stop(self) -> bool: ...
+
+    @property
+    def allow_negative(self) -> bool: ...
 
     @property
     def gaussians(self) -> int | Gaussians | None: ...
@@ -37,6 +49,20 @@ class FitMethod(BoundedMethod, EarlyStopMethod, SignedMethod, CheckpointedMethod
     @property
     def by_content(self) -> bool:
         """Whether held-out views decide if the fit is worthwhile, see `finish.judged`."""
+
+    @property
+    def planned_steps(self) -> int | None:
+        """Number of steps; None if a time ends the fit."""
+
+    @property
+    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+        """All settings that determine the steps, which a resumed run must share, and more by name."""
+
+    def as_candidate(self) -> Self:
+        """The same fit, which makes its own volume whatever methods on voxels predict."""
+
+    def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
+        """Start the fit on these views; the result runs within the seconds that are then `left`."""
 
     def for_trial(self, share: float, of_steps: float) -> Self:
         """The fit alone, of this share of the rows, with this share of the steps."""

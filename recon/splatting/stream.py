@@ -353,16 +353,8 @@ class StreamingFit:
         return fallen(self._state.step - self._schedule_step, self._settings)
 
     def _begin_round(self, force: bool = False) -> None:
-        theta = np.asarray(self._angles)
         if self._state is None:
-            if not force and (theta.size < self._first_views or covered_angle(theta) < self._first_span):
-                return
-            try:
-                self._place_first(all_views=force)
-            except ValueError:  # no matter in these views: wait for half as many again
-                if force:
-                    raise
-                self._round_views = self.n_views
+            if not self._placed_first(force):
                 return
         elif self._problem is not None:
             # The sample or the beam came later, so the density unit is noise. Or so few views place Gaussians badly.
@@ -376,6 +368,20 @@ class StreamingFit:
         self._state.limit = most if force else min(most, self._state.n + round(_ROUND_GROWTH * self._placed))
         self._round_views = self.n_views
         self._state.drawn = []  # draw from all views from now on
+
+    def _placed_first(self, force: bool) -> bool:
+        """Place the first Gaussians, if the views suffice or there are no others; whether they were placed."""
+        theta = np.asarray(self._angles)
+        if not force and (theta.size < self._first_views or covered_angle(theta) < self._first_span):
+            return False
+        try:
+            self._place_first(all_views=force)
+        except ValueError:  # no matter in these views: wait for half as many again
+            if force:
+                raise
+            self._round_views = self.n_views
+            return False
+        return True
 
     def _place_first(self, known: fit.FitState | None = None, *, all_views: bool) -> None:
         """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual.

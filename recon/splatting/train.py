@@ -154,6 +154,10 @@ class _Length:
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
+    def is_over(self, spent: float) -> bool:
+        """Whether the seconds are spent."""
+        return self.seconds is not None and spent >= self.seconds
+
     def plan(self, plan: FinishPlan, spent: float) -> None:
         """Reserve time for the finish."""
         self.sweeps, finishing, self.trials = plan
@@ -183,6 +187,12 @@ class _Run:
     @property
     def stopped(self) -> bool:
         return self.control.stop()
+
+    @property
+    def stopped_falling(self) -> bool:
+        """Whether the residual of views held out has not fallen for a while."""
+        patience = max(6 * _LOOK, _PATIENCE * (self.length.steps or 0))
+        return self.state.step - self.tracker.best_step > patience
 
     def model(self) -> tuple[Volume, Gaussians]:
         """The volume of the Gaussians, and these, turned as the rows see them."""
@@ -305,18 +315,12 @@ def _steps(run: _Run) -> None:
     done = 0
     while length.steps is None or state.step < length.steps:
         spent = now() - begin
-        if done and (run.stopped or (length.seconds is not None and spent >= length.seconds)):
+        if done and (run.stopped or length.is_over(spent)):
             break
         fit.step(state, run.fitting, run.settings, length.fraction(state.step, spent))
         done += 1
         if done >= _TIMED and length.seconds is not None:
-            spent = now() - begin
-            remaining, step = length.seconds - spent, spent / done
-            if not length.planned and done == _TIMED:
-                length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
-            if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
-                expected = state.step + max(0.0, length.seconds - spent) / step
-                run.settings = in_steps(method.fit, min(expected, length.steps or expected))
+            _pace(run, length.seconds, now() - begin, done)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             run.tracker.measure(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
@@ -325,11 +329,23 @@ def _steps(run: _Run) -> None:
         if run.control.on_checkpoint is not None and now() - saved >= run.control.checkpoint_every:
             run.control.on_checkpoint(run.checkpoint(state))
             saved = now()  # the time that saving takes must not crowd out the fit
-        patience = max(6 * _LOOK, _PATIENCE * (length.steps or 0))
-        if method.early_stop and state.step - run.tracker.best_step > patience:
+        if method.early_stop and run.stopped_falling:
             break
     run.tracker.measure(state, method.early_stop)
     run.report(now())
+
+
+def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
+    """Plan the finish and the rates by the time that the first `done` steps took, for a fit of so many `seconds`."""
+    length, state = run.length, run.state
+    remaining, step = seconds - spent, spent / done
+    if not length.planned and done == _TIMED:
+        length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
+        assert length.seconds is not None
+        remaining = length.seconds - spent
+    if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
+        expected = state.step + max(0.0, remaining) / step
+        run.settings = in_steps(run.method.fit, min(expected, length.steps or expected))
 
 
 def _of_voxels(run: _Run, at: int) -> tuple[Volume, str]:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.method import (
-    CheckpointedMethod,
     DataUse,
     Method,
     PresetMethod,
@@ -110,7 +109,6 @@ class MethodConformance:
 
     def test_it_can_do_what_its_traits_say(self, method: Method) -> None:
         traits = method.traits
-        assert traits.checkpoints is isinstance(method, CheckpointedMethod)
         assert traits.presets is isinstance(method, PresetMethod)
         assert isinstance(traits.halo, int) and traits.halo >= 0
         if traits.held_out:

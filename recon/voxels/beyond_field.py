@@ -105,12 +105,8 @@ def sample_radius(
         given: mm, the radius where that is known.
     """
     reach = geometry.reach
-    if isinstance(given, SampleRadius):
-        return given
     if given is not None:
-        if not 0 <= given < math.inf:
-            raise ValueError(f"sample_radius must be a finite length, 0 for a sample within the field, got {given}")
-        return SampleRadius(given, given, given, 0.0) if given > reach else None
+        return _given_radius(given, reach)
     own = geometry.ordinary
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
@@ -124,6 +120,19 @@ def sample_radius(
     if used.size < LEAST_VIEWS:
         ends = sample_reach(views[used].mean(axis=0), geometry.axis_col) * geometry.sample_pitch
         return SampleRadius(float(np.clip(np.median(ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
+    return _predicting_radius(views, geometry, reach)
+
+
+def _given_radius(given: float | SampleRadius, reach: float) -> SampleRadius | None:
+    if isinstance(given, SampleRadius):
+        return given
+    if not 0 <= given < math.inf:
+        raise ValueError(f"sample_radius must be a finite length, 0 for a sample within the field, got {given}")
+    return SampleRadius(given, given, given, 0.0) if given > reach else None
+
+
+def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRadius | None:
+    """The radius whose volume predicts views held out best; `reach`: of the whole detector."""
     trial = _Trial.of(views, geometry, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
 

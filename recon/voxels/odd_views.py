@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, uniform_filter
@@ -31,9 +30,6 @@ _OUTLIER = 3.0  # times their median: largest contribution of one view
 _SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
 _EXTENT = 0.5  # share of the limit above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
-_LEAST_ON_A_LINE = 3  # views: two are always on a line
-_FARTHEST = 60  # views between two parts of one object
-_LEAST_SPEED = 1.0  # pixels a view: what stands is at one place
 
 
 @dataclass(frozen=True)
@@ -50,38 +46,6 @@ class OddView:
     score: float
     rows: tuple[int, int]
     cols: tuple[int, int]
-
-
-def on_a_line(parts: Sequence[OddView]) -> tuple[OddView, ...]:
-    """The most views, at least _LEAST_ON_A_LINE, whose parts one object makes that moves straight across the field: all
-    absorb more, or all less, in the same rows. In their order; empty where there are none."""
-    best: tuple[OddView, ...] = ()
-    for one, other in combinations(sorted(parts, key=lambda odd: odd.view), 2):
-        if one.view == other.view or other.view - one.view > _FARTHEST:
-            continue
-        speed = (_middle(other) - _middle(one)) / (other.view - one.view)
-        if abs(speed) < _LEAST_SPEED:
-            continue
-        on = {
-            odd.view: odd
-            for odd in parts
-            if odd.score * one.score > 0
-            and odd.rows[0] < one.rows[1]
-            and one.rows[0] < odd.rows[1]
-            and abs(_middle(odd) - _middle(one) - speed * (odd.view - one.view)) <= 0.5 * (one.cols[1] - one.cols[0])
-        }
-        if len(on) > max(len(best), _LEAST_ON_A_LINE - 1):
-            best = tuple(on[view] for view in sorted(on))
-    return best
-
-
-def speed_of(parts: Sequence[OddView]) -> float:
-    """Speed in pixels a view, to the right, by least squares."""
-    return float(np.polyfit([odd.view for odd in parts], [_middle(odd) for odd in parts], 1)[0])
-
-
-def _middle(odd: OddView) -> float:
-    return 0.5 * (odd.cols[0] + odd.cols[1] - 1)
 
 
 def odd_views(

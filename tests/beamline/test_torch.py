@@ -11,7 +11,6 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 
 NEED = {
     "beamline.core.machine",  # asks for its version, where it is loaded
-    "recon.kernels.reference",  # of double precision, for derivatives
     "recon.splatting.autograd",
     "recon.splatting.finish",  # these hold Gaussians as tensors
     "recon.splatting.gaussians",

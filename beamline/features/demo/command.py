@@ -121,9 +121,9 @@ def _compare(
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
     from beamline.reconstruct.options import OutputPaths, report_beside
-    from beamline.reconstruct.outcome import ReportContext, facts_of
-    from beamline.reconstruct.result import axis_of, write_result
-    from beamline.report.record import history_from
+    from beamline.reconstruct.record import axis_of, write_result
+    from beamline.reconstruct.scan_facts import ReportContext, facts_of
+    from beamline.report.history import history_from
     from beamline.storage.readers.open import open_scan
     from beamline.storage.writers.recon_file import read_reconstruction
     from recon.base.method import Reconstruction

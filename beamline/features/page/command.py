@@ -180,10 +180,10 @@ def view(
     pair of opposite views over each other and a slice by FBP are shown with them, for any axis and tilt, which are
     copied as options. TIFFs are a volume unless names, a file of angles or an option say that they are a scan.
 
-    OTHER is shown below it at the same places, and the difference where both have the same shape. Without OTHER the FBP
-    is, where `beamline recon` kept one beside a doubtful volume. Of a volume above 512 MB slices across y and x are
-    binned; those of an OME-Zarr are not (`beamline export`). The page is served to this machine alone: from elsewhere
-    use an ssh tunnel, or --bind (not encrypted). NAME is an array in a file with several, as in FILE.h5::/entry/data.
+    OTHER is shown below it at the same places, and the difference where both have the same shape. Of a volume above
+    512 MB slices across y and x are binned; those of an OME-Zarr are not (`beamline export`). The page is served to
+    this machine alone: from elsewhere use an ssh tunnel, or --bind (not encrypted). NAME is an array in a file with
+    several, as in FILE.h5::/entry/data.
 
     --napari shows VOLUME and OTHER in napari instead, in their units, with labels and the centres of the Gaussians.
 
@@ -216,8 +216,6 @@ def view(
             serve_shown(server, browse)
             return
         volumes = [opened.enter_context(closing(ShownVolume(path, dataset=name))) for path, name in named]
-        if other is None and volumes[0].has_fbp:
-            volumes.append(opened.enter_context(closing(ShownVolume(named[0][0], fbp=True))))
         server = start(lambda access: viewer(volumes, access), open_port(bind, port))
         serve_shown(server, browse)
 

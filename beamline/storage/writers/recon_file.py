@@ -29,7 +29,7 @@ from beamline.storage.writer_lock import opened_whole
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 DEFINITION = "NXtomoproc"
-FBP, DEVIATION = "fbp", "data_errors"
+DEVIATION = "data_errors"
 """Datasets beside the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
@@ -85,19 +85,13 @@ def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     if record.series is not None:
         data["time"] = record.series.seconds
         data["time"].attrs["units"] = "s"
-    beside = {
-        DEVIATION: (record.deviation, "standard deviation of each voxel"),
-        FBP: (record.fbp, "filtered back-projection of the same views"),
-    }
-    for name, (values, meaning) in beside.items():
-        if values is None or empty:
-            continue
-        other = data.create_dataset(name, shape, np.float32, chunks=(1, *shape[1:]))
+    if record.deviation is not None and not empty:
+        other = data.create_dataset(DEVIATION, shape, np.float32, chunks=(1, *shape[1:]))
         for first in range(0, shape[0], _SLAB):
-            other[first : first + _SLAB] = values[first : first + _SLAB]
+            other[first : first + _SLAB] = record.deviation[first : first + _SLAB]
             file.require_taken()
         other.attrs["units"] = record.unit
-        other.attrs["long_name"] = f"{meaning} ({record.unit})"
+        other.attrs["long_name"] = f"standard deviation of each voxel ({record.unit})"
     data["data"].attrs["units"] = record.unit
     what = f"{_LONG_NAMES.get(record.kind, record.kind.value)} ({record.unit})"
     data["data"].attrs["long_name"] = what.removesuffix(" ()")
@@ -146,9 +140,8 @@ def read_reconstruction(path: Path) -> ReconRecord:
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         values = np.asarray(record.volume.data[:], dtype=np.float32)
-        beside = record.deviation, record.fbp
-        deviation, fbp = (None if other is None else np.asarray(other[:], dtype=np.float32) for other in beside)
-        return replace(record, volume=Volume(values, record.volume.grid), deviation=deviation, fbp=fbp)
+        deviation = None if record.deviation is None else np.asarray(record.deviation[:], dtype=np.float32)
+        return replace(record, volume=Volume(values, record.volume.grid), deviation=deviation)
 
 
 @contextmanager
@@ -211,7 +204,6 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
         history={name: np.asarray(datasets.values_of(node)) for name, node in process["history"].items()},
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get(DEVIATION),
-        fbp=data.get(FBP),
         kind=VoxelKind.of_unit(str(data["data"].attrs.get("units"))),
         series=series,
     )

@@ -215,10 +215,7 @@ def _confirmed(
         tick()
         return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
 
-    before = judged([])
-    # Shifts and axis are one: the axis is their mean.
-    places = [term for term in wanted if term in ("axis", "shifts")]
-    groups = [each for each in (places, *([term] for term in wanted if term not in places)) if each]
+    before, groups = judged([]), _groups(wanted)
     kept, after = list(wanted), judged(wanted) if wanted else before
     if not better(after, before):
         kept, after = [], before
@@ -236,6 +233,12 @@ def _confirmed(
     return LearntGeometry(
         change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
     )
+
+
+def _groups(terms: list[str]) -> list[list[str]]:
+    """Terms that are confirmed together: shifts and axis are one, since the axis is their mean."""
+    places = [term for term in terms if term in ("axis", "shifts")]
+    return [group for group in (places, *([term] for term in terms if term not in places)) if group]
 
 
 def _text(change: GeometryChange, term: str, binning: int) -> str:

@@ -163,7 +163,6 @@ def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> N
     result = succeeds("recon", "scan.h5", "--axis", "20.7", "--budget", "1s", "--no-report")
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
     assert "of 1 s; " in lines["chosen"]
-    assert any(line.startswith("longer    ") for line in result.stdout.splitlines())
     parameters = read_reconstruction(folder / "scan_auto.h5").parameters
     assert parameters["budget"] == 1 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
 
@@ -200,7 +199,7 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
         record = read_reconstruction(folder / f"{rings}.h5")
         scores[rings] = ring_score(record.volume.data[0], (middle, middle))
         assert record.parameters["rings"] == rings
-        assert ("--rings auto (by a filter)" in result.stderr) == (rings == "none")
+        assert ("--rings auto removes them" in result.stderr) == (rings == "none")
     assert "Rings: removed by sort; stripes of" in result.stderr
     assert str(record.parameters["rings_removed"]) in result.stderr
     assert scores["auto"] < 0.5 * scores["none"], scores

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ import pytest
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import measure, residuals_along_rows
-from beamline.reconstruct.outcome import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
+from beamline.reconstruct.measured import measured, not_begun_warning
+from beamline.reconstruct.options import OutputPaths
+from beamline.reconstruct.scan_facts import ReportContext, ScanFacts
+from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
-from recon.voxels.matter_checks import stray_mass
 from recon.voxels.projector import project
 from tests.beamline.prepared_views import prepared_views
 
@@ -38,10 +41,21 @@ def _made(
     return Reconstruction(volume, {}, method=method, seconds=1.0), replace(prepared, projections=frames)
 
 
+def warnings_of(made: Reconstruction, prepared: PreparedProjections, selection: Selection = Selection()) -> list[str]:  # noqa: B008
+    """Those of a volume without a report."""
+    facts = ScanFacts(Path("scan.h5"), "scan.h5", "", {}, "")
+    context, target = ReportContext(facts, selection, "", 0), OutputPaths(Path("out.h5"), None)
+    return measured(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings
+
+
+def odd(said: list[str]) -> str:
+    """The warning of views, if there is one."""
+    return "".join(each for each in said if "a part that is not in the volume" in each)
+
+
 def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:
-    said = odd_views_warning(
-        *_made(rng, {7: 0.3, 30: -0.5}, "sirt"), Selection(rows=(FIRST_ROW, FIRST_ROW + 48), binning=2)
-    )
+    selection = Selection(rows=(FIRST_ROW, FIRST_ROW + 48), binning=2)
+    said = odd(warnings_of(*_made(rng, {7: 0.3, 30: -0.5}, "sirt"), selection))
     assert said.startswith("2 views with a part that is not in the volume")
     assert "frame 27, rows" in said and "frame 50, rows" in said and said.count("(absorbs less)") == 1
     worst = said.split("frame 50, rows ")[1].split(" (")[0].replace(", columns", " ...").split(" ... ")
@@ -50,29 +64,29 @@ def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.ra
     assert 2 * 22 >= left > 2 * 18 and 2 * 26 <= right + 1 < 2 * 30
 
 
-def test_mass_where_views_show_nothing_is_told_and_that_of_a_direct_method_is_not(rng: np.random.Generator) -> None:
-    made, prepared = _made(rng, {}, "sirt")
+@pytest.mark.parametrize(("method", "told"), [("sirt", True), ("fbp", False)])
+def test_mass_where_views_show_nothing_is_told_and_that_of_a_direct_method_is_not(
+    method: str, told: bool, rng: np.random.Generator
+) -> None:
+    made, prepared = _made(rng, {}, method)
+    stray = "of the mass of the SIRT volume is stray, where the views show nothing"
+    assert not any(stray in each for each in warnings_of(made, prepared))
     spoiled = made.volume.data.copy()
     spoiled[:, 2:8, 2:8] += 0.02
-    for data, told in ((made.volume.data, False), (spoiled, True)):
-        found = stray_mass(replace(made.volume, data=data), prepared.projections.data, prepared.geometry)
-        assert found is not None
-        said = stray_mass_warning(made, found)
-        assert ("% of the mass of the SIRT volume is stray, where the views show nothing" in said) is told
-        assert stray_mass_warning(replace(made, method="fbp"), found) == ""
+    said = warnings_of(replace(made, volume=replace(made.volume, data=spoiled)), prepared)
+    assert any(stray in each for each in said) is told
 
 
-def test_a_model_of_needles_is_told(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("width", "told"), [(3.0, False), (0.2, True)])
+def test_a_model_of_needles_is_told(width: float, told: bool, rng: np.random.Generator) -> None:
     made, prepared = _made(rng, {}, "r2")
-    for width, told in ((3.0, False), (0.2, True)):
-        model = Gaussians.from_physical(np.zeros((5, 3)), np.tile([width, 4.0, width], (5, 1)), np.ones(5))
-        said = needles_warning(replace(made, gaussians=model), prepared.geometry)
-        assert ("100% of the mass of the model is in Gaussians thinner than a pixel" in said) is told
-    assert needles_warning(made, prepared.geometry) == ""
+    model = Gaussians.from_physical(np.zeros((5, 3)), np.tile([width, 4.0, width], (5, 1)), np.ones(5))
+    said = warnings_of(replace(made, gaussians=model), prepared)
+    assert any("100% of the mass of the model is in Gaussians thinner than a pixel" in each for each in said) is told
 
 
 def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> None:
-    said = odd_views_warning(*_made(rng, dict.fromkeys(range(0, 40, 6), 0.5), "sirt"), Selection())
+    said = odd(warnings_of(*_made(rng, dict.fromkeys(range(0, 40, 6), 0.5), "sirt")))
     assert said.count("frame ") == 5 and "; and 2 more" in said
 
 
@@ -80,10 +94,10 @@ def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_whe
     rng: np.random.Generator,
 ) -> None:
     made, prepared = _made(rng, {7: 0.5}, "sirt")
-    assert odd_views_warning(made, prepared, Selection())
+    assert odd(warnings_of(made, prepared))
     for other in (replace(made, ending=Ending(early=True)), replace(made, method="fbp")):
-        assert odd_views_warning(other, prepared, Selection()) == ""
-    assert odd_views_warning(*_made(rng, {}, "sirt"), Selection()) == ""
+        assert not odd(warnings_of(other, prepared))
+    assert not odd(warnings_of(*_made(rng, {}, "sirt")))
 
 
 @pytest.mark.parametrize("method", ["r2", "os-sirt-tv"])

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from beamline.core.errors import DataError
 from beamline.report import figures
+from beamline.report.history import quality_against_time
 from beamline.report.html import Picture, Report, render, to_html, write_report
 from beamline.report.metrics import METRICS, formatted
-from beamline.report.record import quality_against_time
 from beamline.report.sheets import reference_sheet
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

@@ -19,8 +19,7 @@ from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct import result
-from beamline.reconstruct.judge import judge
+from beamline.reconstruct.measured import measured
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
@@ -232,9 +231,9 @@ def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
 
     def noted(made: Reconstruction, views: PreparedProjections, *more: Any) -> Any:
         judged.append(views.geometry.n_views)
-        return judge(made, views, *more)
+        return measured(made, views, *more)
 
-    monkeypatch.setattr(result, "judge", noted)
+    monkeypatch.setattr("beamline.reconstruct.record.measured", noted)
     used = []
     for method in (Fbp(), FistaTv(iterations=2, tv_weight=0.01)):
         target = OutputPaths(tmp_path / f"{method.name}.h5", None)

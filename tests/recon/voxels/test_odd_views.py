@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.odd_views import LIMIT, OddView, odd_views, on_a_line, speed_of
+from recon.voxels.odd_views import LIMIT, odd_views
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -106,22 +106,3 @@ def test_rows_that_fill_no_cell_count_for_nothing(rng: np.random.Generator) -> N
     views = Projector(geometry, volume.grid).forward(volume.data)
     views += rng.normal(0, SIGMA, views.shape).astype(np.float32)
     assert odd_views(volume, views, geometry) == ()
-
-
-def _part(view: int, col: float, row: int = 8, score: float = 14.0) -> OddView:
-    return OddView(view, score, (row, row + 5), (round(col) - 3, round(col) + 4))
-
-
-@pytest.mark.parametrize("speed", [-7.0, 3.5])
-def test_parts_on_a_line_are_one_object_with_its_speed(speed: float) -> None:
-    crossing = [_part(view, 30 + speed * (view - 20), row=8 + view % 2) for view in (16, 18, 23, 24)]
-    others = [_part(30, 12.0, row=1), _part(18, 5.0), _part(25, 90.0, score=-15.0)]
-    found = on_a_line([*others, *reversed(crossing)])
-    assert found == tuple(crossing)
-    assert speed_of(found) == pytest.approx(speed, abs=0.3)
-
-
-def test_parts_that_stand_or_are_in_other_rows_are_no_object() -> None:
-    assert on_a_line([_part(view, 40.0) for view in range(5)]) == ()
-    assert on_a_line([_part(view, 7.0 * view, row=9 * view) for view in range(5)]) == ()
-    assert on_a_line([_part(0, 10.0), _part(1, 20.0)]) == ()

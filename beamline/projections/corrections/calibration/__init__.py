@@ -1,4 +1,4 @@
-"""Geometry and gains learnt from the views themselves."""
+"""Geometry learnt from the views themselves."""
 
 from __future__ import annotations
 

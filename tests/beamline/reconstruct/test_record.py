@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,26 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from scipy.ndimage import gaussian_filter
 
 import recon
-from beamline.core.errors import DataError
 from beamline.core.events import Event
-from beamline.page.tiles import TileRegion
-from beamline.page.volume import ShownVolume
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext, facts_of
-from beamline.reconstruct.result import write_result
+from beamline.reconstruct.record import write_result
+from beamline.reconstruct.scan_facts import ReportContext, facts_of
 from beamline.report import figures
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
-from recon.base.volume import Grid, Volume
-from recon.voxels.direct import direct
+from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -73,38 +66,6 @@ def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(
     done, _ = _written(made, (prepared, scan[1]), tmp_path / "out.h5")
     assert ("fbp" in done) is compared
     assert not compared or done["fbp"]["residual"] < 0.3
-
-
-@pytest.mark.parametrize("doubtful", [True, False])
-def test_fbp_is_kept_beside_a_volume_that_hides_something(scan: Scan, tmp_path: Path, doubtful: bool) -> None:
-    views, output = scan[0], tmp_path / "out.h5"
-    volume = recon.reconstruct(views.projections.data, views.geometry, recon.FistaTv(iterations=15)).volume
-    if doubtful:
-        volume = replace(volume, data=gaussian_filter(volume.data, (0, 2, 2)))
-    _, said = _written(Reconstruction(volume, {}, method="fista-tv", seconds=1.0), scan, output)
-    record = read_reconstruction(output)
-    np.testing.assert_array_equal(record.volume.data, volume.data)
-    assert any("`beamline view out.h5` shows both" in each for each in said) is doubtful
-    with closing(ShownVolume(output)) as shown:
-        assert shown.has_fbp is doubtful is (record.fbp is not None)
-    if record.fbp is None:
-        with pytest.raises(DataError, match="keeps no FBP"):
-            ShownVolume(output, fbp=True)
-        return
-    expected = direct(views.projections.data, views.geometry, volume.grid, "hann")
-    np.testing.assert_allclose(record.fbp, expected, atol=1e-6)
-    with closing(ShownVolume(output, fbp=True)) as fbp:
-        assert fbp.facts()["name"] == "out.h5, FBP"
-        np.testing.assert_array_equal(fbp.cut(0, 5, TileRegion(0, 40, 0, 40)).values, record.fbp[5])
-
-
-def test_fbp_that_another_format_cannot_keep_is_told(scan: Scan, tmp_path: Path) -> None:
-    grid = Grid.matching(scan[0].geometry)
-    sharp = direct(scan[0].projections.data, scan[0].geometry, grid, "hann")
-    made = Reconstruction(Volume(gaussian_filter(sharp, (0, 2, 2)), grid), {}, method="fista-tv", seconds=1.0)
-    _, said = _written(made, scan, tmp_path / "out.npy")
-    assert any("may hide" in each for each in said)
-    assert any("FBP of the same views is not kept" in each and "--method fbp" in each for each in said)
 
 
 def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.MonkeyPatch) -> None:

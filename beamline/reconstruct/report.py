@@ -9,16 +9,16 @@ import numpy as np
 
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.outcome import ReportContext, as_text, label_of
+from beamline.reconstruct.scan_facts import ReportContext, as_text, label_of
 from beamline.report import figures
-from beamline.report.html import Picture, Report
-from beamline.report.metrics import METRICS, formatted
-from beamline.report.record import (
+from beamline.report.history import (
     history_arrays,
     quality_against_time,
     residual_curve,
     views_grew,
 )
+from beamline.report.html import Picture, Report
+from beamline.report.metrics import METRICS, formatted
 from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction

@@ -5,15 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from beamline.report.record import (
+from beamline.report.history import (
     history_arrays,
     history_from,
     quality_against_time,
     residual_curve,
 )
-from recon.base.method import Progress, Reconstruction
-from recon.base.volume import Grid, Volume
-from recon.splatting.settings import FitSettings
+from recon.base.method import Progress
+from recon.base.volume import Grid
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
 
@@ -26,11 +25,6 @@ def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
     residuals = 10 ** (-(20 + slope * np.log(times)) / 20)
     pairs = zip(times.tolist(), residuals.tolist(), strict=True)
     return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
-
-
-def _made(history: tuple[Progress, ...], method: str = "sirt") -> Reconstruction:
-    settings = {"pace": FitSettings().pace} if method == "r2" else {}
-    return Reconstruction(Volume(np.zeros(GRID.shape, np.float32), GRID), settings, history, method=method, seconds=1.0)
 
 
 def test_there_and_back() -> None:

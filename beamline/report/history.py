@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.report.figures import WIDTH, finish, new_figure, png
-from recon.assess.time_model import record
 from recon.base.method import Progress, Reconstruction
 
 if TYPE_CHECKING:
@@ -56,6 +55,12 @@ class ResidualCurve:
     seconds: NDArray[np.float64]
     residuals: NDArray[np.float64]
 
+    @property
+    def decibels(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(s, -20 log10 of the residual) of the measurements above 0."""
+        known = (self.seconds > 0) & (self.residuals > 0)
+        return self.seconds[known], -20 * np.log10(self.residuals[known])
+
 
 def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve | None:
     """The residual of the views held out, if there are any, else of the views used; None if neither was recorded."""
@@ -93,9 +98,7 @@ def quality_against_time(
     left, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
     _misfit(left, history)
     if curve is not None:
-        axes = others.pop(0)
-        axes.plot(*record(curve.seconds, curve.residuals), color="tab:green", lw=1.2, marker=".", ms=3)
-        finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)
+        _decibels(others.pop(0), curve)
     if growing:
         axes = others.pop(0)
         for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):
@@ -128,3 +131,9 @@ def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
     else:
         axes.set_ylim(bottom=0)
     finish(axes, "time (s)", "", "Misfit", grid=True)
+
+
+def _decibels(axes: Axes, curve: ResidualCurve) -> None:
+    """The residual as dB below the data."""
+    axes.plot(*curve.decibels, color="tab:green", lw=1.2, marker=".", ms=3)
+    finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from beamline.core.events import Sink, VolumeDone, Warned
 from beamline.core.files import write_together
 from beamline.core.quantities import VoxelKind
+from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
-from beamline.reconstruct.judge import VolumeLooks, judge
+from beamline.reconstruct.measured import MeasuredVolume, measured
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext, label_of, partly_seen
-from beamline.report.record import history_arrays
+from beamline.reconstruct.scan_facts import ReportContext, label_of
+from beamline.report.history import history_arrays
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
 from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
@@ -28,10 +29,11 @@ from beamline.storage.volumes.files import opened_volume, write_volume
 from drivers.base.clock import Clock
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
-from recon.base.volume import Volume
+from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
 from recon.prep.align import AxisEstimate
 from recon.splatting.gaussians import Gaussians
+from recon.voxels import view_weights
 
 
 def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
@@ -76,11 +78,11 @@ def write_result(
     """
     phases = context.phases
     phases.enter("measuring the volume")
-    judged = judge(made, prepared.ordinary, truth, target, context, sink, clock, in_parts)
-    remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
-    stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
+    found = measured(made, prepared.ordinary, truth, target, context, sink, clock)
+    remarks = [*found.warnings, *([found.left_out_text] if found.left_out_text else [])]
+    stray = found.stray.map if found.stray is not None and found.stray.share > 0 else None
     context = replace(context, warnings=remarks, stray=stray)
-    record, volumes = _record(judged, prepared, context, clock.now())
+    record, volumes = _record(found, prepared, context, clock.now())
     phases.enter("writing the volume")
     if target.written:
         _write(record, target)
@@ -88,7 +90,7 @@ def write_result(
     if (page := target.report) is not None:
         phases.enter("report")
         try:
-            timed = _report(page, judged, volumes, record.parameters, context)
+            timed = _report(page, found, volumes, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
@@ -104,19 +106,17 @@ def write_result(
 
 def _report(
     page: Path,
-    judged: VolumeLooks,
+    found: MeasuredVolume,
     volumes: Mapping[str, Volume],
     parameters: Mapping[str, Value],
     context: ReportContext,
 ) -> Callable[[float], None]:
     """Write the page; what is returned states on it how long the whole command took, in s."""
-    from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
+    from beamline.reconstruct.report import compose  # here: matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
-    made, target = judged.made, judged.target
-    report = compose(
-        made, judged.prepared, judged.truth, volumes, judged.metrics, parameters, context, judged.unexplained
-    )  # fmt: skip
+    made, target = found.made, found.target
+    report = compose(made, found.prepared, found.truth, volumes, found.metrics, parameters, context, found.unexplained)
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(page, report, replace=target.replace)
     return partial(write_timed, page, report, label_of(made.method))
@@ -127,15 +127,15 @@ def _nothing(elapsed: float) -> None:
 
 
 def _record(
-    judged: VolumeLooks, prepared: PreparedProjections, context: ReportContext, now: float
+    found: MeasuredVolume, prepared: PreparedProjections, context: ReportContext, now: float
 ) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
-    made, target = judged.made, judged.target
+    made, target = found.made, found.target
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))
 
-    volumes = {method: written(volume) for method, volume in judged.volumes.items()}
+    volumes = {method: written(volume) for method, volume in found.volumes.items()}
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
@@ -145,15 +145,14 @@ def _record(
         sample=context.facts.sample or "not stated",
         time=now,
         parameters=parameters_of(made, prepared, context),
-        metrics=judged.metrics[made.method],
+        metrics=found.metrics[made.method],
         history=history_arrays(made.history),
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
         deviation=None if made.deviation is None else written(made.deviation).data,
-        fbp=volumes[BASELINE].data if judged.keeps_fbp else None,
         series=made.series,
-        compared=judged.metrics.get(BASELINE) if len(judged.metrics) > 1 else None,
-        warnings=tuple(judged.warnings),
-        hiding=judged.hiding,
+        compared=found.metrics.get(BASELINE) if len(found.metrics) > 1 else None,
+        warnings=tuple(found.warnings),
+        hiding=found.hiding,
         chosen=made.chosen,
         output=target.outputs[0],
         outputs=dict(zip(target.names, target.outputs, strict=True)) if target.names else {},
@@ -201,7 +200,7 @@ def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconReco
             series = replace(series, data=VoxelsInFile(series.data.shape, partial(_some_volumes, target.outputs)))
     else:
         volume = replace(volume, data=np.array(volume.data))  # it may lie in a temporary file
-    return replace(record, volume=volume, series=series, deviation=None, fbp=None, model={})
+    return replace(record, volume=volume, series=series, deviation=None, model={})
 
 
 def _voxels(path: Path, at: int | None, part: Any) -> NDArray[np.float32]:
@@ -228,9 +227,9 @@ def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
 
 def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
     """All parameters of the volume, by name."""
-    selection, geometry = context.selection, prepared.geometry
-    rows = selection.rows
-    return {
+    selection, geometry, facts = context.selection, prepared.geometry, context.facts
+    done = recorded(in_order(selection), prepared.done)
+    parameters: dict[str, Value] = {
         "method": made.method,
         "axis_col": prepared.axis_col,
         **_axis_parameters(prepared.axis),
@@ -240,23 +239,14 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "n_views": geometry.n_views,
         "n_projections": prepared.n_projections,
         "views_left_out": prepared.left_out,
-        **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
-        "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
+        "rows": "all" if selection.rows is None else f"{selection.rows[0]}:{selection.rows[1]}",
         **_region_parameters(context),
-        **({"frames_per_view": context.facts.frames_per_view} if context.facts.frames_per_view > 1 else {}),
-        **({"columns": context.facts.columns} if context.facts.columns else {}),
-        **({"scan_ended": context.facts.ended} if context.facts.ended else {}),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
-        **(done := recorded(in_order(selection), prepared.done)),
-        **({"view_shifts_px": geometry.shifts} if "jumps" in done or geometry.shifts.any() else {}),
-        **({"slices_partly_seen": few} if (few := partly_seen(geometry)).size else {}),
-        **({"view_roll_deg": np.degrees(geometry.roll)} if geometry.roll.any() else {}),
-        **({"view_tilt_deg": np.degrees(geometry.tilt)} if geometry.tilt.any() else {}),
-        **({CENTRES_KEPT: geometry.centres} if geometry.centres.any() else {}),
-        **({} if geometry.is_straight and not geometry.shifts.any() else {"sample_pitch": geometry.sample_pitch}),
+        **done,
+        **_pose_parameters(geometry, "jumps" in done),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),
@@ -266,8 +256,46 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         **recorded_ending(made.ending),
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
-        **({"recipe": context.recipe} if context.recipe else {}),
     }
+    if prepared.view_weights is not None:
+        parameters["view_weights"] = prepared.view_weights
+    if facts.frames_per_view > 1:
+        parameters["frames_per_view"] = facts.frames_per_view
+    texts = {"columns": facts.columns, "scan_ended": facts.ended, "recipe": context.recipe}
+    return parameters | {name: text for name, text in texts.items() if text}
+
+
+def _pose_parameters(geometry: Geometry, jumps: bool) -> dict[str, Value]:
+    """Where views were displaced, rolled or tilted, and slices that few views see."""
+    parameters: dict[str, Value] = {}
+    if jumps or geometry.shifts.any():
+        parameters["view_shifts_px"] = geometry.shifts
+    if (few := partly_seen(geometry)).size:
+        parameters["slices_partly_seen"] = few
+    turns = {"view_roll_deg": np.degrees(geometry.roll), "view_tilt_deg": np.degrees(geometry.tilt)}
+    parameters |= {name: values for name, values in (turns | {CENTRES_KEPT: geometry.centres}).items() if values.any()}
+    if not geometry.is_straight or geometry.shifts.any():
+        parameters["sample_pitch"] = geometry.sample_pitch
+    return parameters
+
+
+def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
+    """Slices that are seen over less of the half turn than others, because views have different heights."""
+    if geometry.is_cone or not geometry.is_straight or not geometry.shifts[:, 1].any():
+        return np.zeros(0, np.intp)
+    heights = Grid.matching(geometry).coordinates()[0]
+    return np.flatnonzero(view_weights.partly_seen(geometry, heights / geometry.pixel_pitch + geometry.axis_row))
+
+
+def partly_seen_warning(geometry: Geometry) -> str:
+    """The warning that some slices are seen by few views; empty if all are seen equally."""
+    some = partly_seen(geometry)
+    if not some.size:
+        return ""
+    return (
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen over less of the half turn than "
+        "the others, since views stand at heights of their own: there the volume is streaked, and too thin by FBP."
+    )
 
 
 def _region_parameters(context: ReportContext) -> dict[str, Value]:

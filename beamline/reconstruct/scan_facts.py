@@ -1,0 +1,139 @@
+"""Facts of a scan for a report, and the context of a reconstruction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.durations import Phases
+from beamline.core.text import spans
+from beamline.projections.flagged_frames import reasons, reference_images, returned_views, worst_frames
+from beamline.projections.selection import Selection
+from beamline.reconstruct.region import RegionOfRows
+from beamline.storage.flag_legend import FrameFlags, counted
+from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.rules.scan import scan_ended
+from drivers.base.frame import FrameKind
+from recon.methods import by_name
+from recon.voxels.fbp import Filter
+
+if TYPE_CHECKING:
+    from beamline.report.sheets import FlaggedFrame
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """The facts of a scan for a report.
+
+    Attributes:
+        table: facts for people, by name.
+        frames: frames in the file of those triggered, e.g. "110/110".
+        remarks: faults during the scan, by the file.
+        flagged: the worst of the flagged frames.
+        references: mean darks and flats [row, col], binned, by title.
+        shape: of a frame.
+        columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
+        ended: how the scan ended where it did not take all its frames, and why; empty: it did, or runs.
+        frames_per_view: that a view is the mean of.
+        live_picture: file name of the last picture of a volume that grew with its scan; empty: none did.
+    """
+
+    path: Path
+    name: str
+    sample: str
+    table: Mapping[str, str]
+    frames: str
+    remarks: Sequence[str] = ()
+    flagged: Sequence[FlaggedFrame] = ()
+    references: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    shape: tuple[int, int] = (1, 1)
+    columns: str = ""
+    ended: str = ""
+    frames_per_view: int = 1
+    live_picture: str = ""
+
+
+@dataclass(frozen=True)
+class ReportContext:
+    """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
+
+    Attributes:
+        filter: of FBP, also of the one that the volume is compared with.
+        leaves: whether there is time for so many seconds before the report.
+        stray: the map of mass where views show nothing [y, x]; None without any.
+    """
+
+    facts: ScanFacts
+    selection: Selection
+    command: str
+    seed: int
+    warnings: Sequence[str] = ()
+    started: float = 0.0
+    recipe: str = ""
+    region: RegionOfRows | None = None
+    phases: Phases = field(default_factory=Phases)
+    leaves: Callable[[float], bool] = lambda seconds: True
+    stray: NDArray[np.float32] | None = None
+    filter: Filter = "hann"
+
+
+def label_of(method: str) -> str:
+    """The name of a method for people."""
+    return by_name(method).label
+
+
+def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
+    """Facts of an open scan; `flags` replace those of the file."""
+    attributes = dict(source.attributes)
+    sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
+    columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
+    missing, flags = int(attributes.get("missing_triggers", 0)), source.flags if flags is None else flags
+    table = _table(source, sample or "not stated", columns)
+    table["flagged by the monitor"] = "no monitor looked at it" if flags is None else counted(flags.counts())
+    table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
+    n, again, returned = int(source.image_key.size), rows_replaced(source), returned_views(source)
+    if again.size:
+        table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
+    if returned:
+        table["views on the way back"] = "; ".join(view.in_words() for view in returned)
+    remarks = [] if flags is None else reasons(flags)
+    remarks += [f"On the way back {view.in_words()} since the first view." for view in returned if view.moved]
+    return ScanFacts(
+        source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks,
+        flagged=[] if flags is None else worst_frames(source, flags),
+        references=reference_images(source),
+        shape=source.shape,
+        columns=columns,
+        ended=" ".join(finding.message for finding in scan_ended(source)) if source.finished else "",
+        frames_per_view=source.frames_per_view,
+    )  # fmt: skip
+
+
+def _table(source: ScanSource, sample: str, columns: str) -> dict[str, str]:
+    """What the reader knows of a scan, by name, for people."""
+    counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
+    pitch, energy = source.pixel_size_mm, source.energy_kev
+    return {
+        "file": source.path.name,
+        "format": source.format,
+        "sample": sample,
+        "projections": str(counts[FrameKind.PROJECTION]),
+        "flats, darks": f"{counts[FrameKind.FLAT]}, {counts[FrameKind.DARK]}",
+        "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}"
+        + (f", columns {columns}" if columns else ""),
+        "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
+        "energy": "not known" if energy is None else f"{energy:g} keV",
+        "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
+    }
+
+
+def as_text(value: object) -> str:
+    """A value as text for people; the file has the exact value."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
