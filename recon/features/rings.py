@@ -208,8 +208,8 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
         return ""
     return (
         f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "
-        "a column; nothing was removed. --rings auto removes them by a filter; where the sample has layers around the "
-        "axis, compare the volumes."
+        "a column; nothing was removed. --rings auto (by a filter), or of a finished scan --calibrate gains (by the "
+        "volume), removes them; where the sample has layers around the axis, compare the volumes."
     )
 
 

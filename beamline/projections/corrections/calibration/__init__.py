@@ -1,4 +1,4 @@
-"""Geometry learnt from the views themselves."""
+"""Geometry and gains learnt from the views themselves."""
 
 from __future__ import annotations
 

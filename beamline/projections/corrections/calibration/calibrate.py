@@ -1,4 +1,4 @@
-"""Calibration: learns the geometry from the views."""
+"""Calibration: learns geometry and pixel gains from the views."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     GeometryOf = Callable[[Selection, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
+GAINS = "gains"  # the term that changes line integrals
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
 
@@ -38,14 +39,15 @@ def _terms(text: str) -> tuple[str, ...]:
     names = [name.strip() for name in text.split(",")]
     if names == ["none"]:
         return ()
-    if others := [name for name in names if name not in GEOMETRY]:
-        raise ValueError(unknown("term", others[0], GEOMETRY))
-    return tuple(name for name in GEOMETRY if name in names)
+    every = *GEOMETRY, GAINS
+    if others := [name for name in names if name not in every]:
+        raise ValueError(unknown("term", others[0], every))
+    return tuple(name for name in every if name in names)
 
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Which terms of the geometry are learnt from the views.
+    """Which terms of the geometry, and whether gains of pixels, are learnt from the views.
 
     Attributes:
         terms: names; none: nothing.
@@ -58,16 +60,16 @@ class Calibrate:
         "--calibrate",
         "none",
         "Learn these from the views, separated by commas: axis, roll (lean of the axis in the detector's plane), tilt "
-        "(lean along the beam), shifts (of each view). Views are not resampled. What held-out views do not confirm is "
-        "not changed.",
+        "(lean along the beam), shifts (of each view), gains (of pixels). Views are not resampled. What held-out views "
+        "do not confirm is not changed.",
         parse=_terms,
         metavar="LIST",
     )
 
     @property
     def geometry(self) -> frozenset[str]:
-        """What of the geometry is learnt."""
-        return frozenset(self.terms)
+        """The calibrated terms that change the geometry."""
+        return frozenset(self.terms).intersection(GEOMETRY)
 
     @property
     def may_lean(self) -> bool:
@@ -79,18 +81,29 @@ class Calibrate:
         return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=_search_memory(part, self.terms))
+        if not self.terms:  # nothing of it is loaded
+            return StepMemory()
+        from recon.features.calibration.gains import gains_memory
+
+        gains = gains_memory(part.geometry) if GAINS in self.terms else 0
+        return StepMemory(alone=max(_search_memory(part, self.geometry), gains))
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
-        """Raise DataError where the scan has too few views."""
+        """Raise DataError for terms that need more views, or more binned columns, than the scan has."""
         if not self.terms:
             return
+        from recon.features.calibration import gains
         from recon.features.calibration.learn import LEAST_VIEWS
 
-        if usable < LEAST_VIEWS:
-            raise DataError(
-                f"--calibrate: {usable} views are too few; {LEAST_VIEWS} are needed. Leave it out. No view was read."
-            )
+        for term in self.terms:
+            least, wide, views = LEAST_VIEWS, 1, usable
+            if term == GAINS:
+                least, wide, views = gains.LEAST_VIEWS, gains.LEAST_COLS, used
+            if views < least or cols < wide:
+                raise DataError(
+                    f"--calibrate {term}: {views} views of {cols} columns are too few; {least} of {wide} are needed. "
+                    "Leave it out. No view was read."
+                )
 
     def learn(
         self,
@@ -108,9 +121,12 @@ class Calibrate:
     ) -> StepDone:
         if not self.terms:
             return StepDone(parameters={})
-        done = views.done.get(self.name, StepDone())
-        said = {"calibrate": ",".join(self.terms), "calibrate_said": done.sentence}
-        return StepDone(done.sentence, {**said, **(done.parameters or {})})
+        done = [views.done[self.name]] if self.name in views.done else []
+        if GAINS in self.terms:
+            done.append(without_learnt_gains(views, progress))
+        sentence = " ".join(each.sentence for each in done if each.sentence)
+        values = {key: value for each in done for key, value in (each.parameters or {}).items()}
+        return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +209,7 @@ def calibrated(
     return Calibrated(ids, change, whole.pixel_pitch, off, pivot_of(source, selection), band.binning, learnt)
 
 
-def _search_memory(part: ScanPart, terms: tuple[str, ...]) -> int:
+def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
     """Bytes that `calibrated` takes at most."""
     if not terms:
         return 0
@@ -218,3 +234,29 @@ def _band(source: ScanSource, selection: Selection) -> Selection:
     n = min(height, ROWS * binning)
     first = (used.start + used.stop - n) // 2
     return replace(selection, rows=(first, first + n), binning=binning)
+
+
+def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
+    """Correct the views for pixel gains if held-out views confirm them, see `learn_gains`."""
+    from recon.features.calibration.gains import NEAR_AXIS, learn_gains
+
+    try:
+        learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
+    except ValueError as error:
+        raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
+    values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
+    judged = f"views held out are left {learnt.without:.4g} without them and {learnt.left:.4g} with them"
+    if learnt.without == 0:
+        judged = "no stripes are seen in the views that are the detector's"
+    if not learnt.confirmed:
+        sentence = f"Gains learnt with the volume: none taken off; {judged}."
+        return StepDone(sentence, {"learnt_gains": sentence, **values})
+    for view in views.projections.data:
+        view -= learnt.pixels
+    if views.held_out is not None:
+        views.held_out[0][...] -= learnt.pixels
+    sentence = (
+        f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
+        f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."
+    )
+    return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

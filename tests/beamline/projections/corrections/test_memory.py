@@ -12,6 +12,7 @@ import pytest
 
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.beam_hardening.hardening import Hardening
+from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.jumps.jumps import Jumps
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
@@ -42,6 +43,8 @@ ON_ALL = {
     "vo": Rings("vo"),
     "auto": Air("auto"),
     "surface": Air("surface:1"),
+    "background": pytest.param(Calibrate(("background",)), marks=pytest.mark.slow),
+    "gains": pytest.param(Calibrate(("gains",)), marks=pytest.mark.slow),
     "fit": Hardening("fit"),
     "aluminium": Hardening("Al:60kV,Al=1"),
 }

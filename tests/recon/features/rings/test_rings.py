@@ -139,7 +139,7 @@ def test_layers_around_the_axis_are_no_rings(off: float) -> None:
 
 def test_rings_are_named_where_there_are_some(clean: F32, gains: F32) -> None:
     assert rings_seen(clean[:, None], ANGLES, 119.5) == ""
-    assert "--rings auto" in rings_seen((clean + gains)[:, None], ANGLES, 119.5)
+    assert "--calibrate gains" in rings_seen((clean + gains)[:, None], ANGLES, 119.5)
     assert rings_seen((clean + gains)[:, None], ANGLES, 1.0) == ""  # no column has one on the other side of the axis
 
 
