@@ -395,7 +395,11 @@ def _describe(done: RecordedBlock) -> str:
     if untriggered := taken.extra - taken.unconfirmed:
         text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
     if taken.unconfirmed:
-        text += f" {taken.unconfirmed} frames came while the stage braked, and are kept as invalid rows."
+        text += (
+            f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
+            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
+            "stage's. They are kept as invalid rows."
+        )
     if taken.shift:
         text += (
             f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "

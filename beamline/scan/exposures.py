@@ -15,6 +15,7 @@ from beamline.core.events import Sink, Warned
 from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
+from beamline.scan.braking import Braking, assigned, placing, unassigned
 from beamline.scan.control import State
 from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.supervision import Supervision
@@ -36,6 +37,7 @@ ASTRAY_ADVICE = (
     "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
     "that a move is done"
 )
+NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 
 @dataclass
@@ -83,8 +85,8 @@ class BlockTally:
 class _Pass:
     """A pulse train under way: its ledger, its counts, its first trigger within the block, the seconds its move takes.
 
-    `told`: time at which the stage was told to stop during the pass: no trigger is known of the frames from then on.
-    `paused`: for a pause, after which the triggers that come after the last frame stored are exposed anew. `waiting`:
+    `told`: time at which the stage was told to stop during the pass. `paused`: for a pause, after which the triggers
+    that come after the last frame stored are exposed anew. `braking`: for a stop, once the stage stands. `waiting`:
     frames whose trigger is told by those that follow.
     """
 
@@ -94,16 +96,13 @@ class _Pass:
     seconds: float
     told: float = math.inf
     paused: bool = False
+    braking: Braking = NOT_BRAKING
     waiting: list[CameraFrame] = field(default_factory=list)
 
     @property
     def so_far(self) -> Ledger:
         """The ledger so far, settled as if no further frame came."""
-        ledger, exposed = self.ledger, self._exposed
-        for i in range(len(exposed)):
-            entered = enter(ledger, exposed[i:], last=True)
-            ledger = ledger if entered is None else entered[0]
-        return ledger
+        return assigned(self.ledger, self.braking, self._exposed, unassigned)
 
     @property
     def last_due(self) -> float:
@@ -120,8 +119,13 @@ class _Pass:
             last: no further frame will come, so none waits.
         """
         self.waiting += frames
+        brakes = self.braking is not NOT_BRAKING
+        if brakes and not last:
+            return
+        way = placing(self.ledger, self.braking, self._exposed) if brakes else unassigned
         while self.waiting:
-            if (entered := enter(self.ledger, self._exposed, last)) is None:
+            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
+            if (entered := enter(self.ledger, exposed, last)) is None:
                 return
             self.ledger, entry = entered
             trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
@@ -129,10 +133,7 @@ class _Pass:
 
     @property
     def _exposed(self) -> list[DeliveredFrame]:
-        return [
-            DeliveredFrame(frame.framestamp, frame.time if self.paused or frame.time < self.told else math.nan)
-            for frame in self.waiting
-        ]
+        return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
 
 
 class Exposures:
@@ -317,9 +318,14 @@ class Exposures:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
     def _brake(self, flight: _Pass) -> None:
-        """Slow down within a train, and wait until the stage stands."""
+        """Slow down within a train, wait until the stage stands, and ask where."""
+        train, limits = flight.train, self._stage.limits
         flight.told, flight.paused = self._clock.now(), not self._stop.stopping
         self.stand()
+        if not flight.paused:
+            stood = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
+            counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
+            flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
 
     def _one_by_one(self, block: Block, taken: BlockTally) -> Iterator[tuple[CameraFrame, int, float, bool]]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each

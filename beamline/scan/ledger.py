@@ -6,8 +6,8 @@ While a stage turns at constant speed, trigger times are linear in the trigger's
 nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
 Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the
 first frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does.
-This needs the following frames: see `enter`. Frames exposed while the stage brakes come without a time, and belong to
-no trigger. All functions are pure; a Ledger is a value.
+This needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at
+which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from beamline.core.errors import DataError
 
 FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
 NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
+CONFIRMED = 0.2  # periods; the same for a frame of a stage that brakes
 KNOWN = 0.25  # periods: largest error of the first trigger's time that still identifies the first frame
 TRAIN, LOOK = 3, 6  # frames that make a train, and the most frames searched for one
 UNEVEN = 0.25  # periods; frames of a train are more regular than this
@@ -110,6 +111,7 @@ class DeliveredFrame:
 
     framestamp: int
     time: float
+    steady: bool = True
 
 
 def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
@@ -122,7 +124,7 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
     first, *others = frames
     ahead = [frame for frame in others if not math.isnan(frame.time)]
     last = last or len(ahead) < len(others)  # frames without a known time show nothing
-    after, entry = assign(ledger, first.framestamp, first.time)
+    after, entry = assign(ledger, first.framestamp, first.time, first.steady)
     if math.isnan(first.time):
         return after, entry
     if ledger.last < 0 and not start_known(ledger.train):
@@ -135,21 +137,22 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
     if not ahead and not last:
         return None
     for other in ahead:
-        if assign(ledger, other.framestamp, other.time)[1].trigger == entry.trigger:
+        if assign(ledger, other.framestamp, other.time, other.steady)[1].trigger == entry.trigger:
             nearer = abs(_off(ledger, entry.trigger, other.time)) < -off
             return _extra(ledger, first, entry.trigger + off) if nearer else (after, entry)
     return after, entry
 
 
-def assign(ledger: Ledger, framestamp: int, time: float) -> tuple[Ledger, LedgerEntry]:
+def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, LedgerEntry]:
     """Assign a received frame; returns the new ledger, and the frame's trigger and angle.
 
     Frames come in the order in which they were exposed.
 
     Args:
         time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
+        steady: the stage turned at constant speed; else the time is as if it had, and must fit better.
     """
-    train, frame = ledger.train, DeliveredFrame(framestamp, time)
+    train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):
         return _extra(ledger, frame, max(ledger.last, 0))
     new_exposures = framestamp - ledger.exposed
@@ -161,7 +164,7 @@ def assign(ledger: Ledger, framestamp: int, time: float) -> tuple[Ledger, Ledger
         position = ledger.last + (time - ledger.phase) / ledger.period
         trigger = round(position)
         steps, residual = trigger - ledger.last, position - trigger
-    fits = abs(residual) <= FREE
+    fits = abs(residual) <= (FREE if steady else CONFIRMED)
     if new_exposures < 1 or steps < 1 or trigger >= train.n or not fits:
         return _extra(ledger, frame, position, beyond=trigger >= train.n and fits)
     lost = min(exposures, steps) - 1
@@ -177,8 +180,10 @@ def assign(ledger: Ledger, framestamp: int, time: float) -> tuple[Ledger, Ledger
     )
     if ledger.last < 0:
         matched = replace(matched, phase=time, period=train.period, first=(exposures - 1, trigger, position))
-    else:
+    elif steady:
         matched = _follow(ledger, matched, time, steps, residual)
+    else:
+        matched = replace(matched, phase=ledger.phase + steps * ledger.period)
     return matched, LedgerEntry(trigger, float(train.angles[trigger]))
 
 
@@ -192,7 +197,7 @@ def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool 
         unmatched=ledger.unmatched + max(new_exposures - 1, 0),
         extra=(*ledger.extra, frame.framestamp),
         beyond=ledger.beyond + beyond,
-        unconfirmed=ledger.unconfirmed + math.isnan(frame.time),
+        unconfirmed=ledger.unconfirmed + (not frame.steady),
     )
     return after, LedgerEntry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 

@@ -46,6 +46,20 @@ def test_a_stop_keeps_what_was_exposed_and_takes_the_references_still_owed(mode:
     assert run.scan.missing == []
 
 
+def test_frames_taken_while_the_stage_brakes_keep_their_angles_though_they_come_ever_later() -> None:
+    stop = StopRequest()
+    lost = 33
+    instrument = FakeInstrument(Faults(lost={5 + lost}), at={35: stop.stop})
+    run = Run(instrument, instrument.timeline(n=140, speed=55), stop)
+    assert type(run.error) is ScanStopped
+    assert run.views == [i for i in range(len(run.views) + 1) if i != lost]
+    assert len(run.views) > 36  # some came while it braked, one of which was lost
+    assert np.diff([f.time for f in run.of(FrameKind.PROJECTION)])[-1] > 1.5 * instrument.period
+    assert run.of(FrameKind.INVALID) == []
+    assert_true(run.frames, COUNT / 2)
+    assert run.scan.missing == [5 + lost]
+
+
 @pytest.mark.parametrize(
     ("at", "number", "taken"),
     [(Place.END, 12, "P" * 12 + "F" + "DDD"), (Place.BOTH, 1, "DD")],  # darks of the end alone are still owed

@@ -1,0 +1,100 @@
+"""Braking: assigns triggers to the frames that came after a stage was told to stop within a train.
+
+Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
+frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
+begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
+the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
+Frames that neither confirms belong to no trigger. All functions are pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
+
+EARLY, LATE = 0.02, 0.5  # s: braking begins at most so long before, and so long after, the stop was sent
+MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
+FEW = 4  # triggers; fewer exposures show nothing
+SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
+BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not have passed it
+
+
+@dataclass(frozen=True)
+class Braking:
+    """A stage that was stopped during a train of triggers, and stands."""
+
+    told: float  # time at which it was told, in s
+    stood: float  # where it stands, in intervals beyond trigger 0
+    deceleration: float  # intervals/s²
+
+
+Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
+"""Gives a frame the time at which its trigger would have come at constant speed; NaN if unknown."""
+
+
+def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
+    """How to assign frames that arrived during braking: by the stage's motion, by their number, or not at all."""
+    steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
+    fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
+    due = fewest - steady.last
+    if _matched(moved) - _matched(steady) >= MOST * due:
+        return by_motion
+    all_counted = fewest <= counted.last <= most and counted.unconfirmed == ledger.unconfirmed
+    return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else unassigned
+
+
+def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
+    """The ledger after all frames were assigned to triggers in this way."""
+    for i in range(len(frames)):
+        entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
+        ledger = ledger if entered is None else entered[0]
+    return ledger
+
+
+def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Assign the frame to the position that a constant deceleration reaches at its time."""
+    train = ledger.train
+    if ledger.last >= 0:
+        last, phase, period = ledger.last, ledger.phase, ledger.period
+    elif train.first is not None and start_known(train):
+        last, phase, period = 0, train.first, train.period
+    else:
+        return unassigned(ledger, braking, frame)
+    seconds = 1 / (period * braking.deceleration)
+    began = phase + (braking.stood - last) * period - seconds / 2
+    if not -EARLY <= began - braking.told <= LATE:
+        return unassigned(ledger, braking, frame)
+    if frame.time <= began:
+        return frame
+    braked = min(frame.time - began, seconds)
+    return DeliveredFrame(frame.framestamp, began + braked - braked**2 / (2 * seconds), steady=False)
+
+
+def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Assign the frame by the number of exposures since the last one at constant speed."""
+    if frame.time < braking.told or ledger.last < 0:
+        return unassigned(ledger, braking, frame)
+    exposures = ledger.unmatched + frame.framestamp - ledger.exposed
+    return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
+
+
+def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Assign no frame after the stop to a trigger."""
+    return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
+
+
+def _matched(ledger: Ledger) -> int:
+    return ledger.last + 1 - len(ledger.missing)
+
+
+def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
+    """Whether the intervals between exposures grow from the last steady one on."""
+    steady = [DeliveredFrame(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
+    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
+    intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
+    period = ledger.train.period
+    return all(later > before - SHRINKS * period for before, later in pairwise([period, *intervals]))
