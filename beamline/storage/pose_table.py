@@ -1,22 +1,26 @@
-"""PoseTable: displacement, roll and tilt of each view from a CSV or a volume, or its vectors from an .npz."""
+"""PoseTable: displacement, roll and tilt of each view, or its vectors, from a CSV, .npz, a volume or an NXtomo file."""
 
 from __future__ import annotations
 
 import csv
+import re
 import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
 from beamline.core.text import csv_text
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
+from beamline.storage.readers.nexus import choose, find
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import opened_reconstruction
+from drivers.base.frame import FrameKind
 from recon.base.arrays import F64
 from recon.base.vectors import geometry_of_vectors
 
@@ -26,9 +30,14 @@ _KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
 _FOR_PEOPLE = "shift_col_mm", "shift_row_mm"
+_VECTORS = {
+    cone: tuple(f"{vector}_{axis}" for vector in (first, "d", "u", "v") for axis in "xyz")
+    for cone, first in ((False, "ray"), (True, "src"))
+}
 _ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and whether they are of a cone
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
+_HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +49,10 @@ class PoseTable:
         by: what `keys` are: rows of the scan file, views counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
         angles_deg: float64 [row] of the views, to be compared with the scan's; None where the file has none.
-        shifts: float64 [row, 2], displacement of the image along (columns, rows), in pixels.
+        shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
         turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
+        unit: "px" of the unbinned detector, or "mm" at the sample.
+        frames: of the scan that the file was made with; None: not known.
         axis_col: of the volume that the poses are of, in columns of the whole detector; None: not known.
         vectors: float64 [row, 12] in mm, as of `recon.base.vectors`, which state all of the geometry; None: no such.
         cone: the vectors are of a cone.
@@ -53,6 +64,8 @@ class PoseTable:
     angles_deg: F64 | None
     shifts: F64
     turns_deg: F64
+    unit: Literal["px", "mm"] = "px"
+    frames: int | None = None
     axis_col: float | None = None
     vectors: F64 | None = None
     cone: bool = False
@@ -66,32 +79,45 @@ class PoseTable:
         return str(self.path)
 
     def __post_init__(self) -> None:
-        ordered, counts = np.unique(self.keys, return_counts=True)
-        if (counts > 1).any():
-            raise ValueError(f"{self.path}: {self.by} {ordered[counts > 1][0]:g} has {counts.max()} rows; expected one")
-        if (steep := np.abs(self.turns_deg) > (180.0, _STEEPEST)).any():
+        for name, values in (("shift", self.shifts), ("roll or tilt", self.turns_deg)):
+            if not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+                raise ValueError(f"{self.path}: {self.by} {self.keys[row]:g} has no finite {name}")
+        steep = np.abs(self.turns_deg) > (180.0, _STEEPEST)
+        if steep.any():
             row = int(np.flatnonzero(steep.any(axis=1))[0])
             roll, tilt = self.turns_deg[row]
             raise ValueError(
                 f"{self.path}: {self.by} {self.keys[row]:g} has a roll of {roll:g} and a tilt of {tilt:g} degrees; "
                 f"expected at most 180 and {_STEEPEST:g}"
             )
+        ordered, counts = np.unique(self.keys, return_counts=True)
+        if (counts > 1).any():
+            raise ValueError(f"{self.path}: {self.by} {ordered[counts > 1][0]:g} has {counts.max()} rows; expected one")
+
+
+class _NoPosesError(Exception):
+    """A sound file that does not state poses: a ValueError would be taken for damage."""
 
 
 def read_poses(text: str) -> PoseTable:
-    """The table in the file `text`; an empty one for `ignore`.
+    """The table named by `FILE`, or `FILE:x,-y` of an NXtomo file; an empty one for `ignore`.
 
     Raises:
         ValueError: the file cannot be read as poses; the message says why.
     """
-    path = Path(text)
     if text == IGNORE:
-        return PoseTable(path, "view", np.empty(0), None, np.empty((0, 2)), np.empty((0, 2)))
+        return PoseTable(Path(IGNORE), "view", np.empty(0), None, np.empty((0, 2)), np.empty((0, 2)))
+    match = re.fullmatch(r"(.+):([+-]?[xyz]|0),([+-]?[xyz]|0)", text)
+    path = Path(match[1] if match else text)
     try:
         if hdf5.is_hdf5(path):
-            with opened_reconstruction(path) as record:
-                return _of_volume(path, record)
-        return _of_arrays(path) if zipfile.is_zipfile(path) else _of_csv(path, text_in(path, _LARGEST))
+            return _of_hdf5(path, (match[2], match[3]) if match else None)
+        if zipfile.is_zipfile(path):
+            return _of_arrays(path)
+        return _of_csv(path, text_in(path, _LARGEST))
+    except _NoPosesError as error:
+        raise ValueError(str(error)) from error
     except (OSError, DataError) as error:
         raise ValueError(f"{path} cannot be read ({hdf5.reason(error)})") from error
 
@@ -100,55 +126,90 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     lines = [line for line in content.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     head, *rows = list(csv.reader(lines)) or [[]]
     names = [name.strip().lower() for name in head]
-    _require_header(path, names)
+    cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
+    _require_header(path, names, cone)
+    columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
+    by = next(name for name in _KEYS if name in columns)
+    keys, angles = columns[by], columns.get("angle_deg")
+    _require_keys(path, columns, by)
+    if cone is not None:
+        vectors = np.stack([columns[name] for name in _VECTORS[cone]], axis=1)
+        return _of_vectors(path, by, keys, vectors, cone=cone)
+    none = np.zeros(keys.size)
+    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
+    return PoseTable(path, by, keys, angles, shifts, turns)
+
+
+def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
+    """ValueError for a first line without a key and poses, or all vectors (of a cone or not), or with other names."""
+    stated = (*_PIXELS, *_TURNS) if cone is None else _VECTORS[cone]
+    missing = set(stated) - set(names)
+    if not set(names) & set(_KEYS) or (len(missing) == len(stated) if cone is None else missing):
+        raise ValueError(
+            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
+            f"{'some' if cone is None else 'all'} of {', '.join(stated)}"
+        )
+    legal = (*_KEYS, *stated, *(_FOR_PEOPLE if cone is None else ()))
+    for name in names:
+        if name not in legal or names.count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(legal)}")
+
+
+def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
+    """The table [row, column]; ValueError for cells that are no numbers, and without a row."""
+    if not rows:
+        raise ValueError(f"{path} has a header and no rows; expected one for each view")
     values = np.empty((len(rows), len(names)))
     for number, row in enumerate(rows):
         try:
             values[number] = [float(cell) for _, cell in zip(names, row, strict=True)]
         except ValueError:
             raise ValueError(f"{path}: {','.join(row)!r} are not {len(names)} numbers") from None
-    if not rows or not np.isfinite(values).all():
-        raise ValueError(f"{path} has {len(rows)} rows of poses; expected finite numbers in one for each view")
-    columns = dict(zip(names, values.T, strict=True))
-    by = next(name for name in _KEYS if name in columns)
-    keys, none = columns[by], np.zeros(len(rows))
-    if by != "angle_deg" and (bad := keys != np.abs(np.round(keys))).any():
-        raise ValueError(f"{path}: {by} holds {keys[bad][:3].tolist()}; expected whole numbers from 0 on")
-    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
-    return PoseTable(path, by, keys, columns.get("angle_deg"), shifts, turns)
+    return values
 
 
-def _require_header(path: Path, names: list[str]) -> None:
-    """ValueError for a first line without a key or without poses, or with other names."""
-    poses, known = (*_PIXELS, *_TURNS), (*_KEYS, *_PIXELS, *_TURNS, *_FOR_PEOPLE)
-    if not set(names) & set(_KEYS) or not set(names) & set(poses):
-        raise ValueError(
-            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"some of {', '.join(poses)}"
-        )
-    for name in names:
-        if name not in known or names.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(known)}")
+def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
+    """ValueError for keys that are no whole numbers from 0 on, or angles that are not finite."""
+    for name in {by, "angle_deg"} & columns.keys():
+        given = columns[name]
+        bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
+        if bad.any():
+            kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
+            raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
 
 
 def _of_arrays(path: Path) -> PoseTable:
     """Vectors of all views, in an .npz under the name that ASTRA has for their kind."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            read, names = {name: arrays[name] for name in arrays.files if name in _ARRAYS}, arrays.files
-        if len(read) != 1:
-            raise ValueError(f"it holds {', '.join(names)}; expected one of {' and '.join(_ARRAYS)}")
-        ((name, vectors),) = read.items()
-        if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
-            raise ValueError(f"{name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")
-        views = geometry_of_vectors(vectors.astype(np.float64), (1, 1), cone=_ARRAYS[name])
+            read = {name: np.asarray(arrays[name]) for name in arrays.files if name in _ARRAYS}
+            names = arrays.files
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read ({error})") from error
+    if len(read) != 1:
+        raise ValueError(f"{path} holds {', '.join(names)}; expected one of {' and '.join(_ARRAYS)}")
+    ((name, vectors),) = read.items()
+    if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
+        raise ValueError(f"{path}: {name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")
+    keys = np.arange(len(vectors), dtype=np.float64)
+    return _of_vectors(path, "view", keys, vectors.astype(np.float64), cone=_ARRAYS[name])
+
+
+def _of_vectors(path: Path, by: Key, keys: F64, vectors: F64, *, cone: bool) -> PoseTable:
+    try:
+        views = geometry_of_vectors(vectors, (1, 1), cone=cone)
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    n, turns = len(vectors), np.degrees(np.stack((views.roll, views.tilt), axis=1))
-    return PoseTable(
-        path, "view", np.arange(n, dtype=np.float64), None, np.zeros((n, 2)), turns,
-        vectors=vectors.astype(np.float64), cone=_ARRAYS[name],
-    )  # fmt: skip
+    turns = np.degrees(np.stack((views.roll, views.tilt), axis=1))
+    return PoseTable(path, by, keys, None, np.zeros((len(keys), 2)), turns, vectors=vectors, cone=cone)
+
+
+def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        if ways is not None or datasets.text_at(file, "entry/definition") != "NXtomoproc":
+            return _of_nexus(path, file, ways)
+    with opened_reconstruction(path) as record:
+        return _of_volume(path, record)
 
 
 def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
@@ -172,6 +233,50 @@ CENTRES_KEPT = "view_centres_mm"
 
 POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 """Parameters of a volume that keep the poses of its views, shifts in binned pixels."""
+
+
+def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
+    """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
+    places = choose(file, find(file))
+    keys = np.ravel(datasets.values_of(places.image_key))
+    shown = keys == FrameKind.PROJECTION
+    moved: dict[str, F64] = {}
+    for axis in "xyz":
+        item = datasets.dataset(places.entry, f"sample/{axis}_translation")
+        if item is None:
+            continue
+        datasets.require_real(item.dtype, f"{item.name} in {path}")
+        unit = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
+        values = np.ravel(np.asarray(datasets.values_of(item), np.float64))
+        if unit is None or values.size not in (1, keys.size):
+            raise _NoPosesError(
+                f"{path}: {item.name} has {values.size} values in the units {datasets.attribute(item, 'units')!r}; "
+                f"expected one for each of {keys.size} frames, in a unit of length"
+            )
+        values = np.broadcast_to(values * unit, keys.shape)
+        if not np.isfinite(values[shown]).all():
+            raise _NoPosesError(
+                f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections"
+            )
+        moved[axis] = values - np.median(values[shown])
+    if not moved:
+        raise _NoPosesError(
+            f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV"
+        )
+    directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
+    if ways is None:
+        raise _NoPosesError(
+            f"{path}: the sample moves in {directions}, but NeXus does not state the directions on the detector; {_HOW}"
+        )
+    named = {way[-1] for way in ways} - {"0"}
+    if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
+        raise _NoPosesError(
+            f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}"
+        )
+    shifts = [np.zeros(keys.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
+    rows = np.flatnonzero(shown)
+    stacked = np.stack(shifts, axis=1)[rows]
+    return PoseTable(path, "frame", rows.astype(np.float64), None, stacked, np.zeros((rows.size, 2)), "mm", keys.size)
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:

@@ -52,8 +52,9 @@ class PosesOfFile:
         "--poses",
         None,
         "Displacement, roll and tilt of each view; no view is resampled. FILE is a CSV with the columns view or "
-        "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an .npz with "
-        "vectors of each view in mm, as ASTRA has them: parallel3d_vec or cone_vec. "
+        "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an NXtomo file "
+        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. Or vectors of each view in mm, as "
+        "ASTRA has them: a CSV with ray_x (of a cone: src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. "
         "ignore: do not use the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
@@ -88,7 +89,7 @@ def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
         return None
     rows = np.flatnonzero(np.isfinite(shifts).all(axis=1))
     frames = rows.astype(np.float64)
-    return PoseTable(source.path, "frame", frames, None, shifts[rows], np.zeros((rows.size, 2)))
+    return PoseTable(source.path, "frame", frames, None, shifts[rows], np.zeros((rows.size, 2)), frames=len(shifts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +164,8 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
         raise ConfigError(
             f"{learns} learns what {table.path} states: give one of {learns} and --poses, or --poses ignore."
         )
-    shifts, rows = table.shifts, _rows(table, source, frames)
+    shifts = table.shifts * _pixels(table, source, selection)
+    rows = _rows(table, source, frames)
     height, width = source.shape
     if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():  # wide views are a few fields aside
         row = int(np.flatnonzero(far)[0])
@@ -193,7 +195,7 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> G
     except ValueError as error:
         raise DataError(f"{table.path}: {error}. Nothing was read.") from error
     if table.cone != (cone_of(source, selection) is not None):
-        need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give cone_vec"
+        need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
         beam = "a cone" if table.cone else "a parallel beam"
         raise ConfigError(f"{table.path} has vectors of {beam}, and {source.path} is not said to be one: {need}.")
     size = pixel_size(source, selection)
@@ -207,17 +209,37 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> G
     return views.rows(rows.start, rows.stop).binned(selection.binning)
 
 
+def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:
+    """Pixels of the unbinned detector in the table's unit."""
+    if table.unit == "px":
+        return 1.0
+    if cone_of(source, selection) is not None:
+        raise DataError(
+            f"{table.path}: translations of the sample in mm are no shifts of a cone's views, whose matter is "
+            "magnified by its depth. Give a CSV of shifts in pixels. Nothing was read."
+        )
+    size = pixel_size(source, selection)
+    if size is None:
+        raise DataError(f"{table.path} is in mm, and {source.path} does not say its pixel size: give --pixel-size-um.")
+    return 1 / size
+
+
 def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     """[frame of the scan] its row in the table; -1: none. Angles that both state must agree."""
     n, views = source.image_key.size, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if table.frames is not None and table.frames != n:
+        raise DataError(f"{table.path} has {table.frames} frames, {source.path} has {n}; expected the same scan.")
     row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.angles)
     distances = np.diff(np.unique(np.round(degrees[frames], 9)))
     tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
     if table.by == "angle_deg":
         order = np.argsort(table.keys)
         ordered = table.keys[order]
-        nearest = np.rint(np.interp(degrees[views], ordered, np.arange(ordered.size))).astype(np.int64)
-        close = np.abs(ordered[nearest] - degrees[views]) <= tolerance
+        right = np.clip(np.searchsorted(ordered, degrees[views]), 0, ordered.size - 1)
+        left = np.maximum(right - 1, 0)
+        angles = degrees[views]
+        nearest = np.where(np.abs(ordered[left] - angles) < np.abs(ordered[right] - angles), left, right)
+        close = np.abs(ordered[nearest] - angles) <= tolerance
         row_of_frame[views[close]] = order[nearest[close]]
     else:
         into = views if table.by == "view" else np.arange(n)

@@ -142,7 +142,7 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _POSES = "give the shifts of views with --poses"
-_POINTS = "NeXus does not say where it points on the detector; a CSV of shifts for --poses does"
+_POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
 UPRIGHT = "the detector is taken to stand upright to the beam"
 _ENERGY = "energy, where the beams above state none"
 _WAVELENGTH = "energy, where no beam states one"

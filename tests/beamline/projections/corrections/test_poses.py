@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -93,6 +94,9 @@ def test_poses_are_those_of_the_file_in_any_order_and_no_pixel_is_resampled(
     assert found.done["poses"].sentence.startswith("40 poses from")
 
 
+VECTOR_COLUMNS = "{0}_x,{0}_y,{0}_z,d_x,d_y,d_z,u_x,u_y,u_z,v_x,v_y,v_z"
+
+
 def free(*, cone: bool) -> Geometry:
     """Laminography of a parallel beam, or a cone whose source circles at heights and distances of its own."""
     if not cone:
@@ -103,22 +107,24 @@ def free(*, cone: bool) -> Geometry:
 
 @pytest.mark.parametrize(("cone", "selected"), [(False, {"rows": (3, 21), "binning": 2}), (True, {"rows": (3, 21)})])
 def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected: dict[str, object]) -> None:
-    """The true sample explains the views along the rays that an .npz states, whatever angles the scan has."""
+    """The true sample explains the views along the rays that a CSV and an .npz state, whatever angles the scan has."""
     geometry = free(cone=cone)
     path = scan(tmp_path, geometry)
     selected |= {"axis_col": None, "cone": (9.0, 15.0) if cone else None, "pixel_size_mm": geometry.pixel_pitch}
-    file = tmp_path / "vectors.npz"
-    np.savez(file, **{"cone_vec" if cone else "parallel3d_vec": vectors_of(geometry)})
-    found = prepared(path, file, **selected)
+    columns = f"view,{VECTOR_COLUMNS.format('src' if cone else 'ray')}"
+    text = table(tmp_path, columns, np.arange(N), *vectors_of(geometry).T)
+    np.savez(tmp_path / "vectors.npz", **{"cone_vec" if cone else "parallel3d_vec": vectors_of(geometry)})
+    found, of_arrays = (prepared(path, file, **selected) for file in (text, tmp_path / "vectors.npz"))
+    np.testing.assert_allclose(vectors_of(found.geometry), vectors_of(of_arrays.geometry), atol=1e-12)
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
     left = found.projections.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
-    assert found.done["poses"].sentence == f"Vectors of 40 views from {file} state the geometry."
+    assert found.done["poses"].sentence == f"Vectors of 40 views from {text} state the geometry."
 
 
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
-    cone, file = vectors_of(free(cone=True)), tmp_path / "vectors.npz"
-    np.savez(file, cone_vec=cone)
+    columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
+    file = table(tmp_path, columns, np.arange(N), *cone.T)
     with pytest.raises(ConfigError, match=r"of a cone, and .* give --cone 10(\.\d+)?:15\."):
         prepared(path, file, axis_col=None)
     with pytest.raises(ConfigError, match=r"pixels of 60 um, .*of 40 um.*--pixel-size-um"):
@@ -126,14 +132,16 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path
     with pytest.raises(ConfigError, match=r"--axis: the vectors"):
         prepared(path, file, cone=(10.0, 15.0))
     cone[5, 6:9] *= 1.1
-    np.savez(file, cone_vec=cone)
+    file = table(tmp_path, columns, np.arange(N), *cone.T)
     with pytest.raises(DataError, match=r"view 5: its detector pixels .* Nothing was read"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
+    with pytest.raises(ValueError, match=r"expected a header .*src_x, src_y"):
+        read_poses(str(table(tmp_path, columns.replace(",u_z", ""), np.arange(N), *np.delete(cone, 8, axis=1).T)))
     np.savez(tmp_path / "others.npz", vectors=cone)
     with pytest.raises(ValueError, match=r"parallel3d_vec and cone_vec"):
         read_poses(str(tmp_path / "others.npz"))
     np.savez(tmp_path / "complex.npz", parallel3d_vec=cone * 1j)
-    with pytest.raises(ValueError, match=r"complex128.*; expected numbers"):
+    with pytest.raises(ValueError, match=r"complex\.npz: parallel3d_vec is complex128.*; expected numbers"):
         read_poses(str(tmp_path / "complex.npz"))
     np.savez(tmp_path / "damaged.npz", cone_vec=cone)
     damaged = bytearray((tmp_path / "damaged.npz").read_bytes())
@@ -204,17 +212,17 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
     [
         ("", "first line is ''"),
         ("view,x\n0,1\n", "first line is 'view,x'"),
-        ("view,shift_col_px\n", "has 0 rows of poses"),
+        ("view,shift_col_px\n", "header and no rows"),
         ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
         ("view,shift_col_px,shift_col_px\n0,1,2\n", "there twice"),
         ("view,shift_col_px\n0,a\n", "'0,a' are not 2 numbers"),
         ("view,shift_col_px\n0\n", "'0' are not 2 numbers"),
         ("view,shift_col_px\n0,\n", "'0,' are not 2 numbers"),
-        ("view,shift_col_px\n0,nan\n", "expected finite numbers"),
+        ("view,shift_col_px\n0,nan\n", "view 0 has no finite shift"),
         ("view,shift_col_px\n0,1\n0,2\n", "view 0 has 2 rows"),
         ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
         ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected whole numbers"),
-        ("angle_deg,roll_deg\ninf,1\n", "expected finite numbers"),
+        ("angle_deg,roll_deg\ninf,1\n", r"angle_deg holds \[inf\]; expected finite angles"),
         ("view,tilt_deg\n3,86\n", "view 3 has a roll of 0 and a tilt of 86 degrees"),
     ],
 )
@@ -240,6 +248,38 @@ def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) 
     turned = (PosesOfFile(read_poses(str(every(tmp_path)))), TiltAndLens(1.0))
     with pytest.raises(ConfigError, match="--tilt and --poses both"):
         prepared(path, every(tmp_path), steps=turned)
+
+
+def nexus(folder: Path, **moved: np.ndarray) -> Path:
+    path = folder / "motors.nxs"
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"] = np.zeros((FIRST + N, 2, 2), np.uint16)
+        detector["image_key"] = [2, 2, 1, 1] + [0] * N
+        for axis, values in moved.items():
+            item = file.create_dataset(f"entry/sample/{axis}_translation", data=np.append(np.zeros(FIRST), values))
+            item.attrs["units"] = "um"
+    return path
+
+
+def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) -> None:
+    geometry = replace(posed(0 * TURNS), shifts=SHIFTS)
+    path = scan(tmp_path, geometry)
+    motors = nexus(tmp_path, x=12e3 + 1e3 * PITCH * SHIFTS[:, 0], z=-1e3 * PITCH * SHIFTS[:, 1])
+    with pytest.raises(
+        ValueError,
+        match=r"^(?!.*damaged).*moves in x by 0.2\d* mm, z by 0.1\d* mm, but NeXus .*FILE:x,-y",
+    ):
+        read_poses(str(motors))
+    found = prepared(path, f"{motors}:x,-z").geometry.shifts
+    np.testing.assert_allclose(found - found[0], SHIFTS - SHIFTS[0], atol=1e-9)  # but for a common one
+    assert np.abs(np.median(found, axis=0)).max() < 1e-9
+    with pytest.raises(ValueError, match=r"y,x are not"):
+        read_poses(f"{motors}:y,x")
+    with pytest.raises(DataError, match="cone's"):
+        prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
+    with pytest.raises(ValueError, match=r"^(?!.*damaged).*no sample/x_translation"):
+        read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
 
 
 @pytest.mark.slow
