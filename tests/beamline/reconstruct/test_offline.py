@@ -200,7 +200,6 @@ def test_scale_unknown_means_pixels_and_a_given_one_wins(tmp_path: Path) -> None
         ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
         ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
         ({"target": OutputPaths(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
-        ({"quality": "best"}, ConfigError, "r2, r2-published"),  # which FBP would ignore
         ({**FIT, "device": "abacus"}, ConfigError, "--device abacus"),
     ],
 )

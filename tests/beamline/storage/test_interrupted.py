@@ -52,7 +52,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         ("recon",), ("info",), ("validate",), ("monitor",), ("view",), ("runs",), ("export", "-o", "a.tif"),
-        ("segment",), ("surface", "-o", "a.ply"),
+        ("segment",),
     ],
     ids=lambda words: words[0],
 )  # fmt: skip
