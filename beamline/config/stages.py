@@ -6,16 +6,22 @@ folder says.
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
+from zlib import crc32
 
 from pydantic import Field, model_validator
 
 from beamline.config.section import Section, declared, read_from, section_of
+from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
 from drivers.stages.settings import StageDriver, StageSettings, with_keys
+from drivers.stages.shared import LineStage
 from recon.base.registry import Registry, in_folders
 
 STAGES: Registry[StageDriver] = Registry(
@@ -27,6 +33,17 @@ STAGES: Registry[StageDriver] = Registry(
     with_keys,
 )
 """Kind, as a configuration names it -> the driver."""
+
+_IDENTITY = ("model", "serial", "device", "axis", "channel")
+
+
+def settings_file(said: Mapping[str, object], folder: Path) -> Path:
+    """File for the settings of the stage with this description: named by its serial number, or by its port if it
+    reports none.
+    """
+    which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
+    name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
+    return folder / f"{name}-{crc32(json.dumps(which).encode()):08x}.json"
 
 
 class StageSection(Section):
@@ -58,8 +75,15 @@ class StageSection(Section):
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
-        """Connect the driver at the port, or at `url`; see `StageDriver`."""
-        return STAGES[self.kind](url or self.port, self.settings, clock)
+        """Connect the driver at the port, or at `url`; see `StageDriver`. Settings of a real stage are kept on disk."""
+        stage = STAGES[self.kind](url or self.port, self.settings, clock)
+        try:
+            if isinstance(stage, LineStage) and not (url or self.port).lower().startswith("sim://"):
+                stage.keep_found_settings(settings_file(stage.describe(), state_folder() / "stages"))
+        except BaseException:
+            stage.close()
+            raise
+        return stage
 
     def halt(self, clock: Clock) -> None:
         """Stop the stage; see `StageDriver`."""

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from beamline.config.load import Config, plan_of
 from beamline.core.events import (
@@ -37,6 +37,7 @@ LiveCommand = Callable[[Path, Path], Sequence[str]]  # (scan file, output file) 
 _SILENCE = 300.0  # real s without output, after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
+_AGAIN = 2  # times that it is started again
 _POLL = 0.1  # real s between two checks of its readiness
 ASK_LIVE_AFTER = 4.0
 """Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
@@ -121,7 +122,8 @@ class LiveReconstruction:
 
     Its `done` becomes `recon_done` and its `failed` a warning: `done` and `failed` belong to the scan. Its stderr goes
     to the file `log`. A process that cannot be started is a warning, too. It ends with this process, also with one that
-    is killed, and then leaves no volume.
+    is killed, and then leaves no volume. One that a signal kills while the scan runs is started again, twice at most:
+    the file has all views, and its last round makes up for the steps that are lost.
 
     Args:
         enough: is told why the views so far are enough, in the thread that reads the output.
@@ -146,13 +148,19 @@ class LiveReconstruction:
         self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
+        self._command, self._low_priority, self._again = command, low_priority, _AGAIN
+        self._changing = threading.Lock()  # of the process, and of whether another is wanted
+        with self._changing:
+            self._start("x")
+
+    def _start(self, mode: Literal["a", "x"]) -> None:
         try:
-            with log.open("x", encoding="utf-8") as stderr:
+            with self._log.open(mode, encoding="utf-8") as stderr:
                 self._process = ChildProcess(
-                    command, stderr, self._pass_on, tether=True, on_end=self._on_end, behind=low_priority
+                    self._command, stderr, self._pass_on, tether=True, on_end=self._on_end, behind=self._low_priority
                 )
         except OSError as error:
-            sink(Warned(f"The {what} could not be started ({error}). The scan is not affected."))
+            self._sink(Warned(f"The {self._what} could not be started ({error}). The scan is not affected."))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
         """Wait until it has compiled its kernels or ended, `stop` returns True, or the timeout (s of real time) has
@@ -179,7 +187,8 @@ class LiveReconstruction:
             stop: polled a few times a second; True asks it to end with its present volume.
             hurry: polled in the same way; True kills it.
         """
-        process, self._wanted = self._process, False
+        with self._changing:
+            process, self._wanted = self._process, False
         if process is None:
             return None
         ending = process.wait(stop=stop, hurry=hurry, silence=self._silence, grace=_GRACE)
@@ -195,19 +204,32 @@ class LiveReconstruction:
 
     def close(self) -> None:
         """Terminate it if it is still running."""
-        process, self._wanted = self._process, False
+        with self._changing:
+            process, self._wanted = self._process, False
         if process is not None:
             process.end(_CLOSE)
 
     def _on_end(self) -> None:
-        """Warn at once if it ends while the scan runs, because the operator watches a volume that does not grow."""
-        if self._wanted and self._done is None and self._process is not None:
+        """Warn at once if it ends while the scan runs, because the operator watches a volume that does not grow; start
+        it again if it was killed."""
+        with self._changing:
+            process = self._process
+            if not self._wanted or self._done is not None or process is None:
+                return
+            process.let_go()
+            since = time.monotonic()
+            while process.code is None and time.monotonic() - since < _CLOSE:  # its output ends before it does
+                time.sleep(_POLL)
             when = "in the middle of the scan" if self._ready.is_set() else "before it was ready"
-            message = (
-                f"The live reconstruction has ended {when}; see {self._log.name}. The scan goes on without it. To "
-                "start another: beamline recon FILE --follow -o OUT.h5"
-            )
+            if killed := process.code is not None and process.code < 0 and self._again > 0:
+                self._again -= 1
+                then = "It is started again, and takes up the views in the file."
+            else:
+                then = "The scan goes on without it. To start another: beamline recon FILE --follow -o OUT.h5"
+            message = f"The live reconstruction has ended {when} (code {process.code}); see {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
+            if killed:
+                self._start("a")
 
     def _pass_on(self, line: str) -> None:
         try:

@@ -2,7 +2,8 @@
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
 frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
-of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same.
+of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same. Where a
+check hangs, the second thread goes on without the first.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ CHECKED_FRAMES = 2  # most frames that wait between the threads
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
 STALL = 60.0  # real s that a write may take, after which the disk counts as dead
-CHECKED_WITHIN = 300.0  # real s that the checks of a frame may take, which compile once on a machine
+CHECKS = 60.0  # real s that the checks of a frame may take, after which they hang
+COMPILES = 300.0  # the same of the first frame of a kind, whose checks may compile
+STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
@@ -85,8 +88,8 @@ class Recorder:
 
     No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
     so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
-    raise DataError where a frame could not be written, or a write or the checks of a frame take too long. A
-    stop or an abort waits for neither: what the camera still owes is kept in memory.
+    raise DataError where a frame could not be written, or a write takes longer than STALL. Checks that hang switch the
+    monitor off. A stop or an abort waits for neither: what the camera still owes is kept in memory.
 
     Args:
         pause: a request that pauses the scan.
@@ -118,6 +121,10 @@ class Recorder:
         self._monitor_off = False
         self._unjudged: list[int] = []  # frames that the monitor did not look at
         self._check_name = ""  # that looks, or looked last
+        self._handing = threading.Lock()  # of the two values below: whoever takes the frame out hands it on
+        self._under_checks: tuple[Frame, float] | None = None  # what the first thread works on, and since when
+        self._alone = False  # the second thread goes on without the first
+        self._compiled: set[FrameKind] = set()  # kinds of frames that were checked
         self.n_frames = 0
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
@@ -137,7 +144,7 @@ class Recorder:
         self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
         self._backlog = BacklogGuard(most, pause, self._work) if views.trains else None
         self._flying = False
-        self._looked_at, self._checking_since, self._writing_since = -math.inf, math.inf, math.inf
+        self._looked_at, self._writing_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
         self._thread.start()
         threading.Thread(target=self._check_frames, name="recorder's checks", daemon=True).start()
@@ -236,10 +243,6 @@ class Recorder:
                 return
 
     def _refuse_stall(self) -> None:
-        if time.monotonic() - self._checking_since > CHECKED_WITHIN:
-            raise DataError(
-                f"The check {self._check_name} has not come back from a frame for {CHECKED_WITHIN:g} s. {self._safe()}"
-            )
         if time.monotonic() - self._writing_since > STALL:
             raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
 
@@ -256,14 +259,18 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _check_frames(self) -> None:
-        """The first thread: digests and checks, until the last frame."""
+        """The first thread: digests and checks, until the last frame, or until the second one goes on alone."""
         while (item := self._next()) is not None:
             if isinstance(item, threading.Event):
                 self._checked.put(item)
             elif self._failure is None:  # frames after a failure are discarded, so that `put` does not wait for room
-                self._checking_since = time.monotonic()
+                self._under_checks = item, time.monotonic()
                 checked = self._digested(item)
-                self._checking_since = math.inf
+                with self._handing:
+                    if self._alone:
+                        return
+                    self._under_checks = None
+                self._compiled.add(item.kind)
                 self._checked.put(checked)
         self._checked.put(None)
 
@@ -281,9 +288,38 @@ class Recorder:
         finally:
             self._work.checking += time.monotonic() - begun
 
+    def _next_checked(self) -> _Item:
+        """The next item of the second thread, which digests frames itself once the checks hang."""
+        while True:
+            with suppress(Empty):
+                return self._checked.get(not self._alone, SLICE)
+            if self._alone:
+                item = self._next()
+                return self._digested(item) if isinstance(item, Frame) else item
+            self._give_up_checks_that_hang()
+
+    def _give_up_checks_that_hang(self) -> None:
+        """Switch the monitor off where it takes too long, and take its frame; the first thread may hang for ever."""
+        with self._handing:
+            if self._under_checks is None:
+                return
+            frame, since = self._under_checks
+            usual = CHECKS if frame.kind in self._compiled else COMPILES
+            limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
+            if (seconds := time.monotonic() - since) <= limit:
+                return
+            self._monitor_off = self._alone = True
+        self._sink(
+            Warned(
+                f"The check {self._check_name} has not come back from frame {frame.index} for {seconds:.0f} s. The "
+                "monitor is off: frames from here on are stored without flags."
+            )
+        )
+        self._checked.put(self._digested(frame))
+
     def _write_frames(self) -> None:
         """The second thread: writes, and reports."""
-        item, flushed = self._checked.get(), True
+        item, flushed = self._next_checked(), True
         while True:
             begun = time.monotonic()
             try:
@@ -308,7 +344,7 @@ class Recorder:
                 return
             if isinstance(item, threading.Event):
                 item.set()
-            item = self._checked.get()
+            item = self._next_checked()
 
     def _next(self) -> Frame | threading.Event | None:
         """The next item of the queue; checks the disk about once a second meanwhile."""

@@ -1,10 +1,16 @@
-"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore."""
+"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
+
+Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
+program that is killed leaves its speed in the controller, and the next one would take it for the original.
+"""
 
 from __future__ import annotations
 
+import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TypeVar
 
 from drivers.base.clock import Clock
@@ -18,12 +24,45 @@ class FoundSettings:
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
+        self.notice = ""
+        """What an earlier program left, in words; "" if it restored all."""
+        self._file: Path | None = None
+
+    def keep_in(self, file: Path) -> None:
+        """See `LineStage.keep_found_settings`."""
+        earlier = {name: value for name, value in _settings_in(file).items() if name in self.values}
+        changed = [
+            f"{name} {self.values[name]} for {value}" for name, value in earlier.items() if self.values[name] != value
+        ]
+        self.values |= earlier
+        self._file, whole = file, file.with_suffix(".new")
+        with suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            whole.write_text(json.dumps(self.values), encoding="utf-8")
+            whole.replace(file)
+        if changed:
+            self.notice = (
+                f"a program that was killed, or lost this stage, left {', '.join(changed)}; "
+                "what stood there before is restored at the end"
+            )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
-        """Write each setting back, once."""
+        """Write each setting back, once. If one is refused, the file keeps them all."""
         values, self.values = self.values, {}
         for name, value in values.items():
             write(name, value)
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.unlink(missing_ok=True)
+
+
+def _settings_in(file: Path) -> dict[str, str]:
+    """Settings that an earlier program found and did not restore; empty if it did, or where the file is not whole."""
+    with suppress(OSError, ValueError):
+        found = json.loads(file.read_text(encoding="utf-8"))
+        if isinstance(found, dict):
+            return {str(name): str(value) for name, value in found.items()}
+    return {}
 
 
 class Stops:
@@ -144,6 +183,9 @@ class LineStage(RotationStage):
     no thread takes the move as complete. Closing restores the settings that the driver has changed.
     """
 
+    _found: FoundSettings
+    """What opening and moves change in the controller, as it was found."""
+
     def __init__(self, url: str, settings: Any, clock: Clock, name: str) -> None:
         self.name, self._url, self._clock = name, url, clock
         self._travel, self._stops = Travel(name, settings.limits()), Stops(name, self._send_stop)
@@ -181,6 +223,14 @@ class LineStage(RotationStage):
     @property
     def limits(self) -> StageLimits:
         return self._travel.limits
+
+    def keep_found_settings(self, file: Path) -> None:
+        """Keep the settings that the controller was found with in `file`, too, until they are restored.
+
+        Those of an earlier program that died are restored at the end instead of what it left, and `describe` says so. A
+        disk that refuses costs only this.
+        """
+        self._found.keep_in(file)
 
     def close(self) -> None:
         if not self._closed:

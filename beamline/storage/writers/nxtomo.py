@@ -52,6 +52,10 @@ LAST = (
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
 
 
+class _TouchedError(OSError):
+    """Another program has cut or deleted the file while it was written."""
+
+
 def _new_file(path: Path) -> h5py.File:
     """DataError where the file exists or HDF5 cannot make it; nothing is left of it then."""
     try:
@@ -128,7 +132,7 @@ class NXtomoWriter:
             raise
         self._table = Rows(self._file)
         self._handle: int = self._file.id.get_vfd_handle()
-        self._to_disk, self._has_links = ToDisk(self._handle), os.fstat(self._handle).st_nlink > 0
+        self._to_disk, self._before = ToDisk(self._handle), os.fstat(self._handle)
         self._progress = self._file[layout.COMMITTED]
         # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
@@ -145,7 +149,7 @@ class NXtomoWriter:
             mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces, frame.aside,
         )  # fmt: skip
         try:
-            self._require_there()
+            self._require_untouched()
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
                 if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
@@ -182,12 +186,12 @@ class NXtomoWriter:
         """Commit the rows so far, regardless of `flush_every`; does nothing after a failed write."""
         if self._broken:
             return
-        self._require_there()
+        self._require_untouched()
         self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()
-        self._committed = self._rows
+        self._committed, self._before = self._rows, os.fstat(self._handle)
         self._to_disk(self._committed)
 
     def close(
@@ -277,10 +281,13 @@ class NXtomoWriter:
                 os.dup2(nowhere.fileno(), self._handle)
                 self._file.close()
 
-    def _require_there(self) -> None:
-        """Raise OSError where another program has deleted the file: HDF5 would write on."""
-        if self._has_links and os.fstat(self._handle).st_nlink == 0:
-            raise FileNotFoundError(errno.ENOENT, "another program has deleted it")
+    def _require_untouched(self) -> None:
+        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        now = os.fstat(self._handle)
+        if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
+            raise _TouchedError(errno.ENOENT, "it was deleted")
+        if now.st_size < self._before.st_size:
+            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""
@@ -296,6 +303,12 @@ class NXtomoWriter:
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
+        if isinstance(error, _TouchedError):
+            return DataError(
+                f"{self.path} was touched by another program while it was written: {error.strerror}. Of the "
+                f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
+                "the copy, and scan again."
+            )
         free = ""
         with suppress(OSError):  # the folder may have moved
             free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"

@@ -19,7 +19,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
 from drivers.stages.settings import StageFigures, key
-from drivers.stages.shared import FoundSettings, LineStage, until_standing, while_it_moves
+from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
 
 
 class Search(StrEnum):
@@ -221,6 +221,7 @@ class EpicsStage(LineStage):
             "model": self._model,
             "port": self._url,
             "trigger_output": "none",
+            **found_at_opening(self._found.notice),
             **self._travel.described(),
         }
 

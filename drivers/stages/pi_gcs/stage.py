@@ -40,6 +40,7 @@ class PiGcsStage(LineStage):
         self._told = 0  # the code of the error register that an error has told
         self._line = GcsLine(url, settings.axis, settings, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
+        self._found = self._axis.found
         with self._closed_on_failure():
             self._identity = self._axis.open(Fraction(settings.acceleration) * self._per_radian)
             self._serial = self._identity.split(",")[2].strip() if self._identity.count(",") >= 2 else ""
@@ -128,7 +129,7 @@ class PiGcsStage(LineStage):
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **({"serial": self._serial} if self._serial else {}),
-            **found_at_opening(meaning(self._axis.error_at_opening)),
+            **found_at_opening(meaning(self._axis.error_at_opening), self._found.notice),
             **self._travel.described(),
         }
 

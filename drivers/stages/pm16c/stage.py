@@ -91,6 +91,7 @@ class PM16CStage(LineStage):
         self._home = None if settings.home is None else self._travel.to_counts(settings.home)
         self._search: HomeSearch | None = None
         self._channel = PM16CChannel(url, settings.channel, settings, clock, name)
+        self._found = self._channel.found
         with self._closed_on_failure():
             self._version = self._channel.open(settings.rate_code)
             if (own := self._channel.own_limits()) is not None:
@@ -169,7 +170,7 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
-            **found_at_opening(self._channel.error_at_opening),
+            **found_at_opening(self._channel.error_at_opening, self._found.notice),
             **self._travel.described(),
         }
 

@@ -130,7 +130,7 @@ class ZaberStage(LineStage):
         self._settings, (self._fastest, steepest) = settings, settings.native_limits
         self._told = frozenset[str]()  # flags that an error, or the description, has told
         self._axis = ZaberAxis(url, settings, clock, name)
-        self._pulses = ZaberPulses(self._axis, settings.pulses, name)
+        self._found, self._pulses = self._axis.found, ZaberPulses(self._axis, settings.pulses, name)
         with self._closed_on_failure():
             self._identity = self._axis.open()
             refuse_another(name, settings.serial, self._identity.serial)
@@ -242,7 +242,7 @@ class ZaberStage(LineStage):
             "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            **found_at_opening("" if flags is None else flags.text),
+            **found_at_opening("" if flags is None else flags.text, self._found.notice),
             **self._travel.described(),
         }
 

@@ -19,6 +19,7 @@ from beamline.scan.live_process import LiveReconstruction, follow_command
 from beamline.scan.run import run_scan
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
+from tests.clock import wait_until
 
 
 def test_what_it_leaves_out_is_told_to_the_follower() -> None:
@@ -117,6 +118,34 @@ def test_a_live_reconstruction_that_dies_touches_nothing(
     ran.assert_good_file(19, "complete")
     if says.endswith("1"):
         assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("times", [1, 9])
+def test_one_that_is_killed_in_the_scan_is_started_again_but_not_for_ever(tmp_path: Path, times: int) -> None:
+    code = f"""
+import json, os, pathlib, signal, sys
+starts = pathlib.Path(sys.argv[1]).with_name("starts")
+starts.write_text(starts.read_text() + "+" if starts.exists() else "+")
+if len(starts.read_text()) <= {times}:
+    os.kill(os.getpid(), signal.SIGKILL)
+pathlib.Path(sys.argv[2]).write_text("volume")
+print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}}))
+"""
+
+    def wait() -> None:
+        wait_until(lambda: "recon_done" in said or any("again" not in text for text in said if "has ended" in text))
+
+    said: list[str] = []
+    instrument = FakeInstrument(at={10: wait})
+    result = run_scan(
+        small(), tmp_path, [lambda event: said.append(str(event.data.get("message", event.event)))],
+        live=script(code), instrument=instrument.connected(),
+    )  # fmt: skip
+    (folder,) = tmp_path.iterdir()
+    assert (folder / "starts").read_text() == "+" * min(times + 1, 3)
+    assert sum("It is started again" in text for text in said) == min(times, 2)
+    assert (result.recon is not None) == (times == 1)
 
 
 def test_an_abort_ends_the_live_reconstruction(tmp_path: Path) -> None:

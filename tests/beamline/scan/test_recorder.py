@@ -226,17 +226,6 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     assert "monitor failed at frame 0" in off and "did not look at 19 frames (0-18)" in unjudged
 
 
-def test_a_check_that_hangs_ends_the_scan_with_the_frames_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    free = threading.Event()
-    monkeypatch.setattr(module, "look_past_failures", lambda *_: free.wait(60))
-    monkeypatch.setattr(module, "CHECKED_WITHIN", 0.05)
-    recorder = record(Writer())
-    recorder.put(frame(0))
-    with pytest.raises(DataError, match=r"has not come back from a frame.*first 0 frames are safe"):
-        recorder.finish()
-    free.set()
-
-
 @pytest.mark.parametrize("checks", [(), ("timing",), ("blur",)])
 def test_views_with_a_warning_are_to_be_taken_again_where_the_check_is_named(checks: tuple[str, ...]) -> None:
     recorder = record(Writer(), consequences=Consequences(retaken_warnings=frozenset(checks)))

@@ -1,6 +1,8 @@
 """However a scan ends: with all its frames, or with an exit code that is not 0. A check or an output ends none."""
 
 import tempfile
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import BeamlineError, exit_code
+from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, Level, Look
 from beamline.monitor.field import MassCheck
+from beamline.scan import recorder
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
-from tests.beamline.fakes import SHAPE, FakeInstrument
+from tests.beamline.fakes import SHAPE, FakeInstrument, Faults
 from tests.beamline.ran import Ran
 
 FRAMES = 19
@@ -80,6 +84,7 @@ class Broken:
 
 def _ran(runs: Path, place: str, which: int, nth: int, once: bool = False, mode: str = "fly") -> Ran:
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorder, "COMPILES", 600.0)  # on a busy machine
         broken = Broken(patch, place, which, nth, once)
         return Ran(runs, broken.instrument, f"scan.mode={mode}", heard=broken.heard)
 
@@ -125,3 +130,35 @@ def test_what_is_no_exception_and_no_look_ends_no_scan_in_silence(tmp_path: Path
         assert ["the check mass failed at frame 8" in event.data["message"] for event in ran.of("warning")] == [True]
     else:
         assert isinstance(ran.error, RuntimeError) and "SystemExit" in str(ran.error)
+
+
+@pytest.mark.parametrize("aborted", [False, True])
+def test_a_check_that_hangs_costs_no_frame_and_holds_up_no_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, aborted: bool
+) -> None:
+    """Its frame and those that wait behind it are stored; what was not judged is said."""
+    for name in ("CHECKS", "ABORTED"):
+        monkeypatch.setattr(recorder, name, 0.05 if (name == "ABORTED") is aborted else 600.0)
+    monkeypatch.setattr(recorder, "SLICE", 0.02)
+    stop, free, look = StopRequest(), threading.Event(), MassCheck.look
+
+    def hangs(check: MassCheck, state: Any, frame: Any, *rest: Any) -> Any:
+        if frame.index == 7:
+            free.wait(60)
+        return look(check, state, frame, *rest)
+
+    monkeypatch.setattr(MassCheck, "look", hangs)
+    instrument = FakeInstrument(Faults(), on_frame=lambda n: stop.abort() if aborted and n == 11 else None)
+    began = time.monotonic()
+    try:
+        ran = Ran(tmp_path, instrument, stop=stop)
+    finally:
+        free.set()
+    assert time.monotonic() - began < 30
+    ran.assert_safe()
+    n = 12 if aborted else FRAMES
+    assert type(ran.error) is (ScanAborted if aborted else type(None))
+    ran.assert_good_file(n, "stopped" if aborted else "complete")
+    off, unjudged = ran.warnings
+    assert "The check mass has not come back from frame 7" in off
+    assert f"The monitor did not look at {n - 7} frames (7-{n - 1})" in unjudged

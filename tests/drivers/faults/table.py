@@ -105,6 +105,19 @@ LINE: tuple[LineFault, ...] = (
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
+NOT_RESTORED: Mapping[str, str] = MappingProxyType(
+    {
+        kind: f"a program that was killed, or lost this stage, left {settings}; "
+        "what stood there before is restored at the end"
+        for kind, settings in {
+            "pm16c": r"RTE 042 for 024, SPDH \d+ for 1000",
+            "pi_gcs": r"VEL \d+\.0{6} for 10\.0{6}, SPA 0xB 60\.0{6} for 100\.0{6}, SPA 0xC 60\.0{6} for 100\.0{6}",
+            "zaber": r"maxspeed \d+ for 16384, motion\.accelonly \d+ for 100, motion\.decelonly \d+ for 100, "
+            r"comm\.checksum 1 for 0",
+        }.items()
+    }
+)
+"""Controller -> what the next scan tells of a stage that was unplugged: its settings could not be restored."""
 
 
 @dataclass(frozen=True)

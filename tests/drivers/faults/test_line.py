@@ -86,7 +86,7 @@ def test_stage_unplugged(rig_of: RigOf, kind: str, phase: Phase, tmp_path: Path)
         assert_known_to_be_unsafe(rig, scanned)
         assert_kept(scanned)
     if phase in (Phase.OPENING, Phase.TURNING):
-        assert_next_scan_works(rig, tmp_path)
+        assert_next_scan_works(rig, tmp_path, "" if phase is Phase.OPENING else table.NOT_RESTORED[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -110,4 +110,4 @@ def test_a_scan_begun_while_an_unplugged_stage_still_turns_is_refused(rig_of: Ri
     scanned = rig.scan(tmp_path)
     assert "opening is not possible while it moves" in str(scanned.error)
     assert scanned.folder is None
-    assert_next_scan_works(rig, tmp_path)
+    assert_next_scan_works(rig, tmp_path, table.NOT_RESTORED[table.CAMERA_KIND])

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -223,13 +224,26 @@ def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
         assert source.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)
 
 
+def _cut(path: Path) -> None:
+    os.truncate(path, 0)
+
+
+def _cut_in_half(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows lets nobody touch a file that is open")
-def test_a_file_that_another_program_deletes_ends_the_scan(writer: NXtomoWriter, frames: list[Frame]) -> None:
-    """HDF5 writes on, so that nothing else tells."""
-    append(writer, *frames[:5])
-    writer.path.unlink()
-    with pytest.raises(DataError, match="another program has deleted it"):
-        append(writer, frames[5])
-    with pytest.raises(DataError, match="earlier write failed"):
-        append(writer, frames[6])
+@pytest.mark.parametrize("at", [5, 14])
+@pytest.mark.parametrize(("touch", "said"), [(_cut, "to 0 bytes"), (_cut_in_half, "was cut"), (Path.unlink, "deleted")])
+def test_a_file_that_another_program_touches_ends_the_scan(
+    writer: NXtomoWriter, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
+) -> None:
+    """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
+    with pytest.raises(DataError, match=f"was written:.*{said}"):
+        for frame in frames:
+            if frame.index == at:
+                touch(writer.path)
+            append(writer, frame)
+        touch(writer.path)
+        writer.close()
     writer.close("failed")
