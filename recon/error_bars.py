@@ -81,7 +81,7 @@ def error_bars(
     geometry = problem.geometry
     if method.traits.error_bars is None:
         known = ", ".join(with_trait("error_bars"))
-        raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
+        raise ValueError(f"the error bars of {method.name} are not calibrated; those of these methods are: {known}")
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
             f"error bars split the views into two halves: at least {LEAST_VIEWS} views are needed, "

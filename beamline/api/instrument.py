@@ -117,7 +117,7 @@ class Instrument:
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
                 f"of {', '.join(wanted)}, something belongs to devices that are open, and would have no effect. Give "
-                f"it to `connect`. A scan of its own can have other angles, times, optics, checks, and the camera's "
+                f"it to `connect`. A single scan can have other angles, times, optics, checks, and the camera's "
                 f"roi, binning and readout. Nothing was started."
             )
         return config

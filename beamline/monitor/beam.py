@@ -119,7 +119,7 @@ class BeamCheck(Logged):
                 return Look(replace(state, drifting=0))
             advice = (
                 f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
-                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
+                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be measured."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
         gone = state.told != 0 and abs(score) < GONE * self.drift

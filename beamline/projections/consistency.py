@@ -314,7 +314,7 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 "give --time N for several in time, --calibrate shifts where the sample moved as a whole, or --views "
                 "for a part of the scan."
             )
-    return Law("views of the same rays", worst, 1.0, "of the least change that is told", sentence)
+    return Law("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:

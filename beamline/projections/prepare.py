@@ -178,7 +178,7 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
 
 
 def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
-    """Of a size, an energy or a distance that no instrument has, as of a mistaken unit."""
+    """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
     size_mm = pixel_size(source, selection)
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names

@@ -1,4 +1,4 @@
-"""Live reconstruction: a process of its own that follows the growing file, so that its failure cannot harm the scan."""
+"""Live reconstruction: a separate process that follows the growing file, so that its failure cannot harm the scan."""
 
 from __future__ import annotations
 

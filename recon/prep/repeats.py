@@ -78,7 +78,7 @@ def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
 def _sums(
     data: F32, geometry: Geometry, pair: tuple[int, int], side: int
 ) -> Iterator[tuple[F64, F64, float, float, int]]:
-    """Of each band of rows: normal equations of the changes; squares of the difference and of the structure; pixels."""
+    """Sums for each band of rows: normal equations of the changes; squares of difference and structure; pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
     at = min(later, len(data) - 2)
     beside = data[[first, later, at - 1, at, at + 1]]

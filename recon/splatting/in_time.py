@@ -1,4 +1,4 @@
-"""In time: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
+"""A time limit: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
 
 
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
-    """Groups of pages alike, without copies of reduced resolution, masks, and thumbnails.
+    """Groups of pages of one shape and type, without copies of reduced resolution, masks, and thumbnails.
 
     Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
     that it has a header for the first alone.
@@ -123,7 +123,7 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     require_possible(tif)
     first = images_of(tif)[0]
     if first.dtype is None:
-        raise ValueError("its pixels are of an unknown type")
+        raise ValueError("its pixels have an unknown type")
     return upright(np.broadcast_to(0, first.shape), orientation(tif)).shape, first.dtype
 
 
