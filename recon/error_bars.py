@@ -70,7 +70,7 @@ def error_bars(
     Args:
         method: that made the volume; no choice of methods.
         decided: decisions of the run, or `ErrorBars.decided` of another slab.
-        control: is told of each sweep, and asked after it whether to stop.
+        control: gets each sweep, and is asked after it whether to stop.
 
     Returns:
         None where `control` ended it.

@@ -1,4 +1,4 @@
-"""From the frames of a scan to line integrals and their geometry: only the views and rows asked for are ever held."""
+"""Preparation of a scan: line integrals and their geometry; only the views and rows asked for are ever held."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ def prepare_projections(
     Args:
         source: a finished scan.
         selection: what to use.
-        warn: is told, in a sentence, of everything that is not as it should be though work goes on.
+        warn: takes a sentence on everything that is not as it should be though work goes on.
         buffer: on disk, takes the line integrals; None: they stay in memory. Rays that were not measured, or weigh
             nothing by the flags, are interpolated there, and `shares` is None.
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
-        phases: is told what is done, one after the other.
+        phases: takes the name of each phase as it begins.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.

@@ -99,7 +99,7 @@ class CheckpointOptions:
         Args:
             origin: of the fit, see `origin_of`.
             steps: planned number; 0 if a time is planned.
-            warn: is told if the plan differs, so that the volume differs from that of an uninterrupted fit.
+            warn: takes a sentence if the plan differs, so that the volume differs from that of an uninterrupted fit.
 
         Raises:
             ConfigError: the fit has more steps behind it than planned.

@@ -63,7 +63,7 @@ def in_slabs(
 
     Args:
         control: of all slabs together; `decide`, if given, gets the decisions that they follow.
-        warn: is told of slices that are not by the method.
+        warn: takes a sentence on slices that are not by the method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 
     Raises:

@@ -62,7 +62,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
 
     Args:
-        warn: is told of energies whose scan lacks frames, or is not there.
+        warn: takes a sentence on energies whose scan lacks frames, or is not there.
 
     Raises:
         DataError: none has one.

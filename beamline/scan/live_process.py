@@ -124,7 +124,7 @@ class LiveReconstruction:
     is killed, and then leaves no volume.
 
     Args:
-        enough: is told why the views so far are enough, in the thread that reads the output.
+        enough: takes the reason why the views so far are enough, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan beside it takes precedence.

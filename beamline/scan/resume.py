@@ -244,7 +244,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     then has the state of its newest file.
 
     Args:
-        say: is told the room that each needs, before anything is written to it.
+        say: takes a sentence on the room that each needs, before anything is written to it.
 
     Returns:
         the result for each file, and a sentence on each part that was left out.

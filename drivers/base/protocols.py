@@ -289,7 +289,7 @@ class Watchable(Protocol):
     """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again while it moves; its exception ends the wait."""
+        """Call `check` again and again from now on while the device moves; its exception ends the wait."""
 
 
 @runtime_checkable

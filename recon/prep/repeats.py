@@ -18,7 +18,7 @@ _EXACT, _NEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: be
 _LATER, _LONGEST = 3, 0.9  # a pair lies a third of the scan apart at least; share of the longest time between two
 _FIRSTS, _PAIRS, _BANDS = 512, 8, 4  # views whose pairs are sought, at most; pairs; bands of rows, which may disagree
 _CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels whose errors are one: those that the Gaussian joins, twice
-_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is told
+_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is reported
 
 
 def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int], float, F64, F64]]:

@@ -130,7 +130,7 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
 def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     """Raise ValueError for more pages than any scan has, or for more bytes than allowed, or than the file can contain.
 
-    Pages are told without a look at each: tifffile takes minutes for a million.
+    Pages are grouped without a look at each: tifffile takes minutes for a million.
     """
     with suppress(IndexError):
         tif.pages.get(_MOST_PAGES)
