@@ -111,8 +111,8 @@ def light_beside_flats(
         yield Finding(
             "warning",
             "light",
-            f"For their counts the flats have {ratio:.2g} times the noise of the views, which is one figure for all "
-            f"images of a camera, and no air tells which is right: references that were multiplied (by about "
+            f"Relative to their counts the flats have {ratio:.2g} times the noise of the views, though one camera has "
+            f"one figure for all images, and no air shows which is right: references that were multiplied (by about "
             f"{ratio:.2g}), or views that are means of several frames? {explained(source, groups, ratio)}",
         )
 
