@@ -49,7 +49,7 @@ def quantum_efficiency(wavelength_nm: float) -> float:
 
 @dataclass(frozen=True)
 class LightPath:
-    """From X-ray photons to photoelectrons: the screen, the lenses and mirror behind it, and the sensor.
+    """The path from X-ray photons to photoelectrons: screen, lenses and mirror behind it, and sensor.
 
     Attributes:
         absorbed: share of the X-ray photons that the screen stops.

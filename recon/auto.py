@@ -163,7 +163,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
 
 
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
-    """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
+    """The middle rows of a cone, so many, and the box that holds their rays; None if they have little matter."""
     some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
     middle = middle_of_cone(problem.geometry, problem.grid, some, height)
     if middle is None:

@@ -70,7 +70,7 @@ def error_bars(
     Args:
         method: that made the volume; no choice of methods.
         decided: decisions of the run, or `ErrorBars.decided` of another slab.
-        control: is told of each sweep, and asked after it whether to stop.
+        control: gets each sweep, and is asked after it whether to stop.
 
     Returns:
         None where `control` ended it.
@@ -81,7 +81,7 @@ def error_bars(
     geometry = problem.geometry
     if method.traits.error_bars is None:
         known = ", ".join(with_trait("error_bars"))
-        raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
+        raise ValueError(f"the error bars of {method.name} are not calibrated; those of these methods are: {known}")
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
             f"error bars split the views into two halves: at least {LEAST_VIEWS} views are needed, "

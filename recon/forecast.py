@@ -93,7 +93,7 @@ class Timing:
         self._paces: dict[str, Pace] = {}
 
     def of(self, method: Method) -> Forecast:
-        """As `forecast`."""
+        """The forecast of a method, see `forecast`."""
         candidates = candidates_of(method)
         if len(candidates) > 1:
             return self._of_choice(candidates)
@@ -124,7 +124,7 @@ class Timing:
         return (self._now() - begin) * _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
 
     def pace(self, method: Method, of_trial: bool = False) -> Pace:
-        """Of an iterative method in all voxels, at the speed of a part of them, or of the rows of a trial."""
+        """Forecast of an iterative method in all voxels, at the speed of a part of them, or of the rows of a trial."""
         key = f"{of_trial} {method!r}"
         if key not in self._paces:
             part, first = self._trial if of_trial else self._part, getattr(method, "first_sweeps", 0)
@@ -151,7 +151,7 @@ class Timing:
         return self._trial_share * sweeps * smooth
 
     def fit(self, method: FitMethod) -> Pace:
-        """Of a fit without its finish."""
+        """Forecast of a fit without its finish."""
         field = Grid.for_fit(self._geometry, self._grid)
         given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
         usual = count_for(field, self._geometry.is_cone)
@@ -185,7 +185,7 @@ class Timing:
         return Forecast(choice, volumes)
 
     def _of_choice(self, candidates: tuple[Method, ...]) -> Forecast:
-        """Of a method that tries others: a fit's own trial judges them, too."""
+        """Forecast of a method that tries others: a fit's own trial judges them, too."""
         each = [self.of(candidate) for candidate in candidates]
         if not self._trial_share:
             return each[-1]

@@ -116,9 +116,9 @@ class Instrument:
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
-                f"of {', '.join(wanted)}, something belongs to devices that are open, and would have no effect. Give "
-                f"it to `connect`. A scan of its own can have other angles, times, optics, checks, and the camera's "
-                f"roi, binning and readout. Nothing was started."
+                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, and would have no "
+                "effect. Give it to `connect`. A single scan can have other angles, times, optics, checks, and the "
+                "camera's roi, binning and readout. Nothing was started."
             )
         return config
 

@@ -75,7 +75,7 @@ class _Frames(DetectorAcquireLogic):
         self.n, self._apart = n, apart
 
     async def new_file(self) -> tuple[Path, tuple[int, int]]:
-        """In a run folder of its own, and the shape of its frames."""
+        """Create the file in a new run folder; also returns the shape of its frames."""
         await self.ensure_stopped()
         self._writer, self._lacking = await asyncio.to_thread(self._created), range(0)
         self._set_rows(0)

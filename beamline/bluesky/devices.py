@@ -36,7 +36,7 @@ MARGIN = 10.0
 
 
 class TomoScan(Device):
-    """A configured scan as flyer and detector; each kickoff is one scan, in a run folder of its own.
+    """A configured scan as flyer and detector; each kickoff is one scan, in a new run folder.
 
     Args:
         runs: folder of the run folders; the configured one unless given.

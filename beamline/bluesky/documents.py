@@ -218,7 +218,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
 
     Args:
         address: tcp://HOST:PORT, where the proxy takes documents.
-        warn: is told that nobody listens there.
+        warn: takes a sentence if nobody listens there.
 
     Raises:
         ConfigError: another address, or bluesky or pyzmq are not installed.

@@ -21,7 +21,7 @@ from drivers.base.errors import DeviceError
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
-_EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
+_EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
 def _command(verb: str, help_text: str) -> click.Command:

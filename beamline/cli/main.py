@@ -118,7 +118,7 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does, with the nearest name in the sentence on an unknown one."""
+        """Resolve a command as click does; the error for an unknown name suggests the nearest one."""
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:

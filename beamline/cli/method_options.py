@@ -143,9 +143,9 @@ def slabs_resumed(path: Path | None) -> Path | None:
 SLABS_RESUMED = "resume of slabs"
 """Stands for `--resume` of a partial volume, which has rules of its own."""
 _OF_ONE_VOLUME = {
-    "roi": "a box is of one volume",
+    "roi": "a box belongs to one volume",
     "truth": "a truth is compared with one volume",
-    "uncertainty": "error bars are of one volume",
+    "uncertainty": "error bars belong to one volume",
     **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes are not made in slabs"),
 }
 """Options that several volumes, in time or of materials, do not go with."""
@@ -224,7 +224,7 @@ _IN_TIME = together(
     option(
         "--moves/--no-moves",
         setting="moves",
-        needs=("time", "is of volumes in time: give --time N with it."),
+        needs=("time", "sets volumes in time: give --time N with it."),
         default=None,
         help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
@@ -235,7 +235,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("time", "spectra"), "it is of methods that make one volume"),
+        **dict.fromkeys(("time", "spectra"), "it belongs to methods that make one volume"),
     },
     type=POSITIVE,
     metavar="EACH",
@@ -291,7 +291,7 @@ method_options = together(
         setting="fit.kernel",
         excludes=_BY_BUDGET,
         type=NameChoice([kernel.value for kernel in Kernel]),
-        help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
+        help="Shape of the Gaussians: true ones, or compact ones that end, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
     ),
     heading(RESOURCES),

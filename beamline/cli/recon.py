@@ -172,7 +172,7 @@ def run_reconstruction(
     stop = StopOnSignal(ready=options.follow is not None or options.budget is not None)
 
     def made(event: Event) -> None:
-        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices.
+        """Note when there is a volume: from the first step or iteration on; what has a unit is a trial, or slices.
 
         Of several volumes there are some from the first trial on.
         """

@@ -141,7 +141,7 @@ recon_options = together(
     heading(DATA),
     option(
         "--follow",
-        excludes={SLABS_RESUMED: "these slabs are of a finished scan"},
+        excludes={SLABS_RESUMED: "these slabs belong to a finished scan"},
         of_one_call=True,
         is_flag=True,
         help="Follow a running scan: reconstruct while it grows. A method that needs all views waits for its end.",

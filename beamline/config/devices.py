@@ -204,7 +204,7 @@ class DeviceSection(Section):
             if (port := device.stage.port) in taken:
                 raise ValueError(
                     f"{name}.stage.port {port} is used by {taken[port]}, too, and a port can be opened once; the "
-                    f"{name.replace('_', ' ')} needs a controller, or a record, of its own"
+                    f"{name.replace('_', ' ')} needs a separate controller or record"
                 )
             taken[port] = f"devices.{name}"
         return self

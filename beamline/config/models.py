@@ -236,7 +236,7 @@ class Speed(Section):
 
 
 class SimulationSection(Section):
-    """Of simulated devices, and of the rehearsal of a real instrument, which ignores it otherwise."""
+    """Settings of simulated devices and of rehearsals; a real instrument ignores them."""
 
     scene: str | dict[str, Any] = Field(
         default="scenes/battery.yaml",

@@ -71,7 +71,7 @@ def _plain(section: Section) -> dict[str, Any]:
 
 
 def _stage(stage: StageSection) -> dict[str, Any]:
-    """Its port is the simulated controller's, and a transcript a file of its own, to be compared with the real one."""
+    """The stage at the simulated controller's port, with a separate transcript to compare with the real one."""
     values = _plain(stage) | {"port": f"sim://{stage.kind}"}
     if values.get("transcript"):
         path = Path(values["transcript"])

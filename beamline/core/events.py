@@ -282,7 +282,7 @@ class TrialReached(Event, event="progress"):
 
 
 class KernelsCompiled(Event, event="progress"):
-    """So many kernels were compiled in so many seconds."""
+    """Kernels were compiled: their number, and the seconds that it took."""
 
     stage: str
     n: int

@@ -65,4 +65,4 @@ def _way_out(name: str, origin: str) -> str:
     """What to do about a module that is not ours."""
     if not any(f"{os.sep}{folder}{os.sep}" in origin for folder in ("site-packages", "dist-packages")):
         return "rename that one, or work in another folder"
-    return "it belongs to another distribution. Install splatline in an environment of its own (python -m venv)"
+    return "it belongs to another distribution. Install splatline in a separate environment (python -m venv)"

@@ -1,4 +1,4 @@
-"""Child processes: started in a group of their own, read line by line, ended in time."""
+"""Child processes: each starts in its own process group, is read line by line, and ended in time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ProcessEnd(Enum):
 
 
 class ChildProcess:
-    """A running command. Each line that it writes to stdout is passed to `on_line`, in a thread of its own.
+    """A running command. A separate thread passes each line of its stdout to `on_line`.
 
     Ctrl-C at the terminal does not reach it: the caller decides when it ends. Use it as a context manager, which kills
     a process that still runs. A Python imports nothing from the working folder, whose recon.py is the user's.

@@ -95,7 +95,7 @@ class Narration:
         self._open: dict[str, FrameFlagged] = {}  # by check: a finding with all frames so far
 
     def __call__(self, event: Event) -> Iterator[Event]:
-        """The events to be told now."""
+        """The events to report now."""
         if isinstance(event, FrameFlagged) and event.flag.first is not None and event.flag.level != Level.ALARM:
             flag, known = event.flag, self._open.get(event.flag.check, event)
             if flag.frames.start > known.flag.frame + 1 or event.time - known.time >= _HELD:

@@ -22,7 +22,7 @@ from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brigh
 from drivers.base.frame import Frame, FrameKind
 
 LASTS = 5  # views that a drift must last
-GROWN = 2.0  # times what was told of a drift: it is told again
+GROWN = 2.0  # times the reported drift, at which it is reported again
 REMEDY = (
     "`beamline recon` takes it off where there is air beside the sample (--air auto); flats before and after the views "
     "(scan.flats.at: both) tell it, too."
@@ -37,7 +37,7 @@ SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 @dataclass(frozen=True)
 class BeamState:
-    drifting: int = 0  # views in a row that would change what was told
+    drifting: int = 0  # views in a row that would change the report
     told: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
     covered: bool = False  # the missing air was reported
     level: float = 0.0  # logarithm of the light over that of the first view, from its confirmed changes
@@ -119,7 +119,7 @@ class BeamCheck(Logged):
                 return Look(replace(state, drifting=0))
             advice = (
                 f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
-                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
+                "it, or the beam is weaker than in the flats. Its drift against the flats cannot be measured."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
         gone = state.told != 0 and abs(score) < GONE * self.drift

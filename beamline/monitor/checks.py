@@ -39,12 +39,12 @@ def _distinct(*checks: Check) -> tuple[Check, ...]:
     names, bits = {check.name for check in checks}, {check.bit for check in checks}
     if min(len(names), len(bits)) < len(checks) or not bits <= set(BITS):
         taken = ", ".join(f"{check.name} {check.bit}" for check in checks)
-        raise ValueError(f"every check needs a name and a bit (0 ... 15, 32 ... 47) of its own, got {taken}")
+        raise ValueError(f"every check needs its own name and bit (0 ... 15, 32 ... 47), got {taken}")
     return checks
 
 
 def _all(ours: tuple[Check, ...]) -> Registry[Check]:
-    """With those of other packages."""
+    """These checks and those of other packages."""
     found = ours
 
     def made(name: str, kind: Callable[[], Check]) -> Check:

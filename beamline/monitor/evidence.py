@@ -1,4 +1,4 @@
-"""Evidence: what darks, flats and some views show, frame by frame, of a running scan and of a file alike."""
+"""Evidence: what darks, flats and some views show, frame by frame, of a running scan or of a file."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SeenFrame:
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> SeenFrame:
-        """Of the digest of a running scan."""
+        """The frame of a running scan, by its digest."""
         return cls(row, kind, exposure, digest.saturated_fraction, np.array(thinned(digest.preview)), block)
 
     @property
@@ -59,7 +59,7 @@ class SeenFrame:
 
     @property
     def rounded_exposure(self) -> float:
-        """As cameras state one exposure; 0 where it is not known."""
+        """An exposure rounded as cameras state it; 0 where it is not known."""
         return round(self.exposure, 6) if self.exposure > 0 else 0.0
 
     @property
@@ -136,7 +136,7 @@ class Evidence:
         return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
 
     def with_frame(self, frame: SeenFrame, begins: bool) -> Evidence:
-        """With the next frame of the scan; a dark or a flat may begin a group."""
+        """This evidence with the next frame of the scan; a dark or a flat may begin a group."""
         if frame.kind is FrameKind.PROJECTION:
             return replace(self, views=(*self.views, frame))
         begins = begins or not self.groups or self.groups[-1][0].kind is not frame.kind
@@ -144,7 +144,7 @@ class Evidence:
         return replace(self, groups=(*before, (*last, frame)))
 
     def without(self, rows: set[int]) -> Evidence:
-        """Without some frames, and without groups that they leave empty."""
+        """This evidence without some frames, and without groups that become empty."""
         groups = (tuple(frame for frame in group if frame.row not in rows) for group in self.groups)
         views = tuple(view for view in self.views if view.row not in rows)
         return Evidence(tuple(group for group in groups if group), views)

@@ -88,7 +88,7 @@ class StuckCheck(Logged):
     start = StuckState
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
-        """Compare checksums. Without noise, references of one kind and the frames of a view are alike."""
+        """Compare checksums. Without noise, references of one kind are equal, and so are the frames of a view."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
         alike = digest.checksum == state.checksum
         as_before = frame.kind is not FrameKind.PROJECTION or frame.angle == state.angle

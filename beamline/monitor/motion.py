@@ -20,7 +20,7 @@ from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
 
-PAIRS = 32  # changes that follow one another, before anything is told
+PAIRS = 32  # changes that follow one another, before anything is reported
 SHAKE_MEMORY = 0.02  # weight of the newest pair
 CLIPPED = 4.0  # mean absolute deviations that count of a change, so that a jump is no vibration
 OWN = 4 / 3  # of the variance of x: minus the covariance of changes that follow one another
@@ -92,7 +92,7 @@ class Shake:
 
 SIGMAS = 8.0
 CELLS = 0.02  # share of a cell: least limit of a shake
-GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times what was told, above which it is told again
+GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times the reported one, above which it is again
 CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
 
 

@@ -136,7 +136,7 @@ def look(
 def look_past_failures(
     monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
 ) -> tuple[Monitor, tuple[Flag, ...], tuple[str, ...]]:
-    """As `look`, but a check that fails is switched off; returns a sentence on each of these, too."""
+    """Look as `look` does, but switch a check that fails off; returns a sentence on each of these, too."""
     failures: list[str] = []
     while True:
         try:
@@ -218,7 +218,7 @@ def _with_good_view(monitor: Monitor, view: CellView, recent: tuple[CellView, ..
 
 
 def _of_one_view(apart: float, step: float) -> bool:
-    """Frames so many radians apart are of one view."""
+    """Radians between two frames up to which they belong to one view."""
     return abs(math.remainder(apart, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
 
 

@@ -139,7 +139,7 @@ def _steps(finest: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _bytes_read(scale: ZarrScale, first: list[int], end: list[int]) -> int:
-    """Of a box: its chunks as a whole."""
+    """Bytes read for a box: whole chunks."""
     chunks = [-(-b // n) - a // n for a, b, n in zip(first, end, scale.chunk, strict=True)]
     return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk)
 
@@ -296,7 +296,7 @@ class ShownVolume:
         return values[np.isfinite(values)]
 
     def _meant(self, values: NDArray[Any]) -> F32:
-        """Of grey values, the values that they stand for."""
+        """The values that grey values stand for."""
         if self._grey is None:
             return np.asarray(values, np.float32)
         low, step = self._grey

@@ -55,7 +55,7 @@ _INVERTED = (
     "Where the sample is, the views are brighter than the air beside it, and line integrals are below 0: were images "
     "stored with dark and bright exchanged, or of flats with another sample? Give them as the camera wrote them."
 )
-# Least changes in a scan that are told: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
+# Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
@@ -65,7 +65,7 @@ class Law:
     """A consistency condition of all views of a sample at rest, and the residual that the views leave in it.
 
     Attributes:
-        tolerance: more is told of; by hardening, phase and scatter in scans at rest, and by the views' noise.
+        tolerance: more is reported; by hardening, phase and scatter in scans at rest, and by the views' noise.
         sentence: where and how it is broken, and what to do.
     """
 
@@ -299,7 +299,7 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
     """Views of the same rays, early and late, show one sample, in any beam and however wide it is.
 
     Args:
-        faint: the least changes that are told are so many times as large: a beam whose shape drifts looks like them.
+        faint: the least reported changes are so many times as large: a beam whose shape drifts looks like them.
     """
     worst, sentence = np.nan, ""
     for (first, later), between, change, sigma in changes_seen(data, geometry):
@@ -314,7 +314,7 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 "give --time N for several in time, --calibrate shifts where the sample moved as a whole, or --views "
                 "for a part of the scan."
             )
-    return Law("views of the same rays", worst, 1.0, "of the least change that is told", sentence)
+    return Law("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
 
 
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:

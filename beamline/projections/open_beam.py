@@ -64,7 +64,7 @@ class OpenBeam:
         Args:
             read: detector rows that are read.
             rows: those of them that are wanted.
-            warn: is told of damaged frames, and of parts of the scan without flats of their own.
+            warn: takes a sentence on damaged frames, and on parts of the scan without flats.
 
         Raises:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.

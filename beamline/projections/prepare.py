@@ -1,4 +1,4 @@
-"""From the frames of a scan to line integrals and their geometry: only the views and rows asked for are ever held."""
+"""Preparation of a scan: line integrals and their geometry; only the views and rows asked for are ever held."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ def prepare_projections(
     Args:
         source: a finished scan.
         selection: what to use.
-        warn: is told, in a sentence, of everything that is not as it should be though work goes on.
+        warn: takes a sentence on everything that is not as it should be though work goes on.
         buffer: on disk, takes the line integrals; None: they stay in memory. Rays that were not measured, or weigh
             nothing by the flags, are interpolated there, and `shares` is None.
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
-        phases: is told what is done, one after the other.
+        phases: takes the name of each phase as it begins.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -178,7 +178,7 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
 
 
 def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
-    """Of a size, an energy or a distance that no instrument has, as of a mistaken unit."""
+    """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
     size_mm = pixel_size(source, selection)
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names

@@ -305,8 +305,8 @@ def _step(source: ScanSource) -> float:
 
 
 def _saturation(source: ScanSource) -> float:
-    """As the file states it; else the end of the pixels' type, or of fewer bits where pixels pile up there. Inf where
-    pixels are real numbers."""
+    """Saturation as the file states it; else the end of the pixels' type, or of fewer bits where pixels pile up
+    there. Inf where pixels are real numbers."""
     if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
         return np.inf
     stated = float(source.attributes.get("saturation", 0))

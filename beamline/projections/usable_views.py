@@ -137,7 +137,7 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
     gap = gap_sentence(source, rows, good)
-    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore takes all alike."
+    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all equally."
     regions = regions_of(treated.flags, source.shape)
     return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 

@@ -107,7 +107,7 @@ class _Budget:
         return choices(paces, share * self.seconds_left, self.largest)
 
     def method(self, choice: Choice, default_count: int) -> Method:
-        """With the settings of the choice, for a volume of so many Gaussians by default."""
+        """The method with the settings of the choice, for a volume of so many Gaussians by default."""
         counted, method = USEFUL[choice.method].setting, self.methods[choice.method]
         settings = {counted: choice.steps} if counted else {}
         if choice.method == R2.name:

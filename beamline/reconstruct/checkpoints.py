@@ -99,7 +99,7 @@ class CheckpointOptions:
         Args:
             origin: of the fit, see `origin_of`.
             steps: planned number; 0 if a time is planned.
-            warn: is told if the plan differs, so that the volume differs from that of an uninterrupted fit.
+            warn: takes a sentence if the plan differs, so that the volume differs from that of an uninterrupted fit.
 
         Raises:
             ConfigError: the fit has more steps behind it than planned.
@@ -117,7 +117,7 @@ class CheckpointOptions:
         if steps != kept.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
             plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
-            warn(f"The checkpoint is of a fit {plans}: the learning rates continue at the same step of the new plan.")
+            warn(f"The checkpoint is from a fit {plans}: the learning rates continue at the same step of the new plan.")
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:

@@ -152,7 +152,7 @@ class ScanFollower:
             self._fit.move_axis(self.views.template(self.axis_col).axis_col)
 
     def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
-        """Feed the fit with the next views, all of one part of the file: other parts have references of their own."""
+        """Feed the fit with the next views, all of one part of the file, as each part has its own references."""
         assert self.axis_col is not None
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)

@@ -90,7 +90,7 @@ class ReconMemory:
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """Memory of a slab with so many slices of its own, with its views and weights; figures of merit need less."""
+        """Memory of a slab of so many slices, with its views and weights; figures of merit need less."""
         halo = self.method.traits.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)

@@ -294,7 +294,7 @@ def partly_seen_warning(geometry: Geometry) -> str:
         return ""
     return (
         f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen over less of the half turn than "
-        "the others, since views stand at heights of their own: there the volume is streaked, and too thin by FBP."
+        "the others, since views stand at different heights: there the volume is streaked, and too thin by FBP."
     )
 
 

@@ -63,7 +63,7 @@ def in_slabs(
 
     Args:
         control: of all slabs together; `decide`, if given, gets the decisions that they follow.
-        warn: is told of slices that are not by the method.
+        warn: takes a sentence on slices that are not by the method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 
     Raises:
@@ -118,7 +118,7 @@ class _SlabJob:
         self.say(f"Slab {n + 1} of {len(self.slabs)}: slices {own.start} to {own.stop - 1}.")
 
     def tell(self, done: int) -> None:
-        """So many slices are there."""
+        """Report the number of finished slices."""
         slices = self.grid.shape[0]
         self.say(f"{done} of {slices} slices are there.")
         if (listen := self.control.on_progress) is not None:
@@ -126,7 +126,7 @@ class _SlabJob:
             listen(Progress(done, slices, seconds, nan, nan, 0, views, unit="slices"))
 
     def resumed(self) -> PartialVolume | None:
-        """The partial volume that is to be completed; None: a new one. DataError where it is of something else."""
+        """The partial volume to complete; None: a new one. DataError where it belongs to another reconstruction."""
         if (path := self.options.partial) is None:
             return None
         partial = open_partial(path)

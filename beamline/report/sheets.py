@@ -57,7 +57,7 @@ class SliceSheet:
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
 
     def png(self, labels: Sequence[str]) -> bytes:
-        """These slices, four beside one another, in the grey window of the first."""
+        """PNG of these slices, four beside one another, in the grey window of the first."""
         low, high = matter_window(self._shown[labels[0]])
         rows, cols = self._shown[labels[0]].shape
         head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // COLUMNS)
@@ -124,7 +124,7 @@ def contact_sheet(frames: Sequence[FlaggedFrame], window: GreyWindow | None = No
 
 
 def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int, int]) -> bytes:
-    """Mean darks and flats as PNG, row 0 at the top, each in a grey window of its own with its scale.
+    """Mean darks and flats as PNG, row 0 at the top, each in its own grey window with its scale.
 
     Args:
         images: [row, col] by title, counts or ratios, binned where they are large.

@@ -44,7 +44,7 @@ class Acquisition:
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         sink: takes `BlockStarted`, `BlockDone` and warnings.
-        supervision: what may pause the scan, or end it before its first projection, and is told its states.
+        supervision: what may pause the scan, or end it before its first projection, and gets its states.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Energies: a series of scans of one sample, one for each energy, in a folder of its own; it can go on later.
+"""Energies: a series of scans of one sample, one for each energy, in one folder; it can go on later.
 
 Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
 """
@@ -62,7 +62,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
 
     Args:
-        warn: is told of energies whose scan lacks frames, or is not there.
+        warn: takes a sentence on energies whose scan lacks frames, or is not there.
 
     Raises:
         DataError: none has one.

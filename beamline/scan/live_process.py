@@ -1,4 +1,4 @@
-"""Live reconstruction: a process of its own that follows the growing file, so that its failure cannot harm the scan."""
+"""Live reconstruction: a separate process that follows the growing file, so that its failure cannot harm the scan."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class LiveReconstruction:
     the file has all views, and its last round makes up for the steps that are lost.
 
     Args:
-        enough: is told why the views so far are enough, in the thread that reads the output.
+        enough: takes the reason why the views so far are enough, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan beside it takes precedence.

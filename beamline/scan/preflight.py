@@ -183,7 +183,7 @@ def _worked(
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
-    """With a violation where files in the folder cannot be locked."""
+    """The plan, with a violation where files in the folder cannot be locked."""
     no_locking = no_locks(folder)
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 

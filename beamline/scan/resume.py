@@ -1,4 +1,4 @@
-"""Resume: a run that was killed, failed, stopped or aborted goes on; missing frames go into a file of their own.
+"""Resume: a run that was killed, failed, stopped or aborted goes on; missing frames go into a new file.
 
 Existing files are only read (after `recover`, if their writer died), so that stored frames are never at risk. The
 new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first
@@ -244,7 +244,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     then has the state of its newest file.
 
     Args:
-        say: is told the room that each needs, before anything is written to it.
+        say: takes a sentence on the room that each needs, before anything is written to it.
 
     Returns:
         the result for each file, and a sentence on each part that was left out.

@@ -419,7 +419,7 @@ class _Run:
             return None
         return (
             f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter was told to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
+            f"The shutter was asked to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
             "at a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the "
             "scan as it is."
         )
@@ -478,7 +478,7 @@ class _Ending:
 
     @property
     def status(self) -> str:
-        """Of the scan so far: complete, stopped or failed."""
+        """Status of the scan so far: complete, stopped or failed."""
         if self.error is None:
             return "complete"
         return "stopped" if isinstance(self.error, ScanStopped) else "failed"

@@ -81,8 +81,9 @@ def inhibited() -> Iterator[None]:
 
 
 class _Keeper:
-    """Tells a watchdog that the scan lives, in a thread of its own, and replaces one that has died. `start`: starts a
-    command; the function is called with each line that it writes."""
+    """Signals a watchdog, from a separate thread, that the scan lives, and replaces one that has died.
+
+    `start`: starts a command; the function is called with each line that it writes."""
 
     def __init__(
         self, folder: Path, sink: Sink, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
@@ -147,7 +148,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     apart = shutter if isinstance(shutter, FoundShutter) else None
     closed = "the shutter is moved by hand"
     if not isinstance(shutter, Simple):
-        closed = "its shutter is closed" if apart is None else "the shutter has a step of its own"
+        closed = "its shutter is closed" if apart is None else "the shutter is closed in a separate step"
 
     def disarm() -> None:
         with closing(stage.connect(clock)) as connected:

@@ -52,7 +52,7 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """What is wrong with a scene is told with its file."""
+    """A context whose errors about a scene name its file."""
     try:
         yield
     except SceneError as error:

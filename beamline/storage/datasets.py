@@ -247,7 +247,7 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 
 
 def missing_links(item: h5py.Dataset) -> list[str]:
-    """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
+    """Sources of a virtual dataset, in other files or in the same one, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
     """

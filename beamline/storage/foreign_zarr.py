@@ -109,7 +109,7 @@ def _require_volume(path: Path, array: Any) -> None:
     if array.ndim < 3 or any(n != 1 for n in array.shape[:-3]) or np.dtype(array.dtype).kind not in "uifb":
         raise DataError(
             f"{path} holds {array.dtype} of shape {array.shape}; expected real numbers [z, y, x], of one time and "
-            "one channel. Copy one to a file of its own."
+            "one channel. Copy one to a separate file."
         )
 
 

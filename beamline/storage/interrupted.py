@@ -65,7 +65,7 @@ def volume_file(path: Path) -> Path:
 
 
 def _no_run(folder: Path, wanted: str) -> Path:
-    """The folder, which may be of another kind, such as of slices. DataError: it is of a run, or of runs."""
+    """The folder, which may hold slices, say. DataError: it is the folder of a run, or of runs."""
     if (folder / EVENTS).is_file():
         raise DataError(f"{folder} is the folder of a run without a {wanted}: it ended before its first frame.")
     if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
@@ -110,7 +110,7 @@ _MAKES = "makes an ordinary file of the frames that are there"
 
 
 def _died(sure: bool) -> str:
-    """Where the disk has no locks, its program may run."""
+    """A sentence on a writer that died; where the disk has no locks, it may still run."""
     return "Its scan has died" + ("" if sure else ", unless a program still writes to it")
 
 

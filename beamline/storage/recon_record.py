@@ -168,7 +168,7 @@ class ReconRecord:
         return f"ReconRecord({self.method}: {' x '.join(map(str, self.grid.shape))} voxels, {self.output})"
 
     def _repr_html_(self) -> str:
-        """For a notebook: the figures and the volume's middle slices."""
+        """HTML for a notebook: the figures and the volume's middle slices."""
         figures = ", ".join(f"{name} {value:.4g}" for name, value in self.metrics.items())
         return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
 

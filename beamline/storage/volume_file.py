@@ -84,7 +84,7 @@ def axes_of(
 
 
 def _is_numpy(path: Path) -> bool:
-    """By its first bytes, whatever its name."""
+    """Whether it is a NumPy file by its first bytes, whatever its name."""
     with path.open("rb") as file:
         return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 
@@ -125,8 +125,8 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
             slices = np.empty((len(files), *values.shape), values.dtype)
         if values.ndim != 2 or (values.shape, values.dtype) != (slices.shape[1:], slices.dtype):
             raise DataError(
-                f"{path / name} is {values.dtype} {values.shape}; expected slices [y, x] alike, of {slices.dtype} "
-                f"{slices.shape[1:]}."
+                f"{path / name} is {values.dtype} {values.shape}; expected slices [y, x] of one type and shape, "
+                f"{slices.dtype} {slices.shape[1:]}."
             )
         slices[z] = values
     assert slices is not None

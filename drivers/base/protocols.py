@@ -205,7 +205,7 @@ class Camera(Protocol):
 
 class CooledCamera(Camera, Protocol):
     def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> float:
-        """Wait until the sensor is cold, at most `timeout` s; its temperature, °C. `progress` is told it and the status
+        """Wait until the sensor is cold, at most `timeout` s; its temperature, °C. `progress` gets it and the status
         of the cooler. Raises DeviceError: it does not get cold, or its cooler is off or in trouble."""
 
 
@@ -224,7 +224,7 @@ class Shutter(Protocol):
 
 @runtime_checkable
 class ConnectedShutter(Shutter, Protocol):
-    """A shutter with a connection of its own."""
+    """A shutter with its own connection."""
 
     def disconnect(self) -> None:
         """Close the connection; the shutter stays as it is."""
@@ -254,7 +254,7 @@ class Filter(Protocol):
 
 
 class ConnectedFilter(Filter, Protocol):
-    """A filter with a connection of its own."""
+    """A filter with its own connection."""
 
     def close(self) -> None:
         """Close the connection; the filter stays where it is."""
@@ -273,7 +273,7 @@ class Monochromator(Protocol):
 
 
 class ConnectedMonochromator(Monochromator, Protocol):
-    """A monochromator with a connection of its own."""
+    """A monochromator with its own connection."""
 
     def energy(self) -> float: ...
 
@@ -289,7 +289,7 @@ class Watchable(Protocol):
     """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again while it moves; its exception ends the wait."""
+        """Call `check` again and again from now on while the device moves; its exception ends the wait."""
 
 
 @runtime_checkable

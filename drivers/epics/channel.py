@@ -227,7 +227,7 @@ def _of_ca(found: Any) -> PvValue:
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
-    """The event loop of Channel Access, in a thread of its own, once a process."""
+    """The event loop of Channel Access, in a separate thread, once a process."""
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
     return loop

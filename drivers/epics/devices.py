@@ -27,7 +27,7 @@ class _PvDevice:
         """Close the connection; the device stays as it is."""
 
     def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again on the way; its exception ends the wait, and stops what can be
+        """Call `check` again and again from now on during the move; its exception ends the wait, and stops what can be
         stopped."""
         self._check = check
 

@@ -130,7 +130,7 @@ def ssim3d(truth: Array, volume: Array, data_range: float | None = None) -> floa
 
 
 def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
-    """As `ssim3d`, but each slice is one window: its mean, variance and covariance (Wang et al. 2004, eq. 13).
+    """SSIM with each slice as one window: its mean, variance and covariance (Wang et al. 2004, eq. 13).
 
     Args:
         truth, volume: [z, y, x]; the range of the data is that of the whole truth.

@@ -240,7 +240,7 @@ class Reconstruction:
         return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
 
     def _repr_html_(self) -> str:
-        """For a notebook: the volume's middle slices, its method and its settings."""
+        """HTML for a notebook: the volume's middle slices, its method and its settings."""
         pixels, (low, high) = middle_slices(self.volume.data)
         facts = {"result": repr(self)[15:-1], "grey": f"black {low:.4g}, white {high:.4g}"}
         if self.history and math.isfinite(self.history[-1].residual):

@@ -136,7 +136,7 @@ def plugins(
         try:
             if point.name in taken or times[point.name] > 1:
                 by = "splatline" if point.name in taken else "another plug-in"
-                raise ValueError(f"the name is taken by {by}; expected a name of its own")
+                raise ValueError(f"the name is taken by {by}; expected another name")
             with redirect_stdout(sys.stderr):  # stdout is for results
                 found[point.name] = made(point.name, point.load())
         except (Exception, SystemExit) as error:  # another package's fault must not stop a scan

@@ -39,7 +39,7 @@ Index = dict[Any, str]
 
 
 def main() -> int:
-    """Compile for each level in a process of its own, then pack."""
+    """Compile for each level in a separate process, then pack."""
     if sys.version_info[:2] != PYTHONS[0]:
         sys.stdout.write("Make the archive by Python {}.{}: others read what it writes.\n".format(*PYTHONS[0]))
         return 2

@@ -150,7 +150,7 @@ def sealed(content: bytes) -> bytes:
 
 
 def unsealed(content: bytes) -> bytes:
-    """The content of a file without its digest, if it has one. ValueError where that is of something else."""
+    """The content of a file without its digest, if it has one. ValueError where the digest is another file's."""
     if not content[-_SEAL:].startswith(_MARK):
         return content
     if sealed(content[:-_SEAL]) != content:

@@ -81,7 +81,7 @@ def _same(known: Any, key: Any) -> bool:
 
 @contextmanager
 def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
-    """What the disk refuses stays in memory; the first kernel is told."""
+    """Kernels that the disk refuses stay in memory; the first one causes a warning."""
     try:
         yield
     except OSError as error:

@@ -1,7 +1,7 @@
 """Rings: removes the stripes that pixels with unequal response make in a sinogram; in a slice they are rings.
 
 A sinogram is float32 [view, col] of one detector row, line integrals in the order of their angles, where a stripe is a
-column. Stripes of views that cover little angle cannot be told from the sample's own edges.
+column. Stripes of views that cover little angle cannot be distinguished from the sample's edges.
 """
 
 from __future__ import annotations

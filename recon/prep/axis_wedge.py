@@ -209,7 +209,7 @@ class _Wedge:
 
     @classmethod
     def of(cls, data: Floats, theta: Floats) -> _Wedge:
-        """By as many views and columns as are necessary."""
+        """Made of as many views and columns as are necessary."""
         views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
         bin_ = -(-data.shape[2] // _MOST_COLS)
         cols = data.shape[2] // bin_

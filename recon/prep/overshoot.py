@@ -30,7 +30,7 @@ set, have at most 1.9 standard errors."""
 
 @dataclass(frozen=True)
 class Overshoot:
-    """By how much line integrals beside outer edges lie below the air farther away.
+    """Overshoot: how far line integrals beside outer edges lie below the air farther away.
 
     Attributes:
         share: of the edge's step.
@@ -78,7 +78,7 @@ class Overshoot:
 
 
 def _overshoot(halves: F32) -> Overshoot:
-    """Of line integrals [view, block, half of the rows, col]."""
+    """Overshoot of line integrals [view, block, half of the rows, col]."""
     edges = [
         _edges(halves[:, :, half, ::way], halves[:, :, 1 - half, ::way], 2 * half + (way > 0))
         for half in (0, 1)

@@ -73,7 +73,7 @@ def check(references: References) -> None:
             raise ValueError(f"the dark has shape {shape}, the flat at {position:g} {np.shape(flat)}")
     at = sorted(p for p, _ in references.flats)
     if len(set(at)) < len(at) or not np.isfinite(at).all():
-        raise ValueError(f"each group of flats needs a position of its own, got {at}; average the flats taken together")
+        raise ValueError(f"each group of flats needs its own position, got {at}; average the flats taken together")
 
 
 def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:

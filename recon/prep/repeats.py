@@ -18,7 +18,7 @@ _EXACT, _NEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: be
 _LATER, _LONGEST = 3, 0.9  # a pair lies a third of the scan apart at least; share of the longest time between two
 _FIRSTS, _PAIRS, _BANDS = 512, 8, 4  # views whose pairs are sought, at most; pairs; bands of rows, which may disagree
 _CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels whose errors are one: those that the Gaussian joins, twice
-_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is told
+_NOISY = 0.1  # noise over the structure of the views, beyond which nothing is reported
 
 
 def changes_seen(data: F32, geometry: Geometry) -> Iterator[tuple[tuple[int, int], float, F64, F64]]:
@@ -78,7 +78,7 @@ def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
 def _sums(
     data: F32, geometry: Geometry, pair: tuple[int, int], side: int
 ) -> Iterator[tuple[F64, F64, float, float, int]]:
-    """Of each band of rows: normal equations of the changes; squares of the difference and of the structure; pixels."""
+    """Sums for each band of rows: normal equations of the changes; squares of difference and structure; pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
     at = min(later, len(data) - 2)
     beside = data[[first, later, at - 1, at, at + 1]]

@@ -262,7 +262,7 @@ def judged(
         fit: makes the fit of a trial.
         least_gain: as of `cheapest_not_led`; 0: a fit that voxels lead takes all of its steps, too.
 
-    Nothing is told where nothing can be held out, or `control` ends the trials. No prior is told for a fit that takes
+    No prior is named where nothing can be held out, or `control` ends the trials, nor for a fit that takes
     matter beyond the box off the views: from all of them a region of interest gets one that costs 1.3 dB.
     """
     data, weights = masked(problem.projections, problem.use.weights)
@@ -333,7 +333,7 @@ def finish(
         sweeps: of total variation, 1 or more; None: 8, and steps with sparse patches where these predict
             views held out better.
         settings: of the fit; None: the defaults.
-        control: is told of each sweep, also of those of trials, and asked after it whether to stop. Its decisions may
+        control: gets each sweep, also those of trials, and is asked after it whether to stop. Its decisions may
             hold the prior, see `judged`.
         nonnegative: voxels below zero are clipped.
 

@@ -168,7 +168,7 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     return from_numpy(np.ascontiguousarray(values, np.float32).copy())
 
 
-NEEDLES_LIMIT = 0.2  # Share of the mass above which needles are told, see docs/published.md
+NEEDLES_LIMIT = 0.2  # Share of the mass above which a warning of needles is given, see docs/published.md
 
 _THIN, _LONG = 0.5, 10.0  # pixels of a standard deviation that views do not resolve; longest over shortest width
 

@@ -1,4 +1,4 @@
-"""In time: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
+"""A time limit: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class LastRound:
         seconds: for the round and the sweeps, at most.
         began: when the fit began to wait for views, by the clock of the run; `Progress.seconds` count from there.
         before: the progress of the fit until now.
-        on_progress: is told of each progress of the round, too, while the fit can be looked at.
+        on_progress: gets each progress of the round, too, while the fit can be looked at.
     """
 
     fit: StreamingFit

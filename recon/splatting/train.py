@@ -89,9 +89,7 @@ class _Views:
         # Slices that turn against each other are a twist of the model: the fit sees all rows at the angle of the first.
         all_geometry, geometry = problem.geometry, problem.geometry.at_row(0)
         if all_geometry.skew and isinstance(method.gaussians, Gaussians):
-            raise ValueError(
-                "Gaussians to start from are not taken where rows see angles of their own: give their number"
-            )
+            raise ValueError("Gaussians to start from are refused where rows have different angles: give their number")
         if geometry.width and problem.device != "cpu":
             warnings.warn(
                 f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows "
@@ -398,7 +396,7 @@ def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Back
     state = state_from(checkpoint, backend)
     if max(state.drawn, default=0) >= n_views:
         raise ValueError(
-            f"the checkpoint is of a fit with at least {max(state.drawn) + 1} views, these are {n_views}: "
+            f"the checkpoint belongs to a fit with at least {max(state.drawn) + 1} views, these are {n_views}: "
             "resume takes the same data and settings"
         )
     return state

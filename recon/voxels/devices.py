@@ -121,7 +121,7 @@ def projector_on(device: VoxelDevice[Array], projector: Projector) -> LineProjec
 
 
 class _GpuProjector:
-    """A projector on a GPU. Views that lean, or whose rows see angles of their own, are projected on the CPU."""
+    """A projector on a GPU. Views that lean, or whose rows have different angles, are projected on the CPU."""
 
     def __init__(self, projector: Projector, device: Any) -> None:
         self._projector, self._device, geometry = projector, device, projector.geometry

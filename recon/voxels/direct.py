@@ -96,7 +96,7 @@ def fdk(
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: of the volume; None: `Grid.matching(geometry)`.
         filter: as of `fbp`.
-        on_block: told how many of how many layers are done, counted by their views.
+        on_block: called with how many of how many layers are done, counted by their views.
 
     Returns:
         float32 [z, y, x], 1/mm.

@@ -282,7 +282,7 @@ def fbp(
         projections: float32 [view, row, col], line integrals (dimensionless).
         grid: of the volume; None: one voxel a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
-        on_block: told after each block of slices how many of how many slices are there.
+        on_block: called after each block of slices with how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
 
     Returns:

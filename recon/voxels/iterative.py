@@ -147,7 +147,7 @@ class VoxelMethod(Checked, ABC):
 
     @abstractmethod
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """As of `IterativeMethod`."""
+        """Iterate, see `IterativeMethod`."""
 
     def toy(self) -> Self:
         return replace(self, iterations=1)

@@ -22,7 +22,7 @@ from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.view_weights import seen_by
 
 STRAY_LIMIT = 0.05
-"""Share of the mass above which a volume is told, see docs/published.md."""
+"""Share of the mass above which a warning is given, see docs/published.md."""
 
 _VIEWS, _AGREE = 24, 2  # looked at; that must show a voxel empty
 _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005  # pixels; of the blurred noise; of the 99th percentile of line integrals
@@ -123,7 +123,7 @@ def seen_empty(projections: F32, geometry: Geometry, grid: Grid, weights: F32 | 
 def _empty_and_seen(
     projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None
 ) -> tuple[Mask, Mask]:
-    """As `seen_empty`, and the voxels that are on the detector in all of these views, [z, y, x] each."""
+    """The voxels of `seen_empty`, and those that are on the detector in all of these views, [z, y, x] each."""
     some = spread(np.arange(geometry.n_views), _VIEWS)
     data, known = masked(projections[some], None if weights is None else weights[some])
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur

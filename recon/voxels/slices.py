@@ -54,7 +54,7 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
     if len(views) != geometry.n_views or len(views) < 2:
         raise ValueError(f"{len(views)} views for {geometry.n_views} angles: slices need two views, an angle each")
     if geometry.is_cone or not geometry.is_straight or geometry.shifts[:, 1].any():
-        raise ValueError("slices of views so far are of a parallel beam, of views that stand straight, at one height")
+        raise ValueError("slices of the views so far need a parallel beam with straight views at one height")
     covered = float(angular_weights(geometry.angles).sum())
     some = spread_views(geometry.angles, _VIEWS, np.arange(len(views)))
     factor = math.ceil(max(geometry.detector_shape) / _SIDE)

@@ -88,7 +88,7 @@ def circle_weights(angles: ArrayLike) -> F64:
     order, gaps = _gaps(theta)
     if _leave_an_arc(gaps):
         raise ValueError(
-            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; these weights are of the full circle: "
+            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; these weights need the full circle: "
             "`cone_weights` has those of a short scan"
         )
     weights = np.empty_like(theta)

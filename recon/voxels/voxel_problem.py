@@ -48,7 +48,7 @@ class Sweeps:
     def __init__(
         self, projector: Projector, data: F32, weight: F32 | None, subsets: Sequence[NDArray[np.intp]]
     ) -> None:
-        """For `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
+        """Set up for `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
         (nz, ny, nx), device = projector.grid.shape, voxel_device(projector.device)
         self._device, self._parts, scales = device, list[tuple[LineProjector[Any], Any, Any, Any]](), 0.0
         self._step = device.zeros((ny, nx, nz))  # largest column sums, then their inverse

@@ -162,7 +162,7 @@ class CameraView:
         )
 
     def shot(self, frame: Exposed) -> Shot:
-        """Without effects of motion the angle is that of the middle of the exposure, as a reconstruction assumes."""
+        """The shot. Without effects of motion its angle is that of mid-exposure, as a reconstruction assumes."""
         middle = frame.time + self.settings.exposure / 2
         turned = 0.0 if self.scene.chain.moves else self.angle_at(middle) - self.angle_at(frame.time)
         return Shot(

@@ -262,7 +262,7 @@ def _filter(config: FilterConfig, connected: Sequence[SerialPort], clock: Clock)
 
 
 def _monochromator(config: MonochromatorConfig, clock: Clock) -> Iterator[Diagnosis]:
-    """A monochromator with a connection of its own: the energy at which it stands."""
+    """The energy at which a monochromator with its own connection stands."""
     if not isinstance(config, FoundMonochromator):
         return
     low, high = config.range_kev or (0.0, math.inf)

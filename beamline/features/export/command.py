@@ -115,9 +115,7 @@ def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None
     }
     for name, (wanted, suffix, _) in parts.items():
         if (request.output.suffix.lower() == suffix) != wanted:
-            raise click.UsageError(
-                f"-o {request.output}: {name} goes with the suffix {suffix}, and voxels with another."
-            )
+            raise click.UsageError(f"-o {request.output}: {name} needs the suffix {suffix}; voxels need another one.")
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
             if request.bits != "32" or any(x is not None for x in (request.window, request.dataset, request.at)):

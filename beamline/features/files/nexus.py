@@ -119,7 +119,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
 
 
 def _taken_again(triggers: NDArray[Any], key: NDArray[Any], at: int, lost: int) -> bool:
-    """As many triggers as frames were lost lie between a frame and the next, and all have a frame elsewhere."""
+    """Whether each trigger between a frame and the next has its frame elsewhere in the file."""
     between = np.arange(triggers[at] + 1, triggers[at + 1])
     return between.size == lost and bool(np.isin(between, triggers[key == key[at]]).all())
 

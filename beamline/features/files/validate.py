@@ -72,7 +72,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
 
     Args:
-        deep: every frame is read and compared with its checksum; is told how many of how many.
+        deep: every frame is read and compared with its checksum; it is called with how many of how many.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     findings = list[Finding]()

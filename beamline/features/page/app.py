@@ -151,7 +151,7 @@ def _refused(request: Request, error: Exception) -> Response:
 
 
 class _Server:
-    """Answers requests; Starlette calls what is not a coroutine in a thread of its own."""
+    """Answers requests; Starlette calls functions that are no coroutines in separate threads."""
 
     def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
         self._reader, self._access, self._log = reader, access, log
@@ -266,7 +266,7 @@ class _Server:
             self._log(f"refused: {name} from {client}, without the token for acting")
             return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
         if folder is None or name == _NO_VERB:
-            return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
+            return JSONResponse({"message": f"Nothing here can {name}: no scan runs in this folder."}, 404)
         self._log(f"{name}, asked for from {client}")
         asked = ask(folder, Verb(name))
         while (state := await run_in_threadpool(asked.state)) is None:

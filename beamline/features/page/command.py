@@ -94,7 +94,7 @@ def serve_shown(server: PageServer, browse: bool) -> None:
 
 
 def _end(server: PageServer) -> None:
-    """End this process; open pages are told within 3 s."""
+    """End this process; open pages show it within 3 s."""
     server.stop()
     time.sleep(ENDS_WITHIN)
     os._exit(0)
@@ -196,7 +196,7 @@ def view(
         from beamline.features.page.in_napari import show
 
         if any(name is not None for _, name in named):
-            raise click.UsageError("--napari takes no ::NAME; copy the array to a file of its own.")
+            raise click.UsageError("--napari takes no ::NAME; copy the array to a separate file.")
         show([path for path, _ in named], labels)
         return
     from beamline.features.page.app import viewer  # these load HDF5 and the server

@@ -1,4 +1,4 @@
-"""Serving a run, or a folder of runs: on this machine alone unless told otherwise, with new tokens at each start.
+"""Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
 
 The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
 """
@@ -41,7 +41,7 @@ class _Opened:
 
 
 class RunBrowser:
-    """The runs of a folder under numbers of its own: no name from a client reaches the file system."""
+    """The runs of a folder, numbered: no name from a client reaches the file system."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, threading.Lock()

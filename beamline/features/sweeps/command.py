@@ -142,7 +142,7 @@ def _options(context: click.Context) -> ReconOptions:
     from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
-        raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
+        raise click.UsageError(f"--{foreign[0]} belongs to a volume, and a sweep makes slices.")
     target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
     return replace(options_of(context, BASELINE), target=target)
 
@@ -204,8 +204,8 @@ def _remarks(
 
 
 def _rows(slices: Sequence[SweptSlice], scores: Scores | None) -> list[list[str]]:
-    """Of each slice: values, residual of views held out, whether it is the best or not significantly different from
-    it, and seconds."""
+    """A row for each slice: values, residual of views held out, whether it is the best or not significantly different,
+    and seconds."""
     judged = [("", "")] * len(slices)
     if scores is not None:
         judged = [(f"{share:.6g}", verdict) for share, verdict in zip(scores.shares, scores.verdicts, strict=True)]

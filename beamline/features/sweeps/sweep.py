@@ -94,7 +94,7 @@ class Scores:
 
     @property
     def verdicts(self) -> list[str]:
-        """[slice] "best"; "alike": it does not differ significantly from the best one; or empty."""
+        """Verdict [slice]: "best"; "alike", not significantly different from the best; or empty."""
         if self.best is None:
             return [""] * len(self.residuals)
         more = self.residuals - self.residuals[self.best]

@@ -1,4 +1,4 @@
-"""Runner: reads the scan once, runs each trial in a process of its own within the time there is, writes the table."""
+"""Runner: reads the scan once, runs each trial in a separate process within the time limit, writes the table."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def opened_scan(
 
 
 def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:
-    """Run one trial in a process of its own, which has ended when this returns or raises.
+    """Run one trial in a separate process, which has ended when this returns or raises.
 
     Args:
         work: a folder with the data, `DATA`.

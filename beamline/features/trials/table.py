@@ -64,7 +64,7 @@ def cells(table: TrialTable, outcome: Outcome) -> list[str]:
 
 
 def _figure(name: str, value: float) -> str:
-    """With its digits; "equal" for the PSNR of two equal volumes."""
+    """A figure with its digits; "equal" for the PSNR of two equal volumes."""
     name = _DIGITS_OF.get(name, name)
     if math.isfinite(value):
         return f"{value:.{METRICS[name].digits}f}"

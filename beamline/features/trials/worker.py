@@ -1,4 +1,4 @@
-"""The data that all trials of a scan share, and one trial in a process of its own, so that its peak memory is its own.
+"""The data that all trials of a scan share, and one trial in a separate process, whose peak memory is the trial's.
 
 `python -m beamline.features.trials.worker FOLDER` reads the data and the job in the folder, and prints the result as
 JSON. Its stdin is a pipe that nothing is written to: it ends with the parent process, and so does this one.
@@ -66,7 +66,7 @@ class TrialData:
 
     @property
     def geometry(self) -> Geometry:
-        """Of the views that may be used."""
+        """Geometry of the views that may be used."""
         return self.prepared.geometry
 
 

@@ -22,7 +22,7 @@ ALIKE = 0.5  # allowed difference between parts, as a share of the gain: a ghost
 
 @dataclass(frozen=True)
 class GainCheck(Logged):
-    """Score: relative change of the light of all places alike since the view before (beamline.monitor.change).
+    """Score: relative change of the light, equal in all places, since the view before (beamline.monitor.change).
 
     The default: flats divide a step out only if they are taken anew. 1 % of light is 0.01 of line integral in every
     ray, a fifth of what 50 um of electrolyte do. A ring that is topped up every few minutes steps by less. The figure's
@@ -51,7 +51,7 @@ class GainCheck(Logged):
             return Look(after)
         level, limit = (Level.ALARM, self.alarm) if abs(score) > self.alarm else (Level.WARN, limit)
         advice = (
-            f"{score:+.1%} of light from one view to the next, everywhere alike: a top-up, a filter or slit that "
+            f"{score:+.1%} of light from one view to the next, equally everywhere: a top-up, a filter or slit that "
             "moved, or the camera's gain. Take new flats."
         )
         return Look(after, Flag(self.name, level, frame.index, score, limit, advice))

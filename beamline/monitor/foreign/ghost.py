@@ -66,7 +66,7 @@ def window(lags: tuple[int, ...]) -> tuple[Reals, Reals]:
 
 
 def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
-    """Covariance [place, place] of a window: patterns of all speeds in the fan alike, seen by square cells."""
+    """Covariance [place, place] of a window: patterns of all speeds in the fan, seen by square cells."""
     frequency = (np.arange(FREQUENCIES) + 0.5) / FREQUENCIES * np.pi
     power = np.sinc(frequency / (2 * np.pi)) ** 2 / (frequency**2 + ROUGHNESS**2) ** 1.5
     power /= power.sum()

@@ -38,7 +38,7 @@ class Preparation:
         "use",
         "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, and "
         "correct views after a jump of the sample. judge: run the monitor on the frames first and use its flags. "
-        "ignore: use all views alike.",
+        "ignore: weigh all views equally.",
         choices=("use", "judge", "ignore"),
     )
     references: str = option(

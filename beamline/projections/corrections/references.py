@@ -74,7 +74,7 @@ def _darks(
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
-    """That of an exposure; the mean of all where it is unknown. None without darks."""
+    """The dark of an exposure; the mean of all where it is unknown. None without darks."""
 
     if len(darks) < 2:
         return darks[0][1] if darks else None
@@ -205,6 +205,6 @@ def warn_of_parts_without_flats(source: ScanSource, references: References, warn
         has_views = (source.image_key[start:end] == FrameKind.PROJECTION).any()
         if has_views and not any(start <= position < end for position in flats):
             warn(
-                f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used. The "
+                f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. The "
                 f"nearest flats of another part correct their views, though the beam may have changed."
             )

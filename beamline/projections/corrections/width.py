@@ -147,7 +147,7 @@ class Width:
         return seen, StepDone(f"In the model of the views {', '.join(statements)}.", parameters)
 
     def _motion(self, source: ScanSource) -> _Motion | None:
-        """Asked for, or told by the file; None: the stage stood, or the file does not say."""
+        """The motion asked for, or stated by the file; None: the stage stood, or the file does not say."""
         if self.arc == "none":
             return None
         if self.arc != "auto":

@@ -74,7 +74,7 @@ class AveragedSource(Frames):
         return np.array([group[0] for group in self._groups], np.int64)
 
     def _apart(self) -> float:
-        """Radians from a view's first frame from which on a frame is of another view."""
+        """Radians from a view's first frame, beyond which a frame belongs to another view."""
         views = self._base.image_key == FrameKind.PROJECTION
         planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
         angles = planned if planned.size > self._n else self._base.angles[views]

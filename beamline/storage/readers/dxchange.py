@@ -132,7 +132,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
 
 
 def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
-    """Of all frames, or of each view; and of flats, where the acquisition says that they have one of their own."""
+    """Set exposures: one of all frames, or of each view; and of flats, where the acquisition states another one."""
     views = source.image_key == FrameKind.PROJECTION
     seconds = _seconds(file, f"{_DETECTOR}/exposure_time", int(views.sum()))
     if seconds is None:

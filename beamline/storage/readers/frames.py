@@ -98,7 +98,7 @@ def _replaced(each: Sequence[NDArray[np.int64] | None], sizes: _Sizes) -> NDArra
 
 
 def _after(each: Sequence[Any], sizes: _Sizes) -> Iterator[tuple[Any, int]]:
-    """With the number of frames before each source."""
+    """The sources, each with the number of frames before it."""
     return zip(each, (np.cumsum(sizes) - sizes).tolist(), strict=True)
 
 

@@ -245,7 +245,7 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
 
 
 def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
-    """Of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
+    """Degrees of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)

@@ -64,7 +64,7 @@ def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
 
 
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
-    """Groups of pages alike, without copies of reduced resolution, masks, and thumbnails.
+    """Groups of pages of one shape and type, without copies of reduced resolution, masks, and thumbnails.
 
     Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
     that it has a header for the first alone.
@@ -123,14 +123,14 @@ def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     require_possible(tif)
     first = images_of(tif)[0]
     if first.dtype is None:
-        raise ValueError("its pixels are of an unknown type")
+        raise ValueError("its pixels have an unknown type")
     return upright(np.broadcast_to(0, first.shape), orientation(tif)).shape, first.dtype
 
 
 def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     """Raise ValueError for more pages than any scan has, or for more bytes than allowed, or than the file can contain.
 
-    Pages are told without a look at each: tifffile takes minutes for a million.
+    Pages are grouped without a look at each: tifffile takes minutes for a million.
     """
     with suppress(IndexError):
         tif.pages.get(_MOST_PAGES)

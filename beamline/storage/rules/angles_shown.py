@@ -1,4 +1,4 @@
-"""Angles that views show: those of the same rays, by the angles that the file states, look alike, and no others do."""
+"""Angles that views show: views that see the same rays by the stated angles look the same, and no others do."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def angles_shown(source: ScanSource) -> Iterator[Finding]:
 
 
 def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
-    """Frames in a row that are stated at one angle look alike, as those that are averaged do.
+    """Consecutive frames stated at one angle look the same, as those that are averaged do.
 
     Where the stage turns on, the last differs from the first by the square of the turn, more than neighbours do.
     """
@@ -162,7 +162,7 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
-    """Views half a turn apart by their angles are mirror images (a whole turn: alike), and no others are.
+    """Views half a turn apart by their angles are mirror images (a whole turn: the same image), and no others are.
 
     Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
     sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
@@ -208,7 +208,7 @@ class _Turn:
 def _turn_seen(
     seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float, mirrored: bool
 ) -> _Turn | None:
-    """Views that are alike after another angle than they should be, where those that should be are not.
+    """Views that repeat after another angle than they should, where those that should do not.
 
     Args:
         views, some: all, and some of them, by ascending angle.
@@ -266,7 +266,7 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
 
 
 def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
-    """Consecutive frames look alike only if their angles are close, and close angles look alike.
+    """Consecutive frames look similar only if their angles are close, and close angles look similar.
 
     A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
     it where the list is shifted, so the places are looked at where angles jump.

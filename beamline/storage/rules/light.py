@@ -74,7 +74,8 @@ def views_scaled(source: ScanSource) -> Iterator[Finding]:
         "light",
         f"Each of {VIEWS} views looked at runs from {low:g} at its darkest pixel to {high:g} at its brightest, which "
         "are other pixels in each: every image was scaled by itself, as programs that save pictures do, and a grey "
-        "value means another attenuation in each view. Give the images as the camera wrote them, or all scaled alike.",
+        "value means another attenuation in each view. Give the images as the camera wrote them, or all scaled by one "
+        "factor.",
     )
 
 
@@ -97,7 +98,8 @@ def light_beside_flats(
         sentence = (
             f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats ({level:+.2f} of line "
             f"integral, {what}); within a scan a beam changes by up to {math.exp(WARN):.2g} times, and a sample only "
-            f"takes light. Were views and references taken or stored alike? {explained(source, groups, factor)}"
+            f"takes light. Were views and references taken and stored in the same way? "
+            f"{explained(source, groups, factor)}"
         )
         refused = abs(level) > REFUSE
         if darker:
@@ -109,8 +111,8 @@ def light_beside_flats(
         yield Finding(
             "warning",
             "light",
-            f"For their counts the flats have {ratio:.2g} times the noise of the views, which is one figure for all "
-            f"images of a camera, and no air tells which is right: references that were multiplied (by about "
+            f"Relative to their counts the flats have {ratio:.2g} times the noise of the views, though one camera has "
+            f"one figure for all images, and no air shows which is right: references that were multiplied (by about "
             f"{ratio:.2g}), or views that are means of several frames? {explained(source, groups, ratio)}",
         )
 
@@ -339,6 +341,6 @@ def one_energy(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "energies",
-            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume is of one. Choose it, such "
+            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume needs one. Choose it, such "
             f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
         )

@@ -109,7 +109,7 @@ def _views_beside(source: ScanSource, views: I64, flats: list[I64]) -> tuple[See
 
 
 def _readable(source: ScanSource, rows: I64) -> tuple[SeenFrame, ...]:
-    """Those of some frames that the file gives; all, where it gives none."""
+    """The frames, of these rows, that can be read; all, where none can."""
     read = tuple(seen_frame(source, int(row)) for row in rows)
     return tuple(frame for frame in read if frame.row not in source.unreadable) or read
 

@@ -26,7 +26,7 @@ from recon.base.views import spread
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
-TURNED = 12  # views by which the direction of the axis is told
+TURNED = 12  # views by which the direction of the axis is found
 _LEAST = 8  # views, rows and columns: fewer tell nothing of it
 _SWAPPED = 2.0  # times as rough as with bytes exchanged; sound counts are smoother than that
 _LEAST_SQUARE = 16  # views and rows, as many

@@ -210,7 +210,7 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
 
 
 def _pitch(axis: NDArray[np.floating]) -> float | None:
-    """From voxel to voxel; None of one voxel."""
+    """Distance from voxel to voxel; None where there is one voxel."""
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 

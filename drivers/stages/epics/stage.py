@@ -197,7 +197,7 @@ class EpicsStage(LineStage):
         return self.to_angle(counts)
 
     def abort(self) -> None:
-        """As `stop`: the record has nothing faster, and the controller slows down as it does for every stop."""
+        """Stop as `stop` does: the record has nothing faster, and the controller decelerates as for every stop."""
         self.stop()
 
     def arm(self, train: TriggerTrain) -> None:

@@ -17,7 +17,7 @@ STOPPED = 10
 NOT_ALLOWED_TO_MOVE = 5
 UNKNOWN_COMMAND = 2
 
-CHECK_MODEL = "Check that the controller is of the C-863 class and knows this command"
+CHECK_MODEL = "Check that the controller belongs to the C-863 class and knows this command"
 CHECK_AXIS = "Check the axis in the configuration against what SAI? lists"
 CHECK_TRAVEL = "Compare the limits in the configuration with the controller's travel range (TMN?, TMX?)"
 CHECK_SPEED = "Compare max_speed and acceleration in the configuration with what the controller allows"

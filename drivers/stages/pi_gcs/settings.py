@@ -37,7 +37,7 @@ class PiFirstPulse(StrEnum):
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """In counts: the distance of pulses, begin and end of the window, and the allowed error of a step, which adds up
+    """Trigger window in counts: distance of pulses, begin and end, and the allowed error of a step, which adds up
     over the train. The stage must stand before the window.
     """
 

@@ -114,7 +114,7 @@ class PiGcsStage(LineStage):
         self._train = train
 
     def disarm(self) -> None:
-        """In any state, also while it moves."""
+        """Disarm the trigger output in any state, also while the stage moves."""
         self._axis.disarm()
         self._train = None
 

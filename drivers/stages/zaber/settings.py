@@ -209,7 +209,7 @@ class ZaberSettings(TriggerUse, Wiring, StageFigures):
         """Settings of the pulses: 1 ms wide unless a width is chosen, or half an interval if fires toggle."""
         width = self.pulse_width
         if self.toggle and width is not None:
-            raise ValueError("a toggled output has no pulse width of its own; choose a width or toggle, not both")
+            raise ValueError("a toggled output has no pulse width; choose a width or toggle, not both")
         chosen = None if self.toggle else PulseSettings.width if width is None else width
         return PulseSettings(self.output, chosen, self.active_high, self)
 

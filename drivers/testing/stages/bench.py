@@ -66,11 +66,11 @@ class StageBench:
     line: Cable
 
     def pulses(self) -> list[EmittedPulse]:
-        """Those that have been emitted by now."""
+        """The number of pulses emitted by now."""
         return emitted(self.line, self.clock)
 
     def pulse_counts(self) -> list[int]:
-        """Where they came, in counts."""
+        """The places of the pulses, in counts."""
         return [self.stage.to_counts(pulse.angle) for pulse in self.pulses()]
 
     def go(self, degrees: float) -> float:

@@ -89,7 +89,7 @@ def archive(
 
 
 def drop_from_cache(path: Path) -> None:
-    """Make the system read the file from the disk, not from its cache, if it can be told so."""
+    """Make the system read the file from the disk, not from its cache, if that is possible."""
     if sys.platform == "linux":
         with path.open("rb") as file:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -186,7 +186,7 @@ def _image_bytes(raw: h5py.Group) -> int:
 
 
 def _is_image_dataset(item: h5py.HLObject) -> bool:
-    """Whether it holds images of its own, not those of another dataset of its file."""
+    """Whether the dataset holds images itself, not those of another dataset of its file."""
     if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != 3 or item.dtype.kind not in "iuf":
         return False
     if item.is_virtual:

@@ -186,7 +186,7 @@ def joined(
 
 
 def _refuse_unlike(first: Any, own: Any, number: int, pixels: float) -> None:
-    """One geometry is of all views: they share detector, beam, and the motion of the stage in an exposure."""
+    """Refuse scans that differ in detector, beam, or the motion of the stage in an exposure."""
     alike = math.isclose(own.pixel_pitch, first.pixel_pitch, rel_tol=0 if own.is_cone else pixels)
     turns = ((first.width.arc, own.width.arc), (first.skew, own.skew))
     alike &= all(math.isclose(*turn, rel_tol=_ARCS_ALIKE) for turn in turns)

@@ -18,7 +18,7 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class BeamBend(ImageEffect):
-    """With the sample in the beam, -log of each ray's light changes by level + drift t + Σ curvature x².
+    """A change of the beam behind the sample: -log of each ray's light changes by level + drift t + Σ curvature x².
 
     x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t in s since the camera
     was connected. Flats and darks stay as they are. Negative: the views have more light than the flats predict.

@@ -162,7 +162,7 @@ SEEN_PX = 0.01  # Smallest shift in pixels that is labelled; a shift along the b
 
 @dataclass(frozen=True)
 class Jump(PoseEffect, Anomaly):
-    """From view `view` on the sample is at another place on the stage: first turned, then shifted.
+    """A jump: from view `view` on the sample is elsewhere on the stage, first turned, then shifted.
 
     All views from the jump on are labelled, because the jump changes them. Errors of the stage precede the jump in a
     scene: they depend on the stage's angle, not on the sample's.

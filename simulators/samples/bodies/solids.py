@@ -115,7 +115,7 @@ class Hull:
 
 @lru_cache(4096)
 def _hull(vertices: tuple[tuple[float, ...], ...]) -> Hull:
-    """Of a convex polyhedron. A body that is moved or turned, as while a sample is packed, has the same one."""
+    """The hull of a convex polyhedron. A body that is moved or turned, as while a sample is packed, keeps its hull."""
     points = np.array(vertices, dtype=np.float64)
     size = float(np.ptp(points, axis=0).max())
     try:

@@ -68,7 +68,7 @@ class PiAxisBuild:
 
 
 class GcsAxis(MovedAxis):
-    """Not safe from several threads. `line` is the cable in the output that has the settings `wired`."""
+    """An axis, not safe from several threads. `line` is the cable in the output with the settings `wired`."""
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PiAxisBuild, wired: PiOutput) -> None:
         self.build = build

@@ -27,7 +27,7 @@ Spoil = Callable[[int, bytes], bytes]
 
 
 def _degrees(angle: float) -> float:
-    """As the driver writes it: with 12 decimals."""
+    """Degrees as the driver writes them: with 12 decimals."""
     return round(math.degrees(angle), 12)
 
 

@@ -109,7 +109,7 @@ class Channel:
         return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
 
     def status(self) -> int:
-        """b7 emergency stop, b6 slow stop, b5 limit, b1 driving, b0 busy. Speeding up and slowing down are not told."""
+        """b7 emergency stop, b6 slow stop, b5 limit, b1 driving, b0 busy. It does not show acceleration."""
         return 0b11 if self.motor.moving() else int(self.motor.ended)
 
 

@@ -86,7 +86,7 @@ class SimulatedZaberAxis(MovedAxis):
         return sorted(standing, key=PRIORITY.index)
 
     def disturb(self, beyond: Callable[[float], float], *flags: str) -> None:
-        """As that of any axis; only these flags tell."""
+        """Disturb the axis, which only these flags show."""
         super().disturb(beyond)
         self.flags.update(flags)
 

@@ -99,7 +99,7 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     if flats == "the second without flats":
         truth[9:] *= left  # by the beam of the first
         (warning,) = said
-        assert f"Frames {len(first)}-{keys.size - 1}, a part of the scan, have no flats of their own" in warning
+        assert f"Frames {len(first)}-{keys.size - 1}, a part of the scan, have no usable flats" in warning
     else:
         assert said == []
     np.testing.assert_allclose(np.exp(-found.data).mean(axis=(1, 2)), truth, rtol=3e-3)  # 5 sigma of 1600 pixels

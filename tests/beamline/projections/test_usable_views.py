@@ -1,4 +1,4 @@
-"""Views with an alarm are left out, those with a warning weigh half, and --flags ignore takes all alike."""
+"""Views with an alarm are left out, those with a warning weigh half, and --flags ignore weighs all equally."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
 
 def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
     _, (line,) = prepare(scan(tmp_path, {FIRST + 9: Level.ALARM}), SELECTION)
-    assert line == "Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore takes all alike."
+    assert line == "Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore weighs all equally."
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:

@@ -292,4 +292,4 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")
     assert (shutter == "The shutter is closed.") is not lost
     assert ("LOOK AT THE INSTRUMENT" in shutter) is lost
-    assert disarmed == "The stage stands, its trigger output is disarmed, the shutter has a step of its own."
+    assert disarmed == "The stage stands, its trigger output is disarmed, the shutter is closed in a separate step."

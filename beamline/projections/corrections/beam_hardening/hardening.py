@@ -79,7 +79,7 @@ class Hardening:
 
     @property
     def needs_finished(self) -> str:
-        return "" if self.model is None else "--hardening is for a finished scan: its curve is of all views."
+        return "" if self.model is None else "--hardening is for a finished scan: its curve is fitted to all views."
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory(alone=0 if self.model is None else curve_memory(part.geometry, self))

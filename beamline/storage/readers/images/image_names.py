@@ -33,7 +33,7 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     largest, where both kinds of references are there without it.
 
     Raises:
-        DataError: no series can be told to be the projections.
+        DataError: no series can be recognised as the projections.
     """
     within = _without_common_folder(names)
     kinds = {name: _by(_REFERENCE, short) for name, short in zip(names, within, strict=True)}
@@ -126,7 +126,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
         one_series: all of them are one numbered series, whatever the names say of kinds.
 
     Raises:
-        DataError: no series can be told to be the projections, or there are several.
+        DataError: no series can be recognised as the projections, or there are several.
     """
     images = natural_sorted(images)
     kinds = dict.fromkeys(images, FrameKind.PROJECTION) if one_series else kinds_of(path, images)

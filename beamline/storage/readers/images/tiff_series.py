@@ -136,7 +136,7 @@ class TiffSeriesSource(ScanSource):
         if (n := self._size(name)) > most:
             raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
-            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of values nearly all alike, which no image has")
+            raise OSError(errno.EFBIG, f"it unpacks to {size(n)} of nearly equal values, which no image has")
         return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
 
     @contextmanager

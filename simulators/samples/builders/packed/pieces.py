@@ -126,7 +126,7 @@ def _sunk(piece: Piece, left: float, bottom: float) -> Ellipsoid | Cylinder | Bo
 
 @dataclass(frozen=True)
 class Charge:
-    """Pieces of one role take other attenuations, each at a time of its own: particles of a battery that charge.
+    """Pieces of one role change their attenuations, each at its own time: particles of a battery that charge.
 
     The attenuation of a piece is multiplied by 1 + (factor - 1) s, and s rises from 0 to 1 as a logistic curve. Its
     middle is drawn between `from_s` and `from_s + over_s`; its width is `each_s`.

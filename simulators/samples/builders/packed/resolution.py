@@ -81,7 +81,7 @@ class Resolution(PieceBuilder):
         return MARGIN * reach, MARGIN * sum(tall for _, _, tall in layers)
 
     def _layers(self) -> list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]]:
-        """For each layer: its solids, centred at its middle; their role; its height with the space around, mm."""
+        """The layers: solids of each, centred at its middle; their role; its height with the space around, mm."""
         layers: list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]] = []
         if self.balls_um:
             sizes = [um * 1e-3 for um in self.balls_um]

@@ -144,8 +144,8 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
     [
         (("--time", "3", "--follow"), 2, "--time does not go with --follow"),
         (("--time", "3", "-m", "fbp"), 2, "--time is of series; it does not go with --method fbp"),
-        (("--time", "3", "--uncertainty"), 2, "error bars are of one volume"),
-        (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "a box is of one volume"),
+        (("--time", "3", "--uncertainty"), 2, "error bars belong to one volume"),
+        (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
         (("--time", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--time", "1"), 2, "--time"),
         (("--moves",), 2, "give --time N"),
