@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
+from types import TracebackType
+from typing import Self
+from uuid import uuid4
 
 import h5py
 import numpy as np
@@ -12,15 +15,58 @@ import pytest
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.run_result import RunResult
+from beamline.instrument.connect import ConnectedDevices
 from beamline.scan import recorder
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
-from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
+from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
+from drivers.dcam.camera import DcamCamera
 from drivers.orca_quest import DcamOptions, TriggerPolarity
-from tests.drivers.dcam.fly_rig import COUNTS, SENSOR, FlyRig
+from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.pm16c.stage import PM16CStage
+from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.box import BoxBuild
+from simulators.wires.pm16c.wire import PM16CBuild
+from simulators.wires.wire import register
+from tests.drivers.dcam.fake import World
+
+SENSOR = (64, 64)
+COUNTS = 360_000
+
+
+class FlyRig:
+    """Closes its devices at the end of a `with` block, and then nothing of the library may be left open."""
+
+    def __init__(self, world: World, options: DcamOptions | None = None) -> None:
+        world.reset(*SENSOR)
+        self.world, self.clock = world, world.clock
+        self.line = TriggerLine(self.clock)
+        world.plug(self.line)
+        build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS))
+        box = build.controller(self.clock, self.line)
+        settings = PM16CSettings(counts_per_turn=COUNTS, max_speed=math.radians(30), acceleration=math.radians(60))
+        self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), settings, self.clock)
+        self.camera: DcamCamera = world.connect(options)
+
+    def connected(self) -> ConnectedDevices:
+        devices = Devices(self.stage, self.camera, SimulatedShutter(), SimulatedSampleMover())
+        return ConnectedDevices(devices, self.clock, None, self.close)
+
+    def close(self) -> None:
+        self.stage.close()
+        self.camera.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+        assert self.world.live == 0
+
 
 EXTERNAL = CameraSettings(0.002, TriggerSource.EXTERNAL)
 DARKS, FLATS = 3, 2

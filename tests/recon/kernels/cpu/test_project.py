@@ -152,21 +152,3 @@ def test_the_gate_takes_needles_and_what_starts_too_far_down_from_the_recurrence
     for y in (127.97, 254.99):
         dot = _one(0.05, 0.05, 0.0, (128.02, y))
         np.testing.assert_allclose(_image(dot, shape), _dense(dot, shape)[0][0], atol=1e-6)
-
-
-@pytest.mark.parametrize(("n", "alike", "bound"), [(20_000, True, 6e-6), (20_000, False, 2e-6), (300_000, False, 3e-6)])
-def test_a_pile_of_footprints_is_summed_without_drift(
-    rng: np.random.Generator, n: int, alike: bool, bound: float
-) -> None:
-    # Of a sum of equal numbers one by one every step rounds alike: 5e-3 are lost of a million, 9e-5 of these.
-    places = np.full((n, 2), 8.0) if alike else rng.uniform(7.6, 8.4, (n, 2))
-    weights = np.full(n, 0.7) if alike else rng.uniform(0.1, 1, n)
-    table = _table(places, *(np.ones(n) for _ in range(2)), np.zeros(n), weights, 3.5)
-    t, pixel = table.astype(np.float64), np.arange(16)
-    along = [np.exp(-0.5 * (pixel[None] - t[:, [place]]) ** 2) for place in (U, V)]
-    expected = (along[1] * t[:, [W]]).T @ along[0]
-    inside = expected > 0.05 * expected.max()
-    assert (np.abs(_image(table, (16, 16)) / expected - 1))[inside].max() < bound
-    if alike:
-        one_by_one = np.cumsum(np.full(n, weights[0], np.float32), dtype=np.float32)[-1]
-        assert abs(float(one_by_one) / (n * 0.7) - 1) > 5 * bound

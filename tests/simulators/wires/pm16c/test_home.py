@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.simulators.pm16c_host import ACCELERATION, TURN, Wire
 
@@ -35,18 +33,6 @@ def test_a_search_passes_the_switch_remembers_it_and_stands_v_squared_over_2a_be
     assert int(wire.ask("PS?0")) == at
 
 
-def test_a_search_that_is_stopped_before_the_switch_has_found_nothing() -> None:
-    for stop in ("SSTP0", "ESTP0"):
-        wire = searching(30_000)
-        wire.tell("FDHP0")
-        wire.clock.sleep(29.0)
-        wire.run(stop)
-        assert wire.ask("SHP?0") == "NO H.P"
-        wire.run("ABS0+40000")
-        assert wire.ask("SHP?0") == "NO H.P"
-        assert wire.ask("GTHP0", "ERRF?") == "01"
-
-
 def test_a_new_search_forgets_the_old_one_and_a_move_does_not() -> None:
     wire = searching(500)
     wire.run("FDHP0")
@@ -54,14 +40,6 @@ def test_a_new_search_forgets_the_old_one_and_a_move_does_not() -> None:
     assert wire.ask("SHP?0") == "+0000500"
     wire.tell("FDHP0")
     assert wire.ask("SHP?0") == "NO H.P"
-
-
-def test_a_search_without_a_switch_or_during_a_move_is_refused() -> None:
-    wire = searching(None)
-    assert wire.ask("FDHP0", "STS0?")[2] == "S"
-    assert wire.ask("ERRF?") == "01"
-    wire = searching(500)
-    assert wire.ask("ABS0+1000", "FDHP0", "ERRF?") == "02"
 
 
 def test_a_limit_between_here_and_the_switch_ends_the_search() -> None:
@@ -72,18 +50,6 @@ def test_a_limit_between_here_and_the_switch_ends_the_search() -> None:
 
 
 # the preset
-
-
-@given(st.lists(st.integers(-100_000, 100_000), max_size=5))
-def test_a_preset_changes_the_counter_without_turning_the_motor(presets: list[int]) -> None:
-    wire = Wire()
-    turned = 0
-    for preset in presets:
-        wire.run("REL0+1000")
-        turned += 1000
-        wire.tell(f"PS0{preset:+d}")
-        assert int(wire.ask("PS?0")) == preset
-        assert wire.line.angle_at(wire.clock.now()) == pytest.approx(turned * 2 * math.pi / TURN)
 
 
 def test_the_past_is_not_turned_by_a_preset() -> None:

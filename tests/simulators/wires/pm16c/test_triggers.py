@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from tests.simulators.pm16c_host import ACCELERATION, Wire
+from tests.simulators.pm16c_host import Wire
 
 
 @pytest.fixture
 def wire() -> Wire:
     return Wire()
-
-
-def test_pulses_come_when_the_commanded_position_crosses_each_point(wire: Wire) -> None:
-    """In the ramp s = at²/2, so point s is crossed at √(2s/a); at full speed the pulses are interval/speed apart."""
-    wire.train(100, 1000, 300)
-    wire.run("ABS0+2000")
-    assert wire.counts() == [100, 400, 700, 1000]
-    crossings = [math.sqrt(2 * point / ACCELERATION) for point in (100, 400, 700, 1000)]
-    assert [pulse.time for pulse in wire.pulses()] == pytest.approx(crossings)
-
-
-def test_at_full_speed_pulses_are_interval_over_speed_apart(wire: Wire) -> None:
-    wire.train(10_000, 50_000, 400)
-    wire.run("ABS0+60000")
-    times = [pulse.time for pulse in wire.pulses()]
-    assert [later - earlier for earlier, later in itertools.pairwise(times)] == pytest.approx([0.04] * 100)
 
 
 def test_a_stop_at_the_instant_of_a_pulse_neither_loses_nor_repeats_one() -> None:
@@ -91,14 +72,6 @@ def test_it_cannot_be_armed_switched_off_or_without_a_position_controller(wire: 
     assert wire.ask("TMGR?0") == "NO"
     wire.tell("TMGM05", "SETCH4567", "TMGR0")
     assert wire.ask("TMGR?0") == "NO"
-
-
-def test_clearing_ends_a_train_early(wire: Wire) -> None:
-    wire.train(1000, 9000, 1000)
-    wire.run("ABS0+4500")
-    wire.tell("TMGC0")
-    wire.run("ABS0+20000")
-    assert wire.counts() == [1000, 2000, 3000, 4000]
 
 
 def test_settings_of_an_armed_trigger_are_not_taken(wire: Wire) -> None:

@@ -26,14 +26,6 @@ def set_up(wire: Wire, condition: str, action: str = PULSE, number: int = 1, ena
 # distances
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_distance_trigger_fires_each_distance_from_where_it_was_enabled(wire: Wire, sign: int) -> None:
-    wire.run(f"move abs {sign * 130}")
-    set_up(wire, "1 dist 500")
-    wire.run(f"move abs {sign * 2630}")
-    assert wire.counts() == [sign * count for count in (630, 1130, 1630, 2130, 2630)]
-
-
 @given(st.integers(1, 4000), st.integers(-500, 500))
 def test_pulse_times_are_those_of_the_closed_form(distance: int, start: int) -> None:
     wire = Wire()
@@ -55,12 +47,6 @@ def test_pulse_times_are_those_of_the_closed_form(distance: int, start: int) -> 
         assert pulse.time - begun == pytest.approx(expected, abs=1e-9)
         assert pulse.angle == pytest.approx((start + gone) * 2 * math.pi / TURN)
     assert len(wire.pulses()) == min(40, 100_000 // distance)
-
-
-def test_toggling_gives_a_rising_edge_each_second_time(wire: Wire) -> None:
-    set_up(wire, "1 dist 500", "io set do 1 t")
-    wire.run("move abs 3000")
-    assert wire.counts() == [500, 1500, 2500]
 
 
 def test_a_distance_is_counted_both_ways_from_the_last_fire(wire: Wire) -> None:
@@ -90,25 +76,6 @@ def test_without_a_count_it_goes_on_until_disabled(wire: Wire) -> None:
     assert wire.counts() == [500, 1000]
 
 
-def test_a_stop_removes_predicted_pulses(wire: Wire) -> None:
-    set_up(wire, "1 dist 500")
-    wire.do("move abs 90000")
-    wire.clock.sleep(1.0)
-    wire.do("estop")
-    here = int(wire.data("get pos", axis=1))
-    wire.clock.sleep(60.0)
-    assert wire.counts() == list(range(500, here + 1, 500))
-    wire.run("move abs 90000")
-    assert wire.counts() == list(range(500, 90_001, 500))
-
-
-def test_firmware_may_fire_where_a_distance_trigger_is_enabled() -> None:
-    wire = Wire(fires_when_enabled=True)
-    set_up(wire, "1 dist 500", enable="enable 2")
-    wire.run("move abs 3000")
-    assert wire.counts() == [0, 500]
-
-
 # comparisons
 
 
@@ -127,24 +94,6 @@ def test_a_comparison_fires_when_it_turns_true(wire: Wire, condition: str, edges
     wire.run("move abs -1000")
     wire.run("move abs 0")
     assert wire.counts() == edges
-
-
-def test_a_comparison_that_turns_true_enables_another_trigger_there(wire: Wire) -> None:
-    """The first pulse and what gives the rest, at one position, wherever the stage stood before."""
-    wire.run("move abs -777")
-    wire.do("trigger 2 when 1 dist 250", f"trigger 2 action a {PULSE}", "trigger 1 action b trigger 2 enable 4")
-    set_up(wire, "1 pos >= 1000", enable="enable 1")
-    wire.run("move abs 9000")
-    assert wire.counts() == [1000, 1250, 1500, 1750, 2000]
-
-
-def test_latency_delays_all_pulses_of_a_chain_by_the_same_angle() -> None:
-    wire = Wire(latency=0.01)
-    wire.do("trigger 2 when 1 dist 500", f"trigger 2 action a {PULSE}", "trigger 1 action b trigger 2 enable 3")
-    set_up(wire, "1 pos >= 5000", enable="enable 1")
-    wire.run("move abs 30000")
-    late = [count - at for count, at in zip(wire.counts(), (5000, 5500, 6000, 6500), strict=True)]
-    assert late == [100, 200, 200, 200]
 
 
 def test_triggers_that_set_each_other_off_come_to_an_end(wire: Wire) -> None:
@@ -173,15 +122,6 @@ def test_pulses_wider_than_their_distance_in_time_merge(wire: Wire) -> None:
     set_up(wire, "1 dist 500", "io set do 1 1 schedule 60 0")
     wire.run("move abs 90000")
     assert len(wire.pulses()) < 90
-
-
-def test_another_output_is_not_cabled_and_an_inverted_one_pulses_downwards() -> None:
-    wire = Wire(active_high=False)
-    assert wire.data("io get do 1") == "1"
-    set_up(wire, "1 dist 500", "io set do 1 0 schedule 1 1")
-    set_up(wire, "1 dist 100", "io set do 2 t", number=2)
-    wire.run("move abs 1200")
-    assert wire.counts() == [500, 1000]
 
 
 def test_lost_pulses_are_missing_and_no_others() -> None:
