@@ -8,13 +8,37 @@ import time
 
 import pytest
 import serial
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.serial.line import LineRules, Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine, SerialPort, serial_ports
 from drivers.serial.line_reader import RECENT_LINES
 from simulators.devices.clock import VirtualClock
 from simulators.wires.wire import register
+
+
+def listed(device: str, **facts: object) -> ListPortInfo:
+    port = ListPortInfo(device)
+    for name, value in facts.items():
+        setattr(port, name, value)
+    return port
+
+
+def test_ports_and_what_they_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    adapter = listed("/dev/ttyUSB0", vid=0x0403, pid=0x6001, serial_number="FT1234", description="FT232R USB UART")
+    monkeypatch.setattr(list_ports, "comports", lambda: [adapter, listed("/dev/ttyS0")])
+    plain, usb = serial_ports()
+    assert usb == SerialPort("/dev/ttyUSB0", 0x0403, 0x6001, "FT1234", "FT232R USB UART")
+    assert str(usb) == "/dev/ttyUSB0 0403:6001 serial FT1234 (FT232R USB UART)"
+    assert plain == SerialPort("/dev/ttyS0", None, None, "", "")
+    assert str(plain) == "/dev/ttyS0"
+
+
+def test_this_computer_can_be_asked() -> None:
+    assert all(port.device for port in serial_ports())
+
 
 NAMES = (f"line-test-{number}" for number in itertools.count())
 NUMBER = r"-?\d+"
@@ -123,13 +147,6 @@ def test_a_reply_that_is_whole_at_the_very_deadline_is_taken_or_not_but_never_ta
         except DeviceTimeout:
             assert late >= 0.0
         assert [ask(line, n) for n in (222, 333)] == [222, 333]
-
-
-def test_a_reply_so_late_that_it_comes_between_probe_and_answer_is_passed_over() -> None:
-    line = connect(Echo({0: [(1.2, b"111\r\n")], 1: [(0.4, b"ECHO\r\n")]}))
-    with pytest.raises(DeviceTimeout):
-        ask(line, 111)
-    assert ask(line, 222) == 222
 
 
 def test_a_late_answer_to_an_earlier_probe_is_not_left_behind() -> None:

@@ -219,25 +219,6 @@ def _amplitude(effect: ScintillatorBlur, k: int, shot: Shot) -> float:
     return 2 / rows * float(wave @ seen.mean(axis=1))
 
 
-@settings(max_examples=40)
-@given(
-    rows=st.integers(1, 50),
-    cols=st.integers(1, 50),
-    fwhm=st.floats(0, 200),
-    share=st.floats(0, 0.99),
-    width=st.floats(0.1, 1000),
-    tail=st.sampled_from(["exponential", "lorentzian"]),
-)
-def test_light_is_kept_and_none_is_negative(
-    rows: int, cols: int, fwhm: float, share: float, width: float, tail: Any
-) -> None:
-    image = np.random.default_rng(rows * 50 + cols).exponential(1000.0, (rows, cols))
-    image[image < 1000] = 0.0
-    seen = ScintillatorBlur(fwhm, share, width, tail).apply(image.copy(), _shot((rows, cols)))
-    assert seen.sum() == pytest.approx(image.sum(), rel=1e-11)
-    assert seen.min() >= 0
-
-
 def test_the_core_is_the_gaussian_of_another_implementation(rng: np.random.Generator) -> None:
     image = rng.random((60, 90))
     seen = ScintillatorBlur(150.0).apply(image.copy(), _shot((60, 90)))
