@@ -17,14 +17,13 @@ from beamline.config.load import Config, config_folder, load
 from beamline.core.run_result import RunResult
 from beamline.instrument.connect import ConnectedDevices
 from beamline.scan import recorder
-from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 from drivers.dcam.camera import DcamCamera
-from drivers.orca_quest import DcamOptions, TriggerPolarity
+from drivers.orca_quest import DcamOptions
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from simulators.devices.in_beam import SimulatedSampleMover, SimulatedShutter
@@ -105,20 +104,6 @@ def fly(rig: FlyRig, interval: int, n: int, speed: float) -> list[CameraFrame]:
         except DeviceTimeout:
             continue
     return frames
-
-
-@pytest.mark.parametrize("polarity", TriggerPolarity)
-def test_each_pulse_of_a_turning_stage_is_a_frame_at_its_time(world, polarity: TriggerPolarity) -> None:
-    with FlyRig(world, DcamOptions(trigger_polarity=polarity)) as rig:
-        frames = fly(rig, interval=100, n=50, speed=10_000)
-        assert [frame.framestamp for frame in frames] == list(range(50))
-        assert np.diff([frame.time for frame in frames]) == pytest.approx(100 / 10_000, abs=5e-6)
-        for frame in frames:
-            angle = rig.line.angle_at(frame.time)
-            late = 10_000 * COUNT * 0.001 if polarity is TriggerPolarity.NEGATIVE else 0.0  # the fake's pulses: 1 ms
-            expected = (COUNTS // 10 + 100 * frame.framestamp) * COUNT + late
-            assert angle == pytest.approx(expected, abs=0.1 * COUNT)
-            np.testing.assert_array_equal(frame.counts, world.pattern(frame.framestamp, (0, 0, *SENSOR)))
 
 
 def test_pulses_that_a_stopped_stage_takes_back_never_come(world) -> None:
@@ -215,16 +200,3 @@ def test_the_camera_captures_before_the_stage_is_armed_and_until_it_is_disarmed(
         assert Scanned(rig, small(24, "scan.period_s=0.2", passes), tmp_path).error is None
     assert capturing["arm"] == [True] * 3
     assert capturing["disarm"][:3] == [True] * 3
-
-
-def test_a_scan_names_what_the_camera_lost(world, tmp_path: Path) -> None:
-    missing = [0, 7, 8, 30, 59]
-    with FlyRig(world) as rig:
-        rig.world.lose(*missing)
-        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
-    assert isinstance(scanned.error, LedgerError)
-    assert [row - DARKS - FLATS for row in scanned.error.missing] == missing
-    for trigger, angle, bits in scanned.views():
-        assert trigger not in missing
-        assert angle == pytest.approx(trigger * COUNTS / 360, abs=1e-6)
-        assert bits == trigger % 16  # each row has the angle of its own pixels

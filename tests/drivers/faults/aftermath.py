@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from beamline.scan.control import State
@@ -72,11 +73,21 @@ def assert_complete(scanned: Scanned) -> None:
     assert scanned.status() == "complete"
 
 
-def assert_next_scan_works(rig: Rig, runs: Path) -> None:
-    """In the same process, over the same controller and library."""
+def assert_next_scan_works(rig: Rig, runs: Path, tells: str = "") -> None:
+    """In the same process, over the same controller and library.
+
+    Args:
+        tells: regular expression of what the controller still has of the fault. The next scan warns of it, the one
+            after does not. "": no scan has a warning.
+    """
     rig.clock.sleep(30.0)  # a stage that could not be stopped stands by itself
     rig.repair()
-    scanned = rig.scan(runs)
-    assert_complete(scanned)
-    assert scanned.warnings == []
-    assert_at_rest(rig, scanned)
+    for words in (tells, "") if tells else ("",):
+        scanned = rig.scan(runs)
+        assert_complete(scanned)
+        if words:
+            (warning,) = scanned.warnings
+            assert re.fullmatch(rf"stage: before it was opened: {words}\.", warning), warning
+        else:
+            assert scanned.warnings == []
+        assert_at_rest(rig, scanned)

@@ -133,3 +133,9 @@ def test_a_reference_move_finds_the_true_zero(command: str, at: float) -> None:
     assert (wire.raw(b"\x05"), wire.raw(b"\x07"), wire.ask("FRF? 1")) == (b"0\n", b"\xb1\n", "1=1")
     assert wire.ask("POS? 1") == f"1={at:.6f}"
     assert math.degrees(wire.line.angle_at(wire.clock.now())) == pytest.approx(at)
+
+
+def test_a_stage_without_switches_says_so() -> None:
+    wire = Wire(reference_switch=False, limit_switches=False)
+    assert (wire.ask("TRS? 1"), wire.ask("LIM? 1")) == ("1=0", "1=0")
+    assert [wire.complains(command) for command in ("FRF 1", "FNL 1", "FPL 1")] == [31, 32, 32]

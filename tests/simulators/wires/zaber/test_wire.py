@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
@@ -57,6 +59,22 @@ def test_a_packet_that_is_damaged_gets_no_answer_and_the_next_one_does(wire: Wir
 def test_words_and_ids_out_of_bounds_are_refused(wire: Wire) -> None:
     assert wire.ask("/1 0 7 " + "w" * 51) == "@01 0 7 RJ IDLE -- LONGWORD"
     assert wire.ask("/1 0 100 home") == "@01 0 RJ IDLE -- BADMESSAGEID"
+
+
+VOCABULARY = """
+    trigger 1 2 3 6 7 when action a b io set do di dist pos >= <= == 100 2000 -50 encoder abs time enable disable
+    print schedule 0 t none move rel vel stop estop home show get maxspeed = += driver warnings clear cont echo tools
+"""
+WORDS = st.sampled_from(VOCABULARY.split())
+
+
+@given(st.lists(st.lists(WORDS, max_size=9), max_size=30))
+def test_any_sequence_of_its_own_words_leaves_it_answering(commands: list[list[str]]) -> None:
+    wire = Wire()
+    for words in commands:
+        wire.tell("/1 0 " + " ".join(words), "/1 1 " + " ".join(words))
+        wire.clock.sleep(0.2)
+    assert wire.ask("/1 0 55 get version").startswith("@01 0 55 OK ")
 
 
 def test_another_devices_packets_are_not_answered_and_everybodys_are(wire: Wire) -> None:
