@@ -39,16 +39,6 @@ def test_the_sample_is_moved_out_and_back_once() -> None:
     assert len(asked) == 2
 
 
-def test_what_the_operator_did_not_confirm_did_not_happen() -> None:
-    def refuse(request: str) -> None:
-        raise KeyboardInterrupt
-
-    shutter = ManualShutter(refuse)
-    with pytest.raises(KeyboardInterrupt):
-        shutter.open()
-    assert not shutter.is_open()
-
-
 def _shutter(ask: Ask) -> tuple[Callable[[], object], Callable[[], object]]:
     device = ManualShutter(ask)
     return device.close, device.open

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from recon.base.decisions import Decisions
 from recon.base.method import ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Volume
 from recon.splatting.finish import Candidates
-from recon.voxels import held_out
 from recon.voxels.direct import Fbp
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv
@@ -69,16 +67,6 @@ def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> No
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=first))
     control = recon.RunControl(decide=Decisions(0, first.made))
     assert recon.reconstruct(0.5 * data, VIEWS, auto, control=control).settings["factor"] == 1.0  # alone it is 0.5
-
-
-def test_the_weight_that_one_trial_finds_is_that_of_all_trials(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two methods are tried, and one of them reconstructs the whole, whose weight is sought anew: two searches."""
-    searches = Mock(side_effect=held_out.preferred_strength)
-    monkeypatch.setattr(held_out, "preferred_strength", searches)
-    decide, auto = Decisions(), Auto((FistaTv(iterations=4), FistaTv(iterations=5)))
-    recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide))
-    recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=Decisions(0, decide.made)))  # another slab
-    assert searches.call_count == 2
 
 
 def test_a_weight_by_the_noise_is_not_passed_on() -> None:

@@ -13,7 +13,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.error_bars import alternating, error_bars, error_bars_memory, method_on_voxels
+from recon.error_bars import alternating, error_bars, method_on_voxels
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 
@@ -147,8 +147,3 @@ def test_a_method_without_calibration_and_too_few_views_are_refused() -> None:
     less = replace(given, geometry=few, projections=given.projections[::16])
     with pytest.raises(ValueError, match="at least 8 views are needed"):
         error_bars(recon.Fbp(), less, Volume(ball(), GRID), {}, RunControl())
-
-
-def test_its_memory_is_at_least_its_arrays() -> None:
-    for method in (recon.Fbp(), recon.FistaTv(), recon.R2()):
-        assert error_bars_memory(method, VIEWS, GRID) > 4 * (2 * problem().projections.size + 4 * ball().size)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon import methods
-from recon.base.method import Method, Traits
+from recon.base.method import Method
 from recon.splatting.fit_method import FitMethod
 from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
@@ -31,22 +30,6 @@ def projections() -> NDArray[np.float32]:
     return Projector(VIEWS, grid).forward(truth)
 
 
-def _first_steps() -> recon.RunControl:
-    asked = count()
-    return recon.RunControl(should_stop=lambda: next(asked) >= 20)
-
-
-@pytest.mark.parametrize("name", methods.names_of_one_volume())
-def test_a_method_by_name_is_the_method_by_object_to_the_bit(name: str, projections: NDArray[np.float32]) -> None:
-    method = methods.by_name(name)
-    by_name, by_object = (
-        recon.reconstruct(projections, VIEWS, given, seed=3, control=_first_steps()) for given in (name, method())
-    )
-    np.testing.assert_array_equal(by_name.volume.data, by_object.volume.data)
-    assert by_name.method == by_object.method == method.name == name
-    assert by_object.volume.data.max() > 0.05
-
-
 @pytest.mark.parametrize("name", methods.taking("allow_negative"))
 def test_negative_densities_are_kept_where_they_are_allowed(name: str, projections: NDArray[np.float32]) -> None:
     """Air below zero: 0.02 on rays of 12 mm."""
@@ -59,12 +42,6 @@ def test_negative_densities_are_kept_where_they_are_allowed(name: str, projectio
 
     assert lowest() == 0
     assert lowest(allow_negative=True) < -5e-4
-
-
-def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
-    positive = {"series"}
-    others = set(methods.names()) - set(methods.with_trait("direct")) - positive
-    assert set(methods.taking("allow_negative")) == others
 
 
 @pytest.mark.parametrize("name", methods.names())
@@ -105,24 +82,10 @@ def test_a_weight_that_no_total_variation_has_is_refused(method: type[recon.Fist
         method(tv_weight=weight)
 
 
-def test_every_trait_is_asked_somewhere() -> None:
-    assert methods.with_trait("direct") == ("fbp",)
-    for trait in (f.name for f in fields(Traits)):
-        assert methods.with_trait(trait)
-
-
 def test_names_load_nothing_that_computes() -> None:
     code = "import sys, recon.methods as m; m.names(); m.streams('r2'); print({'torch', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
-
-
-def test_the_protocol_is_met_by_every_method() -> None:
-    wanted = set(Method.__annotations__) | {"run", "toy", "memory"}
-    for name in methods.names():
-        method = methods.by_name(name)
-        own = set().union(*(vars(cls) for cls in method.__mro__ if cls is not Method))
-        assert wanted <= own  # nothing is the Protocol's
 
 
 class TestConformance(MethodConformance):

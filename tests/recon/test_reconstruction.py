@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -143,15 +142,6 @@ def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> Non
         )  # fmt: skip
 
 
-def test_each_argument_but_the_data_and_hooks_is_checked_against_the_method() -> None:
-    # A new argument that no method is asked about would be one that may silently do nothing.
-    free = {"projections", "geometry", "grid", "method", "seed", "weights", "on_progress", "should_stop", "stop_trials",
-            "checkpoint_every", "now", "decide", "sample_radius"}  # fmt: skip
-    names = {"device", *inspect.signature(recon.reconstruct).parameters} - {"use", "control"}
-    names |= {field.name for kind in (DataUse, RunControl) for field in fields(kind)}
-    assert names == free | {name.split()[0] for name in OF_A_FIT}
-
-
 @pytest.mark.parametrize(
     ("method", "iterations", "margin"),
     [("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0), ("fista-tv", 10, 3.0),
@@ -263,11 +253,6 @@ def test_transmission_causes_a_warning_with_advice(noisy: np.ndarray, call: Call
         call(light)
     assert told[0].filename == __file__
     call(-np.log(light))
-
-
-def test_the_names_that_load_late_are_listed() -> None:
-    assert set(recon.__all__) <= set(dir(recon))
-    assert len(dir(recon)) == len(set(dir(recon)))
 
 
 def test_line_integrals_of_the_other_sign_cause_a_warning(noisy: np.ndarray) -> None:

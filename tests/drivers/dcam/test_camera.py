@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,7 +14,23 @@ from drivers.base.protocols import Camera, CameraSettings, TriggerSource
 from drivers.dcam.abi import DcamError
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error
-from drivers.orca_quest import DcamOptions
+from drivers.orca_quest import SENSOR_SHAPE, DcamOptions
+from drivers.testing.camera import CameraBench, CameraConformance
+from tests.drivers.orca_bench import orca_bench, says_what_an_orca_says
+
+
+class TestDcamCamera(CameraConformance):
+    @pytest.fixture
+    def bench(self, world) -> Iterator[CameraBench]:
+        world.reset(*SENSOR_SHAPE)
+        camera = world.connect()
+        yield orca_bench(camera, world.clock, world.schedule)
+        camera.close()
+        assert world.live == 0
+
+    def test_its_conversion_is_that_of_an_orca(self, bench: CameraBench) -> None:
+        says_what_an_orca_says(bench)
+
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 FRAME_BYTES = 48 * 72 * 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import itertools
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +62,6 @@ def test_commands_and_lines_end_as_they_are_told_to(command_end: bytes, line_end
     line.send("GO")
     assert line.query("A?", r"\d", "a digit")[0] == "1"
     assert wire.heard == [b"GO" + command_end, b"A?" + command_end]
-
-
-def test_lines_that_say_that_another_follows_are_one_reply() -> None:
-    line = connect(Script(b"1=2.5 \n2=3 \n3=4\n"))
-    assert line.query("POS?", r"(?s).*", "positions")[0] == "1=2.5\n2=3\n3=4"
 
 
 @given(st.lists(st.text("abc=1", max_size=5), min_size=1, max_size=6), st.integers(1, 5))
@@ -170,29 +164,6 @@ def test_an_error_about_a_control_byte_can_be_read() -> None:
     assert r"Asked '\x05'" in str(error.value)
     assert r"> \x05 (" in error.value.wire
     assert str(error.value).isprintable()
-
-
-def test_a_command_goes_out_while_another_thread_waits_for_its_reply() -> None:
-    asked, go_on = threading.Event(), threading.Event()
-
-    class Slow(Script):
-        def transmit(self) -> bytes:
-            if b"A?\n" in self.heard:
-                asked.set()
-                assert go_on.wait(30.0)
-            return super().transmit()
-
-    wire = Slow(b"", b"5\n")
-    line = connect(wire)
-    answers: list[str] = []
-    asking = threading.Thread(target=lambda: answers.append(line.query("A?", r"\d", "a digit")[0]))
-    asking.start()
-    assert asked.wait(30.0)
-    line.send("STOP")
-    assert wire.heard == [b"A?\n", b"STOP\n"]
-    go_on.set()
-    asking.join()
-    assert answers == ["5"]
 
 
 # the transcript

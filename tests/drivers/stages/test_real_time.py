@@ -1,19 +1,149 @@
-"""Every stage on real time, by pseudo-terminal and TCP: short moves, a search, a train, a stop, garbage, the plug."""
+"""Every stage on real time, by pseudo-terminal and TCP: a search, a train, the plug."""
 
 from __future__ import annotations
 
 import gc
+import itertools
 import math
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError
-from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, Kind, Real, Serve, serve_sim
-from tests.simulators.wires.transports import serve_tcp
+from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.settings import StageDriver
+from drivers.stages.zaber.stage import ZaberStage
+from drivers.testing.stages.bench import StageBench
+from simulators.devices.clock import ScaledClock
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
+from simulators.wires.wire import Wire, register
+from simulators.wires.zaber.wire import ZaberBuild, ZaberController
+from tests.drivers import zaber_rig
+from tests.drivers.stages import pi_gcs_rig
+from tests.drivers.stages.flat_settings import flat
+from tests.simulators.wires.transports import serve_pty, serve_tcp
+
+FAST = math.radians(60)
+SOON = 10.0
+"""s; a busy machine takes its time."""
+Serve = Callable[[Wire], AbstractContextManager[str]]
+NUMBERS = itertools.count()
+
+
+@contextmanager
+def serve_sim(wire: Wire) -> Iterator[str]:
+    yield register(f"real-time-{next(NUMBERS)}", wire)
+
+
+needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
+PLUGS = [pytest.param(serve_pty, marks=needs_pty, id="pty"), pytest.param(serve_tcp, id="tcp")]
+"""Those that can be pulled out."""
+SPEEDS: dict[Serve, float] = {serve_sim: 8.0, serve_pty: 2.0, serve_tcp: 1.0}
+"""Seconds of the clock of controller and driver in one real second. In one thread nothing can be late, so that sim://
+may be fast; a terminal is as real at twice the speed, with twice the timeout."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A driver and its stand-in.
+
+    Attributes:
+        driver: its class.
+        usual: values of them.
+        wire: makes the stand-in.
+        unreferenced: settings of the stand-in that has not found its reference yet, where there is such a state.
+        home: counts at which a search ends.
+        opening: beginnings of the first two things that the driver sends; `among`: a part of a later one.
+        farewell: parts of the last things that it sends.
+    """
+
+    driver: StageDriver
+    usual: Mapping[str, Any]
+    wire: Callable[..., Any]
+    opening: tuple[str, str]
+    among: str
+    farewell: tuple[str, ...]
+    unreferenced: Mapping[str, Any] = field(default_factory=dict)
+    home: int = 0
+
+
+QUICK = {"max_speed": FAST, "acceleration": math.radians(2000)}
+PATIENCE = 0.25
+"""s of real time for a reply."""
+
+
+def _pm16c(clock: Clock, line: TriggerLine, **faults: Any) -> PM16CController:
+    return flat(PM16CBuild, counts_per_turn=36_000, home_at=50, **faults).controller(clock, line)
+
+
+def _zaber(clock: Clock, line: TriggerLine, **faults: Any) -> ZaberController:
+    return flat(ZaberBuild, counts_per_turn=360_000, **faults).controller(clock, line)
+
+
+KINDS = {
+    "pm16c": Kind(
+        PM16CStage,
+        QUICK
+        | {"counts_per_turn": 36_000, "low": math.radians(-5), "high": math.radians(100), "home": math.radians(0.5)},
+        _pm16c,
+        opening=(r"b'\r\n'", r"b'VER?\r\n'"),
+        among="b'TMGR?0",
+        farewell=(r"b'LOC\r\n'",),
+        home=50,
+    ),
+    "pi_gcs": Kind(
+        PiGcsStage,
+        pi_gcs_rig.USUAL | QUICK,
+        pi_gcs_rig.controller,
+        opening=(r"b'\n'", r"b'*IDN?\n'"),
+        among="b'ACC 1 2000",
+        farewell=("b'SPA 1 0xC ", r"b'ERR?\n'"),  # what opening changed is restored, and taken
+        unreferenced={"referenced": False, "found_at": 0.5},
+    ),
+    "zaber": Kind(
+        ZaberStage,
+        zaber_rig.USUAL | QUICK,
+        _zaber,
+        opening=("b'", "b'/1 0 00 get comm.checksum:"),
+        among="get device.id",
+        farewell=("set comm.checksum 0",),
+        unreferenced={"homed": False},
+    ),
+}
+
+
+class Real:
+    """A stage on real time behind a transport; `unplug` pulls its cable out."""
+
+    def __init__(
+        self,
+        kind: Kind,
+        serve: Serve,
+        plugged: ExitStack,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        unreferenced: bool = False,
+    ) -> None:
+        clock = ScaledClock(SystemClock(), SPEEDS[serve])
+        line = TriggerLine(clock)
+        self.kind = kind
+        wire = kind.wire(clock, line, **(kind.unreferenced if unreferenced else {}))
+        self.unplug = plugged.close
+        url = plugged.enter_context(serve(wire))
+        timeout = PATIENCE * SPEEDS[serve] if serve is not serve_sim else PATIENCE
+        chosen = flat(kind.driver.Settings, **(kind.usual | {"timeout": timeout} | (settings or {})))
+        self.stage = kind.driver(url, chosen, clock)
+        self.bench = StageBench(self.stage, clock, line)
+
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
@@ -23,34 +153,7 @@ def serve(request: pytest.FixtureRequest) -> Serve:
     return request.param
 
 
-@pytest.fixture(scope="module", params=KINDS.values(), ids=KINDS)
-def kept(request: pytest.FixtureRequest, serve: Serve) -> Iterator[Real]:
-    """One for all tests: to open and close a port costs more than a test does."""
-    with ExitStack() as plugged:
-        real = Real(request.param, serve, plugged)
-        yield real
-        real.stage.close()
-
-
-@pytest.fixture
-def real(kept: Real) -> Real:
-    """It stands at zero, on a line that is sound."""
-    kept.wire.instead.clear()
-    kept.stage.stop()
-    kept.stage.start_move(0.0, FAST)
-    kept.stage.wait(SOON)
-    return kept
-
-
 # as on a virtual clock
-
-
-def test_moves_arrive_at_their_counts(real: Real) -> None:
-    stage = real.stage
-    for counts in (real.bench.counts(3), real.bench.counts(-1), 0, 1):
-        stage.start_move(stage.to_angle(counts), FAST)
-        assert stage.to_counts(stage.wait(SOON)) == counts
-        assert not stage.moving()
 
 
 @every_kind
@@ -69,15 +172,6 @@ def test_a_search_and_then_a_train_that_gives_its_pulses_at_its_counts(kind: Kin
         stage.close()
 
 
-def test_a_stop_on_the_way_stands_short(real: Real) -> None:
-    stage = real.stage
-    stage.start_move(math.radians(90), math.radians(10))
-    stage.stop()
-    with pytest.raises(DeviceError, match="stopped short"):
-        stage.wait(SOON)
-    assert 0 <= stage.to_counts(stage.position()) < real.bench.counts(90)
-
-
 @every_kind
 def test_the_transcript_of_a_conversation_is_whole(kind: Kind, tmp_path: Path) -> None:
     with ExitStack() as plugged:
@@ -90,41 +184,6 @@ def test_the_transcript_of_a_conversation_is_whole(kind: Kind, tmp_path: Path) -
     assert all(words in line for line, words in zip(last, kind.farewell, strict=True)), last
     assert all(line.startswith(words) for line, words in zip(sent, kind.opening, strict=False)), sent[:2]
     assert any(kind.among in line for line in sent)
-
-
-# disturbed, over one transport; the fuzz does the same on a virtual clock
-
-
-@pytest.mark.parametrize("serve", [serve_tcp], scope="module")
-def test_after_garbage_the_line_finds_its_step_again(real: Real) -> None:
-    stage = real.stage
-    stage.start_move(math.radians(1), FAST)
-    stage.wait(SOON)
-    for garbage in real.kind.garbage:
-        real.wire.instead.append(garbage)
-        with pytest.raises(DeviceError):
-            stage.position()
-        assert real.wire.instead == []
-        assert stage.to_counts(stage.position()) == real.bench.counts(1)
-        assert not stage.moving()
-
-
-@pytest.mark.parametrize("serve", [serve_tcp], scope="module")
-def test_after_garbage_in_the_middle_of_a_move_the_move_is_still_waited_for(real: Real) -> None:
-    stage = real.stage
-    stage.start_move(math.radians(7), math.radians(20))
-    real.wire.instead.extend([b"\x80\x81\r\n", b"??"])
-    failed = 0
-    while True:
-        try:
-            where = stage.wait(SOON)
-            break
-        except DeviceError as error:
-            assert "may be turning" in str(error)
-            failed += 1
-            assert failed <= 3
-    assert failed >= 1
-    assert stage.to_counts(where) == real.bench.counts(7)
 
 
 # the plug

@@ -31,11 +31,6 @@ def test_the_axis_is_in_the_middle_unless_told() -> None:
     assert Geometry.parallel([0.0], (4, 10), axis_col=3.2).axis_col == 3.2
 
 
-def test_selected_views_keep_their_order() -> None:
-    chosen = Geometry.parallel([0.1, 0.2, 0.3], (2, 2)).select([2, 0])
-    assert chosen.angles.tolist() == [0.3, 0.1]
-
-
 def test_a_single_view_is_a_list_of_one_and_none_is_refused() -> None:
     views = Geometry.parallel([0.1, 0.2, 0.3], (2, 2))
     assert views.select(np.array([False, True, False])).angles.tolist() == [0.2]
@@ -72,12 +67,6 @@ def test_angles_cannot_be_changed_from_outside() -> None:
 def test_impossible_geometries_are_refused(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Geometry.parallel(**({"angles": [0.0], "detector_shape": (4, 4)} | arguments))  # type: ignore[arg-type]
-
-
-def test_voxel_centres_are_symmetric_about_the_grids_centre() -> None:
-    z, y, x = Grid((3, 4, 5), 0.5, centre=(1.0, 2.0, 3.0)).coordinates()
-    assert (z.mean(), y.mean(), x.mean()) == (1.0, 2.0, 3.0)
-    np.testing.assert_allclose(np.diff(x), 0.5)
 
 
 def test_the_edges_are_half_a_voxel_beyond_the_centres() -> None:

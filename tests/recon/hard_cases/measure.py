@@ -105,31 +105,3 @@ def gradient_bound(far: float, thin: float) -> float:
     Of the largest gradient; random weights of the pixels cancel by at most another factor of three in these sets.
     """
     return 9 * bound(far, thin)
-
-
-def directional(g: Gaussians, where: Geometry | Grid, steps: dict[str, float], seed: int = 0) -> tuple[float, float]:
-    """The reference's slope along a random direction with these lengths by parameter: by autograd and by differences.
-
-    In float64. The differences are central, over 1e-3 of the direction each way.
-    """
-    rng = np.random.default_rng(seed)
-    double = in_double(g)
-    named = {
-        "means": double.means, "log_scales": double.log_scales, "quaternions": double.quaternions,
-        "raw_densities": double.raw_densities,
-    }  # fmt: skip
-    moves = {k: torch.from_numpy(rng.normal(size=tuple(v.shape))) * steps[k] for k, v in named.items()}
-    sample: Tensor | None = None
-
-    def loss(t: float) -> Tensor:
-        nonlocal sample
-        moved = Gaussians(*(v + t * moves[k] for k, v in named.items()), density_unit=g.density_unit)
-        image = voxelize(moved, where) if isinstance(where, Grid) else project(moved, where)
-        if sample is None:
-            sample = torch.from_numpy(rng.normal(size=tuple(image.shape)))
-        return (image * sample).sum()
-
-    loss(0.0).backward()
-    slope = sum(float((value * moves[k]).sum()) for k, value in gradients(double).items())
-    with torch.no_grad():
-        return slope, float(loss(1e-3) - loss(-1e-3)) / 2e-3

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from tests.recon.hard_cases.measure import RECURRENCE, STEP, bound, compare, directional, gradient_bound
+from tests.recon.hard_cases.measure import RECURRENCE, STEP, bound, compare, gradient_bound
 from tests.recon.hard_cases.on import EXACT, PITCH, On, Place, cpu
 from tests.recon.helpers import gradients, in_double
 from tests.recon.kernels.reference import project
@@ -55,42 +55,6 @@ def test_stretches_of_needles_and_discs_are_as_exact_as_positions(on: On, shape:
     there = (on.grid, None) if where == "voxels" else (on.beams[where], EXACT)
     found = on.compare(on.some(shape, 8), *there).gradients
     assert found["log_scales"] < 3 * max(found["means"], found["raw_densities"])
-
-
-def test_gradients_of_a_needle_are_accurate_only_in_its_own_directions() -> None:
-    # The gradient on the logarithm of a width, in float32, of slanted needles 0.05 px wide and longer than the image:
-    # from ∂Σ₂ = 1/2 W K M₂ K with moments of δ, and from those of (τ, δv). The former is a small difference of numbers
-    # aspect² as large, with the aspect that the image shows of it.
-    long, thin = 500.0, 0.05
-    rows, cols = np.mgrid[-30:31, -30:31].astype(np.float64)
-    noise = np.random.default_rng(0).normal(size=rows.shape)
-
-    def found(turn: float) -> tuple[float, float, float]:
-        c, s = math.cos(turn), math.sin(turn)
-        axes = np.array([[c, -s], [s, c]]) * (long, thin)  # a, b in the needle's own directions
-        uu, uv, vv = axes[0] @ axes[0], axes[0] @ axes[1], axes[1] @ axes[1]
-        white = (cols * -s + rows * c) / thin
-        g = (noise * np.exp(-0.5 * (white**2 + ((cols * c + rows * s) / long) ** 2))).astype(np.float32)
-        shape, k = axes.astype(np.float32), (np.array([[vv, -uv], [-uv, uu]]) / (long * thin) ** 2).astype(np.float32)
-        delta = np.stack((cols, rows), -1).astype(np.float32)
-        moments = np.einsum("rc,rci,rcj->ij", g, delta, delta)
-        naive = (k @ moments @ k @ shape)[:, 1] @ shape[:, 1]
-        own = np.stack((cols - uv / vv * rows, rows), -1).astype(np.float32)
-        moments = np.einsum("rc,rci,rcj->ij", g, own, own)
-        across = np.array([-s / thin, c * thin / vv]).astype(np.float32)  # A and B on the short axis
-        return float(naive), float(across @ moments @ across), float((g.astype(np.float64) * white**2).sum())
-
-    naive, ours, exact = np.array([found(turn) for turn in np.linspace(0.1, 1.4, 20)]).T
-    assert np.abs(naive - exact).max() > 5e-3 * np.abs(exact).max()
-    assert np.abs(ours - exact).max() < 2e-5 * np.abs(exact).max()
-
-
-@pytest.mark.parametrize(("shape", "where"), [((0.5, 0.5, 50.0), "parallel"), ((2.0, 2.0, 2e-2), "cone")])
-def test_the_reference_gradients_of_needles_and_discs_are_its_differences(shape: Place, where: str) -> None:
-    thin = min(shape) / max(shape)
-    steps = {"means": 0.1 * min(shape), "log_scales": 0.1, "quaternions": 0.1 * thin, "raw_densities": 0.1}
-    slope, difference = directional(cpu().some(shape, 5), cpu().beams[where], steps)
-    assert slope == pytest.approx(difference, rel=1e-5)
 
 
 @pytest.mark.parametrize(("beam", "thin"), [("parallel", 2e-4), ("leaning", 2e-2), ("cone", 2e-6)])

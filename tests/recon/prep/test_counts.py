@@ -11,13 +11,11 @@ from scipy import special
 
 import recon
 from recon.prep.counts import Counts, expanded, line_integrals, of_view, photon_transfer
-from recon.voxels.projector import Projector
 
 F64 = NDArray[np.float64]
 SHAPE = (8, 48)
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
 VIEWS = recon.Geometry.parallel(ANGLES, SHAPE, pixel_pitch=1.0)
-GRID = recon.Grid.matching(VIEWS)
 INSIDE, TRUE = 12.0, 0.06  # radius of the part that is looked at, attenuation of the cylinder of radius 18
 
 
@@ -109,15 +107,6 @@ def test_offset_and_gain_do_not_change_what_is_counted(clean: F64, gain: float) 
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
 
 
-def test_many_photons_give_the_weighed_logarithm(clean: F64) -> None:
-    n = _counted(clean, 1e6)
-    data, weights = line_integrals(Counts(n, np.full(SHAPE, 1e6)))
-    noise = 1 / np.sqrt(n)
-    assert np.abs((data + np.log(n / 1e6)) / noise).max() < 0.05
-    middle = abs(np.arange(SHAPE[1]) - (SHAPE[1] - 1) / 2) < 8  # the weights are smooth across edges
-    np.testing.assert_allclose(weights[..., middle], 1e6 * np.exp(-clean[..., middle]), rtol=0.02)
-
-
 def test_uneven_and_changing_flats_are_part_of_the_model(clean: F64) -> None:
     """A beam that is uneven and fades from view to view leaves the mean attenuation as it is."""
     flat = 40 * (1 + 0.3 * np.sin(np.arange(SHAPE[1]) / 3)) * np.linspace(1, 0.5, VIEWS.n_views)[:, None, None]
@@ -170,20 +159,6 @@ def test_given_weights_multiply(clean: F64) -> None:
     a = recon.reconstruct(counts, VIEWS, method, use=recon.DataUse(weights=mine)).volume.data
     b = recon.reconstruct(data, VIEWS, method, use=recon.DataUse(weights=mine * weights)).volume.data
     np.testing.assert_array_equal(a, b)
-
-
-def test_one_expansion_is_near_the_maximum_of_the_likelihood(clean: F64) -> None:
-    """Expanding anew around the volume that was found explains the counts hardly better: one is enough."""
-    n, beam = _counted(clean, 10).astype(float), np.full(clean.shape, 10.0)
-    method, project = recon.OsSirtTv(iterations=20, tv_weight=0.03), Projector(VIEWS, GRID).forward
-    model = project(recon.reconstruct(Counts(n, beam), VIEWS, method).volume.data).astype(float)
-    data, weights = expanded(n, beam, np.zeros_like(n), model)
-    again = recon.reconstruct(data, VIEWS, method, use=recon.DataUse(weights=weights.astype(np.float32)))
-    first, second = (
-        _likelihood(p, n, beam, np.zeros_like(n)).mean() for p in (model, project(again.volume.data).astype(float))
-    )
-    blank = _likelihood(np.zeros_like(n), n, beam, np.zeros_like(n)).mean()
-    assert abs(first - second) < 0.005 * (blank - second)
 
 
 def test_photon_transfer_finds_gain_and_dark_noise() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from numba import get_num_threads, set_num_threads
-from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel
@@ -17,7 +16,6 @@ from recon.splatting.backend import Cpu, backend_for
 from recon.splatting.gaussians import Gaussians
 from tests.recon.conftest import Make
 
-F32 = NDArray[np.float32]
 UNIT = 0.7
 CUT = (1e-3, 3.5)  # faint, σ
 
@@ -78,25 +76,6 @@ def test_memory_made_for_other_threads_gives_the_same_view(random_gaussians: Mak
         set_num_threads(threads)
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], atol=1e-6 * float(images[0].max()))
-
-
-def test_views_gone_back_in_turn_add_up_and_keep_their_images(random_gaussians: Make, rng: np.random.Generator) -> None:
-    g, views, slopes = random_gaussians(30, 8.0), geometry((15, 22)), rng.normal(size=(2, 15, 22)).astype(np.float32)
-    apart = []
-    for view, slope in enumerate(slopes):
-        run = begin(Cpu(), g)
-        seen = run.view(views, view, *CUT, RayModel())
-        seen.backward(slope)
-        apart.append((seen.image, run.gradients()))
-    run, images = begin(Cpu(), g), []
-    for view, slope in enumerate(slopes):
-        seen = run.view(views, view, *CUT, RayModel())
-        images.append(seen.image)
-        seen.backward(slope)
-    for image, (expected, _) in zip(images, apart, strict=True):
-        np.testing.assert_array_equal(image, expected)  # the next view shares memory, but not the image
-    for both, one, other in zip(run.gradients(), apart[0][1], apart[1][1], strict=True):
-        np.testing.assert_allclose(both, one + other, atol=2e-6 * float(np.abs(both).max()))
 
 
 def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: np.random.Generator) -> None:

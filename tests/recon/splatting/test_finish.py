@@ -25,7 +25,6 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out import preferred_strength
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
@@ -239,26 +238,6 @@ def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(rng: np.random.
     fit.reset_mock()
     none = judged(replace(_problem(data[:12]), geometry=VIEWS.select(range(12))), R2().fit, RunControl(), fit)
     assert none.by_voxels is None and none.fit is None and fit.call_count == 0
-
-
-def test_patches_are_judged_by_the_volume_that_chose_their_strength(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And not by one of another strength, from another start, as for a while: no method was then patches'."""
-    waves = np.sin(np.meshgrid(*GRID.coordinates(), indexing="ij")).sum(axis=0)
-    data = Projector(VIEWS, GRID).forward((_box() * (1 + 0.3 * waves)).astype(np.float32))
-    data += rng.normal(0, 0.02, data.shape).astype(np.float32)
-    made: list[float] = []
-
-    def search(*of: Any) -> Any:
-        best = preferred_strength(*of)
-        assert best is not None
-        made.append(float(best.residuals.mean()))
-        return best
-
-    monkeypatch.setattr("recon.voxels.methods.preferred_strength", search)
-    tried = judged(_problem(data), R2().fit, RunControl(), Mock(side_effect=ValueError("no fit")))
-    assert tried.patches is not None and tried.patches.mean() == pytest.approx(made[0], rel=1e-12)
 
 
 def test_a_stop_ends_the_trials() -> None:

@@ -10,13 +10,10 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
 from recon.base.volume import Grid
-from recon.splatting import optimise as fit
 from recon.splatting.backend import Cpu
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import extend, join_pixels, make_problem
-from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project
-from tests.recon.helpers import run_steps
 
 VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
@@ -89,21 +86,6 @@ def test_what_is_large_but_can_be_squared_keeps_its_weight(rng: np.random.Genera
     assert np.isfinite(float(loss)) and np.isfinite(slope).all()
 
 
-def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Generator) -> None:
-    u = np.arange(18) - 8.5
-    data = np.broadcast_to(np.exp(-(u**2) / 8).astype(np.float32), (3, 12, 18)).copy()
-    start = Gaussians.from_physical(rng.normal(size=(20, 3)), np.ones(20), np.full(20, 0.1), density_unit=0.2)
-    ends = []
-    for value in (np.nan, 1e25):
-        data[2, 5, 6] = value
-        settings = FitSettings(policy=None, tv_size=6)
-        problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
-        ends.append(run_steps(fit.init(start, 0), problem, settings, 8).parameters)
-    for name in NAMES:
-        assert np.isfinite(ends[1][name]).all()
-        np.testing.assert_array_equal(ends[0][name], ends[1][name])
-
-
 @given(seed=st.integers(0, 1000), share=st.floats(0, 0.9), factor=st.sampled_from([2, 3]))
 def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, factor: int) -> None:
     rng = np.random.default_rng(seed)
@@ -158,13 +140,6 @@ def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(r
     shifted = Geometry.parallel(VIEWS.angles, (12, 18), pixel_pitch=0.5, shifts=[[0, 0], [1, 0], [0, 0]])
     with pytest.raises(ValueError, match="view to view"):
         extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
-
-
-def test_binned_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
-    data = rng.random((3, 12, 18)).astype(np.float32)
-    found, weights, _ = join_pixels(data, None, VIEWS, 3)
-    np.testing.assert_allclose(found, data.reshape(3, 4, 3, 6, 3).mean(axis=(2, 4)), rtol=1e-5)
-    assert weights is None
 
 
 def test_a_view_with_only_wild_values_is_refused_with_the_range(rng: np.random.Generator) -> None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
 from recon.base.method import DataUse, ReconProblem, RunControl
-from recon.splatting import optimise
 from recon.splatting.anytime import PredictionErrors, direct_volume, volume_error
 from recon.splatting.in_time import LastRound
 from recon.splatting.r2 import R2
@@ -89,23 +86,6 @@ def test_views_that_fbp_does_not_take_are_not_compared() -> None:
     for geometry, held_out in ((cone, [1]), (VIEWS.select(range(3)), [])):
         errors = PredictionErrors.of([view] * 3, geometry, held_out, lambda number: view)
         assert np.isnan(errors.fit) and np.isnan(errors.direct)
-
-
-def test_views_held_out_are_learnt_by_the_last_round_alone(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit = _grown(data, 3)
-    drawn, step = list[int | None](), optimise.step
-
-    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
-        before = list(state.drawn)
-        step(state, problem, settings, fraction, view)
-        drawn.extend(before[len(state.drawn) :] if len(before) > len(state.drawn) else state.drawn)
-        drawn.append(view)
-
-    monkeypatch.setattr(optimise, "step", spy)
-    fit.advance(60)
-    assert {8, 24, 40}.isdisjoint(drawn) and {7, 9, 47} <= set(drawn)
-    fit.finish()
-    assert {8, 24, 40} <= set(drawn)
 
 
 @pytest.mark.slow

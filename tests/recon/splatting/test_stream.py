@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +11,9 @@ import recon
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
 from recon.base.kernel import Kernel
-from recon.splatting import optimise as fit
-from recon.splatting import stream
 from recon.splatting.anytime import WHILE_VIEWS_COME
-from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import DensityPolicy, FitSettings
-from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -116,113 +111,6 @@ def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:
     assert not model.snapshot().data.any()
     model.add_views(data[20:22], ANGLES[20:22])
     assert model.advance(0.1).n_gaussians > 0 and model.started
-
-
-def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_end(
-    data: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken: list[tuple[int | None, float]] = []
-    step = fit.step
-
-    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
-        taken.append((view, fraction))
-        return step(state, problem, settings, fraction, view)
-
-    monkeypatch.setattr(fit, "step", spy)
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=SteppedClock(tick=0.01))
-    model.add_views(data, ANGLES)
-    model.advance(2.0)
-    newest = [view for view, _ in taken if view is not None]
-    assert len(taken) >= 200 and 0.22 < len(newest) / len(taken) < 0.45
-    assert set(newest) == set(range(32, 40))  # the last fifth of forty
-    rates = [fraction for _, fraction in taken]
-    assert rates == sorted(rates) and rates[0] == 0 and rates[-1] < 0.6
-    taken.clear()
-    model.finish(2.0)
-    fractions = [fraction for _, fraction in taken]
-    assert fractions == sorted(fractions) and abs(fractions[0] - rates[-1]) < 0.02 and fractions[-1] > 0.95
-    assert all(view is None for view, _ in taken)
-
-
-def test_a_view_that_has_come_is_learnt_by_the_next_step(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[int | None] = []
-    step = fit.step
-
-    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
-        taken.append(view)
-        return step(state, problem, settings, fraction, view)
-
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=SteppedClock(tick=0.01))
-    model.add_views(data[:20], ANGLES[:20])
-    model.advance(0.1)
-    monkeypatch.setattr(fit, "step", spy)
-    model.add_views(data[20:23], ANGLES[20:23])
-    model.add_views(data[23:24], ANGLES[23:24])
-    model.advance(0.2)
-    assert taken[:4] == [20, 21, 22, 23]
-    taken.clear()
-    model.replace_views(data[:12], np.arange(12))  # some of the others no step had learnt
-    model.add_views(data[12:14], ANGLES[12:14])  # the first of them is the 24th that came, and judges
-    model.advance(0.1)
-    assert taken[0] == 13
-
-
-def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    def placed() -> tuple[Gaussians, int]:
-        model = StreamingFit(VIEWS, GRID, 0, gaussians=500, now=SteppedClock(tick=0.01))
-        model.add_views(data, ANGLES)
-        model.advance(0.0)
-        assert model.gaussians is not None
-        return model.gaussians, model._placed
-
-    monkeypatch.setattr(fit, "step", lambda *_: None)
-    whole, n = placed()
-    monkeypatch.setattr(stream, "PLACED_FROM", GRID.shape[0] * GRID.shape[1] * GRID.shape[2] // 8)
-    rough, m = placed()
-    assert n == m == 500
-    assert float(rough.scales.min()) > float(whole.scales.min())  # half a voxel, at least
-    left = [np.linalg.norm(project(g, VIEWS).numpy() - data) / np.linalg.norm(data) for g in (whole, rough)]
-    assert left[1] < 1.2 * left[0] < 0.4, left
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("one_thread")
-def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Particles after 22 views in golden order: 0.32 to 0.51 dB for seeds 0 to 4."""
-    from tests.bench.test_anytime_curve import ORDERS, particles  # here: it takes the clock of this module
-
-    data, geometry, truth = particles(ORDERS["golden"])
-    first, placements = StreamingFit._place_first, list[bool]()
-
-    def quality(knows: bool) -> float:
-        def place(model: StreamingFit, known: fit.FitState | None = None, *, all_views: bool) -> None:
-            placements.append(known is not None)
-            first(model, known if knows else None, all_views=all_views)
-
-        monkeypatch.setattr(StreamingFit, "_place_first", place)
-        model = StreamingFit(geometry, Grid.matching(geometry), now=SteppedClock(tick=1.0))
-        for view in range(22):
-            model.add_views(data[view : view + 1], geometry.angles[view : view + 1])
-            model.advance(25.0)
-        return psnr(truth, model.snapshot().data)
-
-    knows, forgets = quality(True), quality(False)
-    assert placements == [False, True] * 2
-    assert knows > forgets + 0.2
-
-
-def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phantom: Phantom) -> None:
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
-    model.add_views(data, ANGLES)
-    model.advance(2.0)
-    truth, settings = phantom.attenuation(GRID), model.settings
-    state = model._state
-    assert state is not None and state.mean is not None
-    assert {name: values.shape for name, values in state.mean.items()} == {
-        name: values.shape for name, values in state.parameters.items()
-    }
-    last = fit.volume_of(state, GRID, VIEWS, settings).data
-    assert psnr(truth, model.snapshot().data) > psnr(truth, last) + 0.3
 
 
 def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -103,19 +100,6 @@ def test_gridding_of_a_full_turn_about_an_axis_at_the_edge(
     grid = Grid((2, 180, 180))
     rays, gridded = both_ways(monkeypatch, views, geometry, "hann", grid)
     assert np.abs(gridded - rays).max() < 1e-3 * rays.max()
-
-
-def test_gridding_of_a_real_scan(monkeypatch: pytest.MonkeyPatch, shared_data: Path) -> None:
-    with h5py.File(shared_data / "aps2bm_tooth_181x2x640.h5") as file:
-        counts, white, dark = (
-            np.asarray(file[f"exchange/{name}"], float) for name in ("data", "data_white", "data_dark")
-        )
-        angles = np.deg2rad(file["exchange/theta"])
-    views = -np.log(np.maximum((counts - dark.mean(0)) / (white.mean(0) - dark.mean(0)), 1e-3)).astype(np.float32)
-    geometry = Geometry.parallel(angles, views.shape[1:], axis_col=295.6)
-    rays, gridded = both_ways(monkeypatch, views, geometry, "hann")
-    difference = in_all_views(np.abs(gridded - rays), geometry, Grid.matching(geometry))
-    assert difference.max() < 1e-3 * rays.max()
 
 
 @pytest.mark.parametrize("gridded", [False, True])

@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels import held_out, methods
+from recon.voxels import held_out
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, slab_of
 from recon.voxels.held_out import (
     LEAST_VIEWS,
@@ -35,7 +35,7 @@ from recon.voxels.held_out import (
     unseen_residuals,
 )
 from recon.voxels.iterative import solve
-from recon.voxels.priors import ordered_fista, pnp_dct
+from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
 from recon.voxels.voxel_problem import VoxelProblem
@@ -332,25 +332,6 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     ):
         few, many = make(narrow)[matter], make(wide)[off:-off, off:-off][matter]
         assert np.sqrt(np.mean((few - many) ** 2)) < 0.004 * np.sqrt(np.mean(many**2))
-
-
-def test_a_trial_takes_as_many_steps_as_the_volume(
-    foam: tuple[F32, Geometry, Grid, F32], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With 48 steps for 80 of 50 views it preferred 2.4 times the best weight: -1.1 dB on bone."""
-    taken = set[tuple[int, int]]()
-
-    def told(problem, x, weight, subsets, *, sweeps, tv_steps):  # type: ignore[no-untyped-def]
-        taken.add((sweeps, len(subsets.views)))
-        return ordered_fista(problem, x, weight, subsets, sweeps=sweeps, tv_steps=tv_steps)
-
-    for module in (held_out, methods):
-        monkeypatch.setattr(module, "ordered_fista", told)
-    data, geometry, _, _ = foam
-    for views in (slice(0, 38), slice(0, 38, 2)):  # 33 of 38 and 16 of 19 would be one subset less
-        taken.clear()
-        recon.reconstruct(data[views], geometry.select(views), FistaTv())
-        assert len(taken) == 1
 
 
 def test_all_views_get_the_weight_of_seven_eighths_by_the_root_of_their_number(

@@ -7,9 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsqr, svds
 
@@ -24,7 +21,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.iterative import IterativeMethod, Watch, solve
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import VoxelProblem, density_unit, largest_eigenvalue
+from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
 from tests.recon.kernels.voxels_reference import system_matrix
 from tests.recon.voxels.tv_reference import differences, total_variation, transposed_differences
 
@@ -155,15 +152,6 @@ def test_the_step_bound_is_the_largest_eigenvalue_from_above() -> None:
         exact = float(svds(matrix, k=1, return_singular_vectors=False, rng=0)[0] ** 2)
         bound = largest_eigenvalue(projector, None)
         assert exact * (1 - 1e-5) <= bound < 1.1 * exact
-
-
-def test_sixteen_rows_tell_the_step_of_all() -> None:
-    """Rows of a parallel beam are alike, wherever their slices lie."""
-    angles, bounds = np.linspace(0, np.pi, 7, endpoint=False), []
-    for rows, axis_row in ((16, None), (17, 3.0), (40, None)):
-        geometry = Geometry.parallel(angles, (rows, 24), pixel_pitch=0.5, axis_row=axis_row)
-        bounds.append(largest_eigenvalue(Projector(geometry, Grid.matching(geometry)), None))
-    assert bounds[1:] == pytest.approx([bounds[0]] * 2, rel=1e-6)
 
 
 MIRRORS: tuple[tuple[int, ...], ...] = ((), (1,), (2,), (1, 2))  # axes of [z, y, x] that are reversed
@@ -347,45 +335,11 @@ def test_units_do_not_matter(method: IterativeMethod, weight: float, pitch: floa
     np.testing.assert_allclose(found.astype(np.float64) * pitch, plain, atol=3e-4)
 
 
-@given(method=st.sampled_from(METHODS), weight=st.floats(-20, 20), pitch=st.floats(-12, 8), size=st.floats(-20, 20))
-@settings(max_examples=40, deadline=None)
-def test_powers_of_ten_of_every_unit_leave_the_volume_as_it_is(
-    method: IterativeMethod, weight: float, pitch: float, size: float
-) -> None:
-    projector, _, views = cone_case()
-    plain = solve(replace(method, iterations=3), projector, views).data
-    g, box, edge, density = projector.geometry, projector.grid, 10.0**pitch, 10.0 ** (size - pitch)
-    there = Projector(
-        replace(g, pixel_pitch=g.pixel_pitch * edge, sod=g.sod * edge, sdd=g.sdd * edge),
-        Grid(box.shape, box.voxel_size * edge, slice_pitch=box.spacing[0] * edge),
-        projector.matched,
-    )
-    weights = np.full(views.shape, 10.0**weight, np.float32)
-    found = solve(replace(method, iterations=3), there, (views * 10.0**size).astype(np.float32), weight=weights).data
-    np.testing.assert_allclose(found / density, plain, atol=1e-3)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_box_that_no_ray_meets_stays_empty(method: IterativeMethod) -> None:
     projector, _, views = parallel_case()
     aside = Projector(projector.geometry, Grid((4, 5, 6), 0.5, (90.0, 0.0, 0.0)))
     assert not solve(replace(method, iterations=2), aside, views).data.any()
-
-
-@pytest.mark.parametrize(("edge", "threads"), [(20, 1), (400, 2)])
-def test_a_small_slice_takes_few_threads_and_gives_them_back(edge: int, threads: int) -> None:
-    class Counting:
-        iterations = 1
-
-        def iterate(self, problem: VoxelProblem, x: NDArray[np.float32]) -> NDArray[np.float32]:
-            counted.append(get_num_threads())
-            return x
-
-    counted: list[int] = []
-    before = get_num_threads()
-    projector = Projector(Geometry.parallel([0.0, 1.0], (1, 5)), Grid((1, edge, edge)))
-    solve(Counting(), projector, np.ones((2, 1, 5), np.float32))
-    assert counted == [min(threads, before)] and get_num_threads() == before
 
 
 @pytest.mark.parametrize("method", [FistaTv(iterations=6), OsSirtTv(iterations=8)])

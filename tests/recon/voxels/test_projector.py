@@ -17,13 +17,7 @@ from scipy import sparse
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu import cone as cone_kernels
-from recon.kernels.cpu import joseph
-from recon.voxels.direct import fdk
 from recon.voxels.projector import Projector, project
-from simulators.frame.shot import Detector
-from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Ellipsoid
 from tests.recon.helpers import assert_transpose
 from tests.recon.kernels.voxels_reference import system_matrix
 
@@ -151,33 +145,6 @@ def test_the_transpose_is_exact_at_a_working_size(cone: bool, lean: float, rng: 
     np.testing.assert_array_equal(projector.subset([30, 2]).forward(volume), forward[[30, 2]])
 
 
-@pytest.mark.parametrize(("cone", "lean"), [(False, 0.0), (True, 0.0), (True, 0.1)])
-def test_many_calls_of_a_kernel_give_the_bits_of_one(
-    cone: bool, lean: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A kernel returns every few tenths of a second, so that signals are heard."""
-    angles, shape = np.linspace(0, 2 * np.pi, 37, endpoint=False), (20, 70)
-    views = Geometry.cone(angles, shape, 0.05, 40.0, 60.0, roll=lean) if cone else Geometry.parallel(angles, shape)
-    projector = Projector(views, Grid.matching(views))
-    volume = rng.random(projector.grid.shape, dtype=np.float32)
-    found = []
-    for most in (2**62, 1):
-        monkeypatch.setattr(joseph, "CALL", most)
-        monkeypatch.setattr(cone_kernels, "CALL", most)
-        lines = projector.forward(volume)
-        found.append((lines, projector.adjoint(lines), *([fdk(lines, views)] if cone and not lean else [])))
-    for once, often in zip(*found, strict=True):
-        np.testing.assert_array_equal(once, often)
-
-
-def test_calls_hold_all_jobs_once_and_few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joseph, "get_num_threads", lambda: 4)
-    parts = joseph.calls(103, joseph.CALL // 10)
-    assert [job for part in parts for job in part] == list(range(103))
-    assert {len(part) for part in parts[:-1]} == {8}  # whole rounds of all threads
-    assert [len(part) for part in joseph.calls(6, 10 * joseph.CALL)] == [4, 2]  # all threads work
-
-
 def test_tiles_make_no_difference(rng: np.random.Generator) -> None:
     """Rays through many tiles, along their edges too, more slices than a job takes: the explicit matrix, whatever the
     number of threads, to the bit."""
@@ -214,20 +181,6 @@ def test_steps_of_any_length_make_no_difference(slices_a_row: float, rng: np.ran
     np.testing.assert_allclose(projector.forward(volume), expected, atol=3e-6 * expected.max())
     expected = (matrix.T @ views.ravel()).reshape(volume.shape)
     np.testing.assert_allclose(projector.adjoint(views), expected, atol=3e-6 * expected.max())
-
-
-@given(
-    angle=st.floats(-7, 7),
-    axis_col=st.floats(20, 27),
-    pitch=st.floats(0.01, 5),
-    x0=st.floats(-3, 3),
-    y0=st.floats(-3, 3),
-)
-@settings(max_examples=40)
-def test_a_gaussian_projects_to_a_gaussian(angle: float, axis_col: float, pitch: float, x0: float, y0: float) -> None:
-    volume, geometry, truth = _gaussian_case([angle], axis_col, pitch, (x0, y0), 4.0)
-    # Linear interpolation of a Gaussian errs by at most h²/8 of its second derivative: 1/128 of the peak.
-    np.testing.assert_allclose(project(volume, geometry), truth, atol=truth.max() / 120)
 
 
 def ellipsoid_shadow(geometry: Geometry, axes: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -290,18 +243,6 @@ def test_an_ellipsoid_projects_to_its_chords(cone: bool, lean: float) -> None:
     assert np.abs(error[inside]).max() < 0.02 * truth.max()
     assert np.sqrt(np.mean(error[inside] ** 2)) < 0.004 * truth.max()
     assert abs(error.sum()) < 0.002 * truth.sum()
-
-
-def test_parallel_chords_agree_with_the_simulator() -> None:
-    """Written by other hands from another formula (chords of packed solids)."""
-    body = Ellipsoid((0.5, 0.35, 0.6), 1.0, (0.12, -0.2, 0.1))
-    geometry = Geometry.parallel([0.3, 1.9], (40, 50), pixel_pitch=0.04)
-    expected = np.stack(
-        [Phantom.of([body]).line_integrals(a, Detector.centred((40, 50), 0.04)) for a in geometry.angles]
-    )
-    np.testing.assert_allclose(
-        ellipsoid_shadow(geometry, np.array(body.semi_axes), np.array(body.centre)), expected, atol=1e-9
-    )
 
 
 def test_parallel_projections_agree_with_astra(rng: np.random.Generator) -> None:

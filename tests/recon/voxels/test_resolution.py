@@ -70,15 +70,6 @@ def test_a_wide_blur_of_the_detector_is_spread_in_passes() -> None:
         assert min(_response(geometry, grid, f, True), 1) == pytest.approx(expected, abs=0.02)
 
 
-def test_sharpening_brings_views_nearer_to_those_that_are_measured() -> None:
-    for degrees in (3.0, 20.0, 45.0, 70.0):
-        geometry = Geometry.parallel([math.radians(degrees)], (1, SIDE))
-        grid = Grid((1, SIDE, SIDE))
-        for f in (0.05, 0.125, 0.25, 0.375):
-            plain, matched = (_response(geometry, grid, f, each) for each in (False, True))
-            assert plain < matched < 1
-
-
 def test_the_excess_of_a_voxel_follows_from_the_geometry() -> None:
     angles = np.deg2rad([10.0, 30.0, 80.0])
     nearer = np.maximum(np.cos(angles) ** 2, np.sin(angles) ** 2)

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from recon.base.jit import njit
 from simulators.frame.shot import CannotExposeError
-from simulators.pixels.noise import LEAST, add_normal, expansion, poisson, searched, summed
+from simulators.pixels.noise import LEAST, add_normal, poisson, summed
 from tests.simulators import chance
 
 SHAPE = (512, 512)
@@ -20,33 +19,6 @@ SHAPE = (512, 512)
 
 def _poisson(mean: float, seed: int = 0) -> NDArray[np.float64]:
     return poisson(np.full(SHAPE, mean), np.random.default_rng(seed))
-
-
-@njit()
-def _expansions(w, mean):  # type: ignore[no-untyped-def]
-    out = np.empty((2, w.size))
-    for i in range(w.size):
-        out[0, i], out[1, i] = expansion(w[i], mean, math.sqrt(mean))
-    return out
-
-
-def test_the_expansion_lies_within_its_bound() -> None:
-    """Q(x - error, m) <= Φ(w) <= Q(x + error, m) by scipy, in the tail that keeps the digits."""
-    w = np.linspace(-8, 8, 641)
-    below, above, rounding = special.ndtr(w), special.ndtr(-w), 1e-9
-    left, right = w <= 0, w > 0
-    for mean in np.concatenate([np.geomspace(LEAST, 29.9, 60), np.geomspace(30, 1e5, 60)]):
-        x, error = _expansions(w, mean)
-        bound = np.isfinite(error)
-        low, high = np.maximum(x - error, 1e-300), x + error
-        assert (special.gammaincc(low, mean) <= below * (1 + rounding))[left & bound].all()
-        assert (special.gammaincc(high, mean) >= below * (1 - rounding))[left & bound].all()
-        assert (special.gammainc(low, mean) >= above * (1 - rounding))[right & bound].all()
-        assert (special.gammainc(high, mean) <= above * (1 + rounding))[right & bound].all()
-        # And it is of use: what it leaves to the sums is a few in a hundred, and a few in ten thousand of much light.
-        share = np.minimum(2 * error, 1) @ np.exp(-0.5 * w**2) / np.exp(-0.5 * w**2).sum()
-        assert share < (0.1 if mean < 30 else 2e-3)
-    assert not np.isfinite(_expansions(w, 0.99 * LEAST)[1]).any()
 
 
 @pytest.mark.parametrize("mean", [LEAST, 3.3, 17.0, 240.0, 5e3, 1e5])
@@ -63,18 +35,6 @@ def test_the_sums_find_the_quantile_at_its_very_edges(mean: float) -> None:
         tail = special.ndtr(-abs(w))
         inner, outer = (stats.poisson.cdf(k + n, mean) if w < 0 else stats.poisson.sf(k - 1 - n, mean) for n in (0, -1))
         assert outer <= tail <= inner or k == 0
-
-
-@pytest.mark.parametrize("mean", [1e-6, 0.01, 0.7, LEAST])
-def test_small_expectations_are_looked_up(mean: float) -> None:
-    for k in range(6):
-        edge = stats.poisson.cdf(k, mean)
-        if stats.poisson.pmf(k, mean) > 1e-12:
-            assert searched(edge - 1e-13, mean) == k
-        if stats.poisson.pmf(k + 1, mean) > 1e-12:
-            assert searched(edge + 1e-13, mean) == k + 1
-    assert searched(0.0, mean) == 0
-    assert searched(1 - 2**-53, mean) < 30
 
 
 @pytest.mark.parametrize("mean", [0.003, 0.5, 1.99, 2.01, 5.0, 12.0, 29.0, 31.0, 200.0, 5000.0, 80_000.0])

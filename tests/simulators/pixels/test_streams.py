@@ -14,7 +14,7 @@ from scipy import stats
 from drivers.orca_quest import SENSOR_SHAPE
 from recon.base.jit import njit
 from simulators.pixels.pattern import binned, normals, places
-from simulators.pixels.streams import STEP, TAIL, begin, layers, mix, normal, uniform
+from simulators.pixels.streams import STEP, TAIL, begin, mix, normal, uniform
 from tests.simulators import chance, shots
 
 N = 400_000
@@ -93,14 +93,6 @@ def test_the_ziggurat_s_tail_is_the_normal_s() -> None:
     even = stats.norm.sf(np.abs(tail)) / stats.norm.sf(TAIL)
     assert stats.kstest(even, "uniform").pvalue > chance.FALSE_ALARM
     assert abs((tail > 0).mean() - 0.5) < chance.SIGMAS / 2 / math.sqrt(tail.size)
-
-
-def test_the_ziggurat_s_layers_are_of_one_area_and_close_at_the_top() -> None:
-    x, height = layers()
-    base = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(2 * math.pi) * stats.norm.sf(TAIL)
-    np.testing.assert_allclose(x[1:256] * np.diff(height[1:]), base, rtol=1e-9)  # the uppermost one too
-    np.testing.assert_allclose(x[0] * height[1], base, rtol=1e-12)
-    assert (np.diff(x) < 0).all()
 
 
 def test_neighbours_rows_and_keys_have_no_part_in_each_other(drawn: NDArray[np.float64]) -> None:

@@ -60,15 +60,6 @@ def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_bef
     assert [round(math.degrees(pulse.angle), 3) for pulse in bench.pulses()] == [3.5, 4.5, 5.5]
 
 
-def test_pulses_a_servo_cycle_late_still_belong_to_their_counts() -> None:
-    """At 10 degrees/s a cycle of 50 µs is an eighth of a count."""
-    bench = Rig(servo_period=50e-6).bench()
-    train = bench.train(1.0, 0.5, 30)
-    bench.stage.arm(train)
-    bench.go(20.0)
-    assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [250 + 125 * k for k in range(30)]
-
-
 def test_pulses_that_would_merge_are_refused() -> None:
     """At 30 degrees/s a count of 0.004 degrees lasts 133 µs."""
     stage = Rig().open(firmware_pulse=60e-6)

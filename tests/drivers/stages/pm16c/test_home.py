@@ -143,12 +143,4 @@ def test_a_stop_that_crosses_the_way_back_to_the_switch_stops_it(rig: Rig) -> No
     assert stage.to_counts(stage.position()) > SWITCH
 
 
-def test_a_move_after_a_search_that_failed_is_a_move(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_home()
-    stage.abort()
-    stage.start_move(math.radians(3), SPEED)
-    assert math.degrees(stage.wait(LONG)) == pytest.approx(3.0)
-
-
 # what gets lost

@@ -95,18 +95,6 @@ def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
         flat(PulseSettings, **wrong)
 
 
-@pytest.mark.parametrize(
-    ("made", "nearest"), [({"pulse_width": 2e-3}, 120), ({"toggle": True}, 60), ({"pulse_width": 1e-3}, 60), ({}, 60)]
-)
-def test_trains_that_would_run_together_are_refused(made: dict[str, Any], nearest: int) -> None:
-    """At 30 deg/s = 30 000 counts/s: a width and as long again of rest, or two fires 1 ms apart."""
-    stage = Rig().bench(**made).stage
-    stage.arm(TriggerTrain(1000, nearest, 9))
-    with pytest.raises(DeviceRefused, match=f"{nearest} counts"):
-        stage.arm(TriggerTrain(1000, nearest - 2, 9))
-    stage.arm(TriggerTrain(1000, 1, 1))
-
-
 def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
     triggers = TriggerUse(chained=False, shortest=2e-3)
     usual = ZaberSettings(counts_per_turn=360_000, max_speed=1.0, acceleration=1.0, chained=False, shortest=2e-3)
@@ -214,12 +202,6 @@ def test_firmware_without_triggers_turns_but_does_not_arm() -> None:
     with pytest.raises(DeviceRefused, match=r"7\.05 has no triggers.*7\.06"):
         bench.stage.arm(bench.train(1.0, 1.0, 3))
     assert bench.go(3.0) == pytest.approx(3.0)
-
-
-def test_an_odd_interval_cannot_be_toggled() -> None:
-    bench = Rig().bench(toggle=True)
-    with pytest.raises(DeviceRefused, match=r"cannot be emitted.*even"):
-        bench.stage.arm(TriggerTrain(1000, 501, 3))
 
 
 def test_closing_takes_an_armed_train_away() -> None:

@@ -176,29 +176,6 @@ def test_views_held_out_tell_a_sample_that_moves_from_one_that_fades_where_angle
     assert (found.motion is not None) == (with_motion < without) == moves
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("motion", "stages"), [(None, 3), (False, 2), (True, 2)])
-def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: int) -> None:
-    """Weights, whether it moves (here not), or the motion itself; then factors of the mean, if it does not move."""
-    heard = list[int]()
-
-    def go_on(sweep: int, residual: float) -> bool:
-        heard.append(sweep)
-        return True
-
-    fit_series(views_of(48, noise=0.05), 3, motion=motion, sweeps=2, go_on=go_on)
-    end = heard.index(2)
-    assert heard[end - 1 : end + 1] == [1, 2]
-    assert heard[end + 1 :] in ([], [*range(1 - SOLUTION_STEPS, 1)])
-    trials = np.array(heard[: end - 1])
-    parts = np.split(trials, np.flatnonzero(np.diff(trials) < 1) + 1)
-    assert len(parts) == stages
-    for part in parts:
-        assert part[-1] == 0 and len(part) <= 1 - part[0]
-    for fixed in parts[1:2] if motion is not False else ():
-        np.testing.assert_array_equal(fixed, np.arange(1 - len(fixed), 1))
-
-
 def test_an_end_of_the_factors_gives_the_volumes_without() -> None:
     views, past = views_of(48, noise=0.05), list[int]()
 

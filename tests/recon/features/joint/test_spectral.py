@@ -79,26 +79,6 @@ def test_the_descent_is_minus_the_gradient(rng: np.random.Generator) -> None:
     assert -float(np.vdot(total, along)) == pytest.approx(slope, rel=1e-3)
 
 
-def test_components_and_densities_are_one_to_one(rng: np.random.Generator) -> None:
-    """C D = U z at each energy: what the views see does not depend on the coordinates."""
-    views = views_of(balls(), 4)
-    fit = EnergyFit(views, Grid.matching(views.geometry), rng)
-    fit.z = rng.standard_normal(fit.z.shape).astype(np.float32)
-    seen = np.einsum("em,mzyx->ezyx", SECTIONS, fit.densities())
-    components = np.einsum("ek,kyxz->ezyx", fit._u, fit.z)
-    np.testing.assert_allclose(seen, components, atol=1e-4)
-
-
-def test_each_subset_has_all_energies_and_directions_all_around() -> None:
-    views = views_of(balls(), 36)
-    fit = EnergyFit(views, Grid.matching(views.geometry), np.random.default_rng(0))
-    assert len(fit.subsets) == 9
-    for subset in fit.subsets:
-        assert [part.energy for part in subset] == [0, 1, 2, 3]
-        angles = np.sort(np.concatenate([part.projector.geometry.angles for part in subset]))
-        assert np.diff(angles).max() < 2.5 * np.pi / angles.size
-
-
 @pytest.mark.slow
 def test_few_views_an_energy_tell_the_share_of_a_material_better_than_one_volume_an_energy() -> None:
     """The error of the share is at most half of that by FISTA-TV at each energy, with its best of four weights."""
@@ -135,16 +115,6 @@ def test_rays_of_weight_zero_do_not_count() -> None:
     spoilt = EnergyViews(wrong, views.geometry, views.energy, SECTIONS, weight)
     densities = fit_materials(spoilt, tv_weight=1e-3, sweeps=60).densities
     assert rms(densities - balls()) < 0.1 * rms(balls())
-
-
-def test_an_energy_with_more_views_counts_more() -> None:
-    """The decomposition is that of the matrix with one line a view."""
-    some = views_of(balls(), 12)
-    kept = np.flatnonzero((some.energy != 3) | (np.arange(48) % 8 == 3))
-    views = some.select(kept, slice(None))
-    fit = EnergyFit(views, Grid.matching(views.geometry), np.random.default_rng(0))
-    gram = fit._u[views.energy].T @ fit._u[views.energy]
-    np.testing.assert_allclose(gram / gram[0, 0], np.eye(2), atol=1e-12)
 
 
 def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> None:

@@ -11,10 +11,6 @@ from torch import Tensor
 from recon.base.geometry import Geometry
 from recon.kernels.cpu.engine import Active, Gradients, camera
 from recon.kernels.cpu.footprints import (
-    HIDDEN,
-    HU,
-    HV,
-    INEXACT,
     KV,
     SHEAR,
     K,
@@ -25,7 +21,6 @@ from recon.kernels.cpu.footprints import (
     footprints,
     footprints_backward,
 )
-from tests.recon.kernels import reference
 
 F64 = NDArray[np.float64]
 
@@ -72,45 +67,6 @@ def on_pixels(table: F64) -> tuple[F64, F64, F64]:
     return np.exp(-0.5 * (t[:, K] * dt**2 + t[:, KV] * dv**2)), dt, dv
 
 
-def leaves(parameters: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    return tuple(p.double().requires_grad_() for p in parameters)
-
-
-def reference_image(doubles: tuple[Tensor, ...], geometry: Geometry, view: int, length: float) -> Tensor:
-    means, log_scales, quaternions, densities = doubles
-    density = UNIT * torch.nn.functional.softplus(densities)
-    return reference.project_view((means, log_scales.exp(), quaternions, density), geometry, view, length=length)
-
-
-@pytest.mark.parametrize("length", [0.0, 2.5], ids=["rectified", "plain"])
-@pytest.mark.parametrize("name", GEOMETRIES)
-def test_footprints_and_gradients_equal_the_reference(name: str, length: float, rng: np.random.Generator) -> None:
-    geometry, parameters = GEOMETRIES[name], raw(rng)
-    active = active_of(parameters)
-    weights = rng.normal(size=(2, *SHAPE))
-    into, centres = Gradients.zeros(30), np.empty((30, 2), np.float32)
-    doubles = leaves(parameters)
-    for view in range(2):
-        table = table_of(active, geometry, view, length=length)
-        shapes, dt, dv = on_pixels(table)
-        image = np.einsum("n,nrc->rc", table[:, W], shapes)
-        expected = reference_image(doubles, geometry, view, length)
-        np.testing.assert_allclose(image, expected.detach().numpy(), atol=3e-6 * float(expected.detach().max()))
-
-        (expected * torch.from_numpy(weights[view])).sum().backward()
-        g = weights[view][None] * shapes
-        powers = np.stack((g, g * dt, g * dv, g * dt * dt, g * dt * dv, g * dv * dv), -1)
-        moments = powers.sum((1, 2)).astype(np.float32)
-        footprints_backward(
-            table, moments, active.means, active.scales, active.rotations, active.densities, camera(geometry, view),
-            into.means, into.log_scales, into.rotations, into.densities, centres, length=length,
-        )  # fmt: skip
-    found = into.to_raw(parameters[2].numpy(), parameters[3].numpy(), UNIT)
-    for gradient, leaf in zip(found, doubles, strict=True):
-        assert leaf.grad is not None
-        np.testing.assert_allclose(gradient, leaf.grad.numpy(), atol=2e-5 * float(leaf.grad.abs().max()))
-
-
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_the_gradient_on_centres_is_that_of_moving_the_picture(name: str, rng: np.random.Generator) -> None:
     # Density control asks how hard the image pulls at a footprint, in pixels: shift the view and see.
@@ -136,35 +92,3 @@ def test_the_gradient_on_centres_is_that_of_moving_the_picture(name: str, rng: n
     h = 1e-4
     expected = [(loss((h, 0)) - loss((-h, 0))) / (2 * h), (loss((0, h)) - loss((0, -h))) / (2 * h)]
     np.testing.assert_allclose(centres[0], expected, rtol=1e-4, atol=1e-5)
-
-
-def test_a_cone_lists_those_whose_affine_picture_is_off(rng: np.random.Generator) -> None:
-    geometry, parameters = GEOMETRIES["turned cone"], raw(rng)
-    means, log_scales, quaternions, _ = leaves(parameters)
-    estimate = reference.affine_error(means, log_scales.exp(), quaternions, geometry, 0).numpy()
-    bound = float(np.median(estimate))
-    all_of_them = table_of(active_of(parameters), geometry, 0)
-    judged = table_of(active_of(parameters), geometry, 0, exact_above=bound)
-    off = estimate > bound
-    assert 10 < off.sum() < 20
-    assert (judged[off, HU] == INEXACT).all() and (judged[off, HV] == INEXACT).all()
-    np.testing.assert_array_equal(judged[~off], all_of_them[~off])
-    np.testing.assert_array_equal(judged[:, : W + 1], all_of_them[:, : W + 1])
-
-
-def test_what_is_behind_the_source_or_too_faint_is_hidden_and_has_no_gradient(rng: np.random.Generator) -> None:
-    cone = Geometry.cone([0.0], SHAPE, 1.0, 10.0, 20.0)
-    means, log_scales, quaternions, densities = raw(rng, 4, 0.0)
-    means[:, 1] = torch.tensor([-10.0, -9.95, -30.0, 0.0])  # the source is at y = -10
-    densities[3] = -60.0
-    active = active_of((means, log_scales, quaternions, densities))
-    table = table_of(active, cone, 0, faint=1e-6)
-    assert (table[:3, HU] == HIDDEN).all() and table[3, HU] < 0
-    assert np.isfinite(table).all()
-    into, centres = Gradients.zeros(4), np.ones((4, 2), np.float32)
-    footprints_backward(
-        table, np.full((4, 6), 1e6, np.float32), active.means, active.scales, active.rotations, active.densities,
-        camera(cone, 0), into.means, into.log_scales, into.rotations, into.densities, centres,
-    )  # fmt: skip
-    for gradient in (into.means, into.log_scales, into.rotations, into.densities, centres):
-        assert not gradient.any()

@@ -97,11 +97,3 @@ def test_exp_is_as_good_as_the_rounding_of_its_argument() -> None:
     relative = out / np.exp(x.astype(np.float64)) - 1
     # Rounding x log2(e) shifts the result by up to 1.2e-7 |x|; the polynomial's rounding adds 2e-7.
     assert (np.abs(relative) < 2e-7 + 1.2e-7 * np.abs(x)).all()
-
-
-def test_exp_never_overflows_and_vanishes_far_down() -> None:
-    x = np.array([[-3e38, -1e10, -1000, -200, -100, -88, 0, 88, 100, 200, 1000, 1e10, 3e38, -0.0, 1, -1]], np.float32)
-    out = np.empty_like(x)
-    _exp(x, out)
-    assert np.isfinite(out).all()
-    assert (out[0, :6] < 1e-37).all()

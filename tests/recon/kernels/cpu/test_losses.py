@@ -101,25 +101,6 @@ def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None
     np.testing.assert_allclose(term, likelihood(x) - likelihood(y), rtol=2e-3)
 
 
-def test_weights_of_one_change_nothing_and_of_none_leave_nothing(rng: np.random.Generator) -> None:
-    image, target = _images(rng)
-    loss, plain, weighted = CpuProjectionLoss(image.shape, 0.25), np.empty_like(image), np.empty_like(image)
-    value = loss(image, target, loss.target_maps(target), plain)
-    ones, none = np.ones_like(image), np.zeros_like(image)
-    assert loss(image, target, loss.target_maps(target, ones), weighted, ones) == pytest.approx(value, rel=1e-6)
-    np.testing.assert_allclose(weighted, plain, atol=1e-6 * float(np.abs(plain).max()))
-    assert loss(image, target, loss.target_maps(target, none), weighted, none) == 0
-    assert not weighted.any()
-
-
-def test_the_weighted_loss_has_the_gradient_of_its_finite_differences(rng: np.random.Generator) -> None:
-    image, target = (torch.from_numpy(a.astype(np.float64)) for a in _images(rng, (7, 9)))
-    weights = torch.from_numpy(np.where(rng.random((7, 9)) > 0.4, rng.random((7, 9)), 0.0))
-    assert torch.autograd.gradcheck(
-        lambda x: projection_loss(x, target, 0.25, weights), image.requires_grad_(), eps=1e-7, atol=1e-7
-    )
-
-
 @pytest.mark.parametrize("size", [10.0, 1e3, 1e4, 1e8])
 def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.random.Generator, size: float) -> None:
     # Variances are differences of squares. Of values of 1e3 none of their digits is left: naively they come out

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.kernels.cpu.patches import denoise, patch_scratch, scratch_values
+from recon.kernels.cpu.patches import denoise, patch_scratch
 from tests.recon.kernels.reference import sparse_patches
 
 F32 = NDArray[np.float32]
@@ -33,17 +33,6 @@ def test_the_kernel_gives_what_the_reference_gives(
     expected = sparse_patches(torch.from_numpy(x).double(), threshold).numpy()
     np.testing.assert_allclose(denoised(x, threshold), expected, atol=2e-6 * max(1.0, threshold))
     np.testing.assert_allclose(denoised(x, threshold, True), np.maximum(expected, 0), atol=2e-6 * max(1.0, threshold))
-
-
-@given(st.tuples(st.integers(1, 12), st.integers(1, 12), st.integers(1, 40)), st.integers(0, 99))
-def test_nothing_is_lost_without_a_threshold_and_everything_but_the_means_with_a_large_one(
-    shape: tuple[int, int, int], seed: int
-) -> None:
-    x = np.random.default_rng(seed).normal(5, 1, shape).astype(np.float32)
-    np.testing.assert_allclose(denoised(x, 0.0), x, rtol=1e-5)
-    level = denoised(np.full(shape, 3, np.float32), 1e6)
-    np.testing.assert_allclose(level, 3, rtol=1e-5)
-    assert float(np.ptp(denoised(x, 1e6))) <= float(np.ptp(x)) + 1e-5
 
 
 @given(st.integers(0, 99), st.sampled_from(["flip a", "flip b", "flip c", "turn", "turn to c"]))
@@ -74,16 +63,3 @@ def test_slices_three_beyond_do_not_matter(rng: np.random.Generator) -> None:
     x = rng.normal(0, 1, (12, 10, 24)).astype(np.float32)
     whole, part = denoised(x, 0.8), denoised(x[:, :, 4:20], 0.8)
     np.testing.assert_array_equal(part[:, :, 3:-3], whole[:, :, 7:17])
-
-
-def test_noise_of_flat_matter_falls_and_a_step_stays(rng: np.random.Generator) -> None:
-    clean = np.zeros((24, 24, 24), np.float32)
-    clean[:, 9:] = 10
-    found = denoised(clean + rng.normal(0, 1, clean.shape).astype(np.float32), 3.0)
-    assert np.std(found - clean) < 0.3
-    assert found[:, 9].mean() - found[:, 8].mean() > 9.8
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_the_scratch_is_as_large_as_stated(shape: tuple[int, int, int]) -> None:
-    assert sum(part.size for part in patch_scratch(shape)) == scratch_values(shape)

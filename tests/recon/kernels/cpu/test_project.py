@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.base.kernel import Kernel
 from recon.kernels.cpu.boxes import DEEPEST, box_of, is_upright, padded_shape
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
-from recon.kernels.cpu.project import moments, render, render_layers
+from recon.kernels.cpu.project import moments, render
 
 F64 = NDArray[np.float64]
 STATED_ERROR = 1e-5  # of the footprint's weight, see the kernels
@@ -152,55 +152,3 @@ def test_the_gate_takes_needles_and_what_starts_too_far_down_from_the_recurrence
     for y in (127.97, 254.99):
         dot = _one(0.05, 0.05, 0.0, (128.02, y))
         np.testing.assert_allclose(_image(dot, shape), _dense(dot, shape)[0][0], atol=1e-6)
-
-
-def test_past_the_gate_the_recurrence_would_lose_what_the_pixels_keep() -> None:
-    # From exp(-120) float32 starts at zero and stays there: the centre of the needle would be missing.
-    needle = _one(12.0, 0.5, 0.785, (40, 40))
-    assert not _smooth(needle, 0, (80, 80))
-    start = _dense(needle, (80, 80))[0][0][8]
-    assert (start.astype(np.float32) == 0).sum() > 40
-    assert _image(needle, (80, 80))[40, 40] == pytest.approx(1, abs=1e-5)
-
-
-@pytest.mark.parametrize(("n", "alike", "bound"), [(20_000, True, 6e-6), (20_000, False, 2e-6), (300_000, False, 3e-6)])
-def test_a_pile_of_footprints_is_summed_without_drift(
-    rng: np.random.Generator, n: int, alike: bool, bound: float
-) -> None:
-    # Of a sum of equal numbers one by one every step rounds alike: 5e-3 are lost of a million, 9e-5 of these.
-    places = np.full((n, 2), 8.0) if alike else rng.uniform(7.6, 8.4, (n, 2))
-    weights = np.full(n, 0.7) if alike else rng.uniform(0.1, 1, n)
-    table = _table(places, *(np.ones(n) for _ in range(2)), np.zeros(n), weights, 3.5)
-    t, pixel = table.astype(np.float64), np.arange(16)
-    along = [np.exp(-0.5 * (pixel[None] - t[:, [place]]) ** 2) for place in (U, V)]
-    expected = (along[1] * t[:, [W]]).T @ along[0]
-    inside = expected > 0.05 * expected.max()
-    assert (np.abs(_image(table, (16, 16)) / expected - 1))[inside].max() < bound
-    if alike:
-        one_by_one = np.cumsum(np.full(n, weights[0], np.float32), dtype=np.float32)[-1]
-        assert abs(float(one_by_one) / (n * 0.7) - 1) > 5 * bound
-
-
-def test_a_workspace_serves_again_and_changes_nothing(rng: np.random.Generator) -> None:
-    shape = (20, 30)
-    table = _table(rng.uniform(0, 20, (9, 2)), *(rng.uniform(0.5, 3, 9) for _ in range(4)))
-    image, layers = np.empty(shape, np.float32), render_layers(*shape)
-    layers[:] = np.nan
-    for _ in range(2):
-        render(table, image, layers)
-        np.testing.assert_array_equal(image, _image(table, shape))
-    g, room = rng.normal(size=shape).astype(np.float32), np.full((9, 6), np.nan, np.float32)
-    assert moments(table, g, room) is room
-    np.testing.assert_array_equal(room, moments(table, g))
-    np.testing.assert_array_equal(moments(table, np.asfortranarray(g)), room)
-
-
-def test_no_gaussians_or_gaussians_beside_the_image_leave_zeros() -> None:
-    shape = (8, 24)
-    assert not _image(np.empty((0, 8), np.float32), shape).any()
-    away = _table(np.array([[-50.0, 3.0], [3.0, 90.0]]), *(np.ones(2) for _ in range(4)))
-    faint = _table(np.array([[5.0, 5.0]]), *(np.ones(1) for _ in range(4)))
-    faint[0, [HU, HV]] = -1
-    for table in (away, faint):
-        assert not _image(table, shape).any()
-        assert not moments(table, np.ones(shape, np.float32)).any()

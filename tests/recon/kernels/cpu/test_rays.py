@@ -62,29 +62,6 @@ def backward(rays: CpuRays, weights: F32) -> tuple[Gradients, F32]:
     return into, centres
 
 
-def test_rays_and_gradients_equal_the_reference(rng: np.random.Generator) -> None:
-    parameters, weights = raw(rng), rng.normal(size=SHAPE).astype(np.float32)
-    rays, image = rays_of(Active.of(*parameters, UNIT), WIDE), np.zeros(SHAPE, np.float32)
-    rays.add_to(image)
-    leaves = as_leaves(parameters)
-    expected = exact_view(leaves, WIDE)
-    np.testing.assert_allclose(image, expected.detach().numpy(), atol=5e-6 * float(expected.detach().max()))
-    (expected * torch.from_numpy(weights)).sum().backward()
-    into, _ = backward(rays, weights)
-    for found, leaf in zip(into.to_raw(parameters[2], parameters[3], UNIT), leaves, strict=True):
-        assert leaf.grad is not None
-        np.testing.assert_allclose(found, leaf.grad.numpy(), atol=2e-5 * float(leaf.grad.abs().max()))
-
-
-def test_rays_are_linear_in_density_and_the_density_gradient_is_the_adjoint(rng: np.random.Generator) -> None:
-    active, y = Active.of(*raw(rng), UNIT), rng.normal(size=SHAPE).astype(np.float32)
-    rays, image = rays_of(active, WIDE, 1e-4, 3.5), np.zeros(SHAPE, np.float32)
-    rays.add_to(image)
-    into, _ = backward(rays, y)
-    left = float((image.astype(np.float64) * y).sum())
-    assert left == pytest.approx(float((active.densities.astype(np.float64) * into.densities).sum()), rel=2e-5)
-
-
 @settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), cut=st.floats(1.0, 4.0), largest=st.sampled_from([0.5, 2.0, 6.0]))
 def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: float, largest: float) -> None:
@@ -105,17 +82,6 @@ def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: floa
     reach = cut * np.linalg.norm(active.scales[0] * (beam @ active.rotations[0].reshape(3, 3)))
     if WIDE.sod + beam @ active.means[0] > 1.001 * reach:
         assert (whole[seen] >= thinnest * math.exp(-(cut**2) / 2) * 0.999 - 1e-6).all()
-
-
-def test_many_rays_in_bands_sum_to_the_same_as_one_by_one(rng: np.random.Generator) -> None:
-    active = Active.of(*raw(rng), UNIT)
-    together, apart = np.zeros(SHAPE, np.float32), np.zeros(SHAPE, np.float32)
-    rays_of(active, WIDE).add_to(together)
-    for i in range(25):
-        one = Active(active.means[i : i + 1], active.scales[i : i + 1], active.rotations[i : i + 1],
-                     active.densities[i : i + 1])  # fmt: skip
-        rays_of(one, WIDE).add_to(apart)
-    np.testing.assert_array_equal(together, apart)
 
 
 @settings(max_examples=60)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numba
 import numpy as np
 import pytest
@@ -61,18 +59,6 @@ def test_threads_share_planes_without_a_race(back: tuple[int, int], rng: np.rand
     np.testing.assert_array_equal(*fields)
 
 
-def test_the_kernels_get_arrays_without_gaps() -> None:
-    """Of an array with gaps the compiler makes code that gathers single numbers: three times as slow."""
-    given = (*tv_cpu.dual_field((64, 5, 6)), *tv_cpu.dual_scratch((64, 5, 6)))
-    assert all(part.flags.c_contiguous for part in given)
-
-
-def test_fields_lie_apart_from_a_power_of_two() -> None:
-    """Else rows of all three share one set of the cache: three times as slow at 1024 x 1024 x 64 voxels."""
-    places = [part.__array_interface__["data"][0] % 4096 for part in tv_cpu.dual_field((64, 64, 16))]
-    assert min(abs(a - b) for a, b in itertools.combinations(places, 2)) >= 512
-
-
 @given(shapes, st.integers(0, 2**31))
 @settings(max_examples=30)
 def test_the_gradient_is_the_slope_of_tv(shape: tuple[int, int, int], seed: int) -> None:
@@ -84,11 +70,6 @@ def test_the_gradient_is_the_slope_of_tv(shape: tuple[int, int, int], seed: int)
     way, h = rng.normal(size=shape), 1e-5
     rise = total_variation(x + h * way, WEIGHTS, smoothing) - total_variation(x - h * way, WEIGHTS, smoothing)
     assert float((found * way).sum()) == pytest.approx(rise / (2 * h), rel=1e-4, abs=1e-4)
-
-
-def test_reference_is_a_transpose(rng: np.random.Generator) -> None:
-    x, p = rng.normal(size=(4, 5, 6)), rng.normal(size=(3, 4, 5, 6))
-    assert (differences(x, WEIGHTS) * p).sum() == pytest.approx((x * transposed_differences(p, WEIGHTS)).sum())
 
 
 def test_a_vanishing_weight_leaves_the_volume(rng: np.random.Generator) -> None:

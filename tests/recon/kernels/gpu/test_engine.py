@@ -17,10 +17,8 @@ from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
 from tests.recon.conftest import Make
-from tests.recon.helpers import as_leaves, gradients, in_double, run_steps
-from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, EXACT, UNIT, cone, parallel
-from tests.recon.kernels.reference import on_grid as voxelize
-from tests.recon.kernels.reference import project
+from tests.recon.helpers import run_steps
+from tests.recon.kernels.gpu.on_gpu import UNIT, cone, parallel
 
 gpu = importlib.import_module("recon.kernels.gpu")
 
@@ -70,16 +68,6 @@ def test_a_fit_is_the_same_on_both_backends(
         np.testing.assert_array_equal(array, checkpoint[key], err_msg=key)
 
 
-def test_project_and_voxelize_go_where_they_are_sent(random_gaussians: Make) -> None:
-    g, geometry, grid = random_gaussians(9, 8.0), cone(), Grid((4, 6, 5), 0.9)
-    model, cut = RayModel(exact_above=0.05), Truncation(9.0, 1e-12)
-    there = as_leaves(g, DEVICE)
-    shown = project(there, geometry, truncation=cut, model=model, gpu=True).detach().cpu()
-    np.testing.assert_allclose(shown, project(g, geometry, truncation=cut, model=model), rtol=1e-4, atol=1e-5)
-    dense = voxelize(there, grid, truncation=cut, gpu=True).detach().cpu()
-    np.testing.assert_allclose(dense, voxelize(g, grid, truncation=cut), rtol=1e-4, atol=1e-6)
-
-
 def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "interpreted", lambda: False)
     with pytest.raises(ValueError, match="devices, got cpu"):
@@ -96,20 +84,3 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(ValueError, match=r"sees 2 CUDA.*ask for cuda"):
             gpu.require(absent)
     assert gpu.require("cuda:0") == torch.device("cuda:0")
-
-
-@pytest.mark.parametrize("model", [AFFINE, EXACT], ids=["affine", "exact"])
-def test_a_compact_kernel_and_its_gradients_equal_the_reference(model: RayModel, random_gaussians: Make) -> None:
-    g, geometry, grid = random_gaussians(5, 5.0, kernel=Kernel.COMPACT), cone((9, 12)), Grid((3, 4, 3), 0.9)
-    fast, double = as_leaves(g, DEVICE), in_double(g)
-    for seen, expected in (
-        (project(fast, geometry, model=model, gpu=True), project(double, geometry, model=model)),
-        (voxelize(fast, grid, gpu=True), voxelize(double, grid)),
-    ):
-        found = seen.detach().cpu().double()
-        assert float((found - expected.detach()).abs().max()) < 3e-6 * float(expected.detach().max())
-        weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
-        (seen * weights.float().to(DEVICE)).sum().backward()
-        (expected * weights).sum().backward()
-    for name, gradient in gradients(double).items():
-        assert float((gradients(fast)[name] - gradient).abs().max()) < 2e-5 * float(gradient.abs().max()), name

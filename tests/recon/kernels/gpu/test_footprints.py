@@ -1,4 +1,4 @@
-"""Footprints, images and what flows back from them: the Triton kernels against the reference and the CPU's."""
+"""Images and volumes, what flows back from them, and where they end: the Triton kernels against the reference."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import RayModel
+from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.volume import Grid
-from recon.kernels.cpu import footprints as footprints_cpu
-from recon.kernels.cpu.engine import Active, view_table
 from recon.splatting.gaussians import Gaussians
 from tests.recon.conftest import Make
-from tests.recon.helpers import gradients, in_double
+from tests.recon.hard_cases.measure import compare
+from tests.recon.helpers import as_leaves, gradients, in_double
 from tests.recon.kernels import reference
 from tests.recon.kernels.gpu.on_gpu import (
     AFFINE,
     DEVICE,
+    EXACT,
     SHAPE,
     UNIT,
     WHOLE,
@@ -32,58 +32,32 @@ from tests.recon.kernels.gpu.on_gpu import (
     reference_view,
     voxelize_raw,
 )
+from tests.recon.kernels.reference import project
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 
 
-@pytest.mark.parametrize("make", [parallel, leaned, cone])
-def test_images_and_gradients_equal_the_reference(make: object, random_gaussians: Make) -> None:
-    geometry = make()  # type: ignore[operator]
-    g = random_gaussians(18, 9.0)
-    raw, double = raw_of(g, DEVICE), in_double(g)
-    found = project_raw(*raw, UNIT, geometry, *WHOLE, AFFINE)
-    expected = torch.stack([reference_view(double, geometry, view) for view in range(geometry.n_views)])
-    peak = float(expected.detach().max())
-    assert float((found.detach().cpu() - expected.detach()).abs().max()) < 3e-6 * peak
-    weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
-    (found * weights.float().to(DEVICE)).sum().backward()
-    (expected * weights).sum().backward()
-    assert_gradients(raw, double)
+PATHS: dict[str, tuple[Geometry | Grid, RayModel | None, Kernel]] = {
+    "parallel": (parallel(), None, Kernel.GAUSSIAN),
+    "leaned": (leaned(), None, Kernel.GAUSSIAN),
+    "cone": (cone(), None, Kernel.GAUSSIAN),
+    "cone, some exact": (cone(), RayModel(exact_above=0.035), Kernel.GAUSSIAN),
+    "cone, all exact": (cone(), EXACT, Kernel.GAUSSIAN),
+    "parallel, plain": (parallel(), RayModel(rectified=False), Kernel.GAUSSIAN),
+    "cone, plain": (cone(), RayModel(rectified=False), Kernel.GAUSSIAN),
+    "compact": (cone((9, 12)), None, Kernel.COMPACT),
+    "compact, exact": (cone((9, 12)), EXACT, Kernel.COMPACT),
+    "voxels": (Grid((9, 12, 10), 0.6, (0.4, -0.8, 1.1)), None, Kernel.GAUSSIAN),
+    "tall voxels": (Grid((5, 9, 8), 0.7, slice_pitch=1.3), None, Kernel.GAUSSIAN),
+    "compact voxels": (Grid((3, 4, 3), 0.9), None, Kernel.COMPACT),
+}
 
 
-@pytest.mark.parametrize("make", [parallel, cone])
-def test_the_uncorrected_factor_equals_the_references(make: object, random_gaussians: Make) -> None:
-    geometry = make()  # type: ignore[operator]
-    g = random_gaussians(10, 9.0)
-    raw, double = raw_of(g, DEVICE), in_double(g)
-    plain = RayModel(rectified=False)
-    found = project_raw(*raw, UNIT, geometry, *WHOLE, plain)[0]
-    physical = (double.means, double.scales, double.quaternions, double.densities)
-    expected = reference.project_view(physical, geometry, 0, length=plain.length(geometry))
-    assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
-    (found * found).sum().backward()
-    (expected * expected).sum().backward()
-    assert_gradients(raw, double)
-
-
-def test_footprints_equal_the_cpus(random_gaussians: Make) -> None:
-    g, geometry = random_gaussians(30, 30.0), parallel()
-    arrays = g.arrays()
-    active = Active.of(*(arrays[k] for k in ("means", "log_scales", "quaternions", "raw_densities")), UNIT)
-    expected = view_table(active, geometry, 0, 1e-3, 3.5)
-    raw = [t.detach() for t in raw_of(g, DEVICE)]
-    found = engine.GpuPass(*raw, UNIT).view(geometry, 0, 1e-3, 3.5, AFFINE).footprints
-    table = found.table.cpu().numpy()
-    hidden = expected[:, footprints_cpu.HU] < 0
-    assert hidden.any() or not (table[:, footprints_cpu.HU] < 0).any()
-    np.testing.assert_array_equal(table[:, footprints_cpu.HU] < 0, hidden)
-    np.testing.assert_allclose(table[~hidden], expected[~hidden], rtol=2e-5, atol=2e-5)
-    boxes = found.boxes.cpu().numpy()
-    assert (boxes >= 0).all() and (boxes[:, 1] <= SHAPE[0]).all() and (boxes[:, 3] <= SHAPE[1]).all()
-    u, v, hu, hv = (table[:, k] for k in (0, 1, 6, 7))
-    hit = (u + hu >= 0) & (u - hu <= SHAPE[1] - 1) & (v + hv >= 0) & (v - hv <= SHAPE[0] - 1)
-    assert 0 < hit.sum() < hit.size  # some lie outside the image
-    np.testing.assert_array_equal(boxes[:, 1] > boxes[:, 0], hit)
+@pytest.mark.parametrize("path", PATHS)
+def test_images_volumes_and_their_gradients_equal_the_reference(path: str, random_gaussians: Make) -> None:
+    where, model, kernel = PATHS[path]
+    found = compare(random_gaussians(12, 8.0, kernel=kernel), where, model=model, device=DEVICE)
+    assert found.value < 5e-6 and found.worst < 2e-5, found.gradients
 
 
 def test_a_cut_off_ends_at_the_box_whatever_the_tiles() -> None:
@@ -146,3 +120,42 @@ def test_none_one_and_those_that_cover_everything(n: int) -> None:
     for tensor, (name, value) in zip(raw, gradients(double).items(), strict=True):
         assert tensor.grad is not None
         np.testing.assert_allclose(tensor.grad.cpu(), value, rtol=1e-4, atol=0.3 if name == "quaternions" else 1e-3)
+
+
+@pytest.mark.parametrize("cut", [1.5, 3.0])
+def test_exact_rays_end_where_the_cpus_end(cut: float, random_gaussians: Make) -> None:
+    # To the pixel; and forward and backward agree on where.
+    g, geometry = random_gaussians(12, 9.0), cone()
+    raw, ours = raw_of(g, DEVICE), as_leaves(g)
+    found = project_raw(*raw, g.density_unit, geometry, 1e-4, cut, EXACT)[0]
+    faint = 1e-4 / (g.density_unit * geometry.sample_pitch * SHAPE[1])
+    expected = project(ours, geometry, truncation=Truncation(cut, faint), model=EXACT)[0]
+    np.testing.assert_allclose(found.detach().cpu(), expected.detach(), atol=1e-5 * float(expected.detach().max()))
+    y = torch.from_numpy(np.random.default_rng(4).normal(size=SHAPE).astype(np.float32))
+    (found * y.to(DEVICE)).sum().backward()
+    (expected * y).sum().backward()
+    assert_gradients(raw, ours, 1e-4)
+    assert raw[3].grad is not None
+    back = raw[3].grad.cpu().double() / (g.density_unit * torch.sigmoid(g.raw_densities.double()))
+    left, right = float((found.detach().cpu() * y).double().sum()), float((g.densities.double() * back).sum())
+    assert left == pytest.approx(right, rel=2e-5)
+
+
+tiles = importlib.import_module("recon.kernels.gpu.tiles")
+
+
+def test_a_long_list_is_shared_out_and_sums_to_the_same() -> None:
+    rng = np.random.default_rng(2)
+    g = Gaussians.from_physical(rng.uniform(-3, 3, (90, 3)), rng.uniform(0.8, 2, (90, 3)), rng.uniform(0.2, 1, 90))
+    geometry, grid = Geometry.parallel([0.5], (7, 8)), Grid((4, 5, 6))
+    run = engine.GpuPass(*(t.detach() for t in raw_of(g, DEVICE)), g.density_unit)
+    view, box = run.view(geometry, 0, *WHOLE, AFFINE), run.box(grid, *WHOLE)
+    boxes = view.footprints.boxes
+    assert tiles.tile_lists(boxes, (7, 8), 8).shares > 1
+    assert tiles.tile_lists(torch.zeros_like(boxes), (7, 8), 8).shares == 1
+    double = in_double(g)
+    expected = reference_view(double, geometry, 0).detach()
+    np.testing.assert_allclose(view.image.cpu(), expected, rtol=2e-6)
+    z, y, x = (torch.from_numpy(axis) for axis in grid.coordinates())
+    volume = reference.voxelize(double.means, double.scales, double.quaternions, double.densities, (z, y, x)).detach()
+    np.testing.assert_allclose(box.density.cpu(), volume, rtol=2e-6)

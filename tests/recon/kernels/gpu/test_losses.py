@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
-from recon.splatting.backend import Cpu, backend_for
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 from tests.recon.kernels.reference import projection_loss
 from tests.recon.kernels.reference import total_variation as reference_total_variation
@@ -41,21 +40,6 @@ def test_projection_loss_and_gradient_equal_the_reference(
     np.testing.assert_allclose(gradient.cpu(), exact.grad, atol=2e-5 * float(exact.grad.abs().max()))
     if weights is not None:
         assert not gradient.cpu().numpy()[weights == 0].any()
-
-
-@pytest.mark.parametrize("weighted", [False, True])
-def test_misfit_and_lengths_equal_the_cpus(weighted: bool, rng: np.random.Generator) -> None:
-    image, target, w = rng.random((3, 12, 17)).astype(np.float32)
-    vectors, factor = rng.normal(size=(31, 2)).astype(np.float32), 2.5
-    found = []
-    for backend in (Cpu(), backend_for("cuda")):
-        weights, sums = backend.array(w) if weighted else None, backend.array(np.arange(31, dtype=np.float32))
-        here = [backend.array(a) for a in (image, target, 0 * target)]
-        assert float(backend.misfit(here[0], here[2], weights)) == 0
-        backend.add_lengths(backend.array(vectors), factor, sums)
-        found.append((float(backend.misfit(here[0], here[1], weights)), backend.numpy(sums)))
-    assert found[1][0] == pytest.approx(found[0][0], rel=1e-6)
-    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(5, 6, 11), (1, 4, 4), (1, 1, 3), (1, 1, 1)])

@@ -51,27 +51,6 @@ def test_arrays_are_copied_to_the_device_and_back(rng: np.random.Generator) -> N
     assert not gpu.zeros((2, 3)).any() and gpu.zeros((2, 3)).shape == (2, 3)
 
 
-@pytest.mark.parametrize("out", ["a", "b", "new"])
-@pytest.mark.parametrize("alpha", [1.0, -0.7])
-def test_combine_takes_what_it_overwrites(out: str, alpha: float, rng: np.random.Generator) -> None:
-    a, b, other = drawn(rng, (5, 6, 7), 3)
-    there = {"a": gpu.array(a), "b": gpu.array(b), "new": gpu.array(other)}
-    expected = np.empty_like(a)
-    vectors.combine(alpha, a, 0.3, b, expected)
-    gpu.combine(alpha, there["a"], 0.3, there["b"], there[out])
-    assert_close(there[out], expected, 2)
-
-
-@pytest.mark.parametrize("nonnegative", [False, True])
-def test_products_are_added_as_on_the_cpu(nonnegative: bool, rng: np.random.Generator) -> None:
-    x, a, b = drawn(rng, (5, 6, 7), 3)
-    there = gpu.array(x)
-    gpu.add_product(there, 0.7, gpu.array(a), gpu.array(b), nonnegative)
-    gpu.maximum(there, gpu.array(b), out=there)
-    vectors.add_product(x, 0.7, a, b, nonnegative)
-    assert_close(there, np.maximum(x, b), 2)
-
-
 @pytest.mark.parametrize("at_once", [1, 1 << 20])
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("scaled", [False, True])
@@ -103,16 +82,6 @@ def test_sums_are_of_float64() -> None:
     data[0, 0, 0] = 1e4
     expected = float(np.square(data, dtype=np.float64).sum())
     assert gpu.replace_by_residual(gpu.array(data), gpu.array(model)) == pytest.approx(expected, rel=1e-9)
-
-
-def test_extrapolation_is_the_cpus(rng: np.random.Generator) -> None:
-    expected = drawn(rng, (5, 6, 7), 3)
-    x, last, start = map(gpu.array, expected)
-    for factor in (0.0, 0.4, 0.9):
-        vectors.extrapolate(expected[0], factor, *expected[1:])
-        gpu.extrapolate(x, factor, last, start)
-    for found, wanted in zip((x, last, start), expected, strict=True):
-        assert_close(found, wanted, 4)
 
 
 @pytest.mark.parametrize("shape", [(4, 9, 7), (4, 1, 6), (4, 5, 1)])
@@ -152,16 +121,6 @@ def test_dual_steps_and_the_primal_point_are_the_cpus(
     assert torch.equal(there, out)
 
 
-def test_a_vanishing_weight_leaves_the_volume(rng: np.random.Generator) -> None:
-    x = gpu.array(rng.random((4, 5, 20)).astype(np.float32))
-    p, given, out = gpu.dual_field(x.shape), (1e-25, (1.0, 1.0, 1.0), True, None), torch.zeros_like(x)
-    for _ in range(3):
-        gpu.dual_step(x, p, *given)
-    assert all(bool(field.isfinite().all()) for field in p)
-    gpu.primal(x, p, *given, out)
-    assert torch.equal(out, x)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("threshold", [0.0, 0.4, 3.0])
 @pytest.mark.parametrize("nonnegative", [False, True])
@@ -177,12 +136,6 @@ def test_patches_are_the_cpus(shape: Shape, threshold: float, nonnegative: bool,
     assert torch.equal(there, out)
 
 
-def test_a_mean_below_the_threshold_stays() -> None:
-    x, out = gpu.array(np.full((6, 5, 7), 0.25, np.float32)), gpu.zeros((6, 5, 7))
-    gpu.denoise(x, 1e6, False, None, out)
-    assert torch.equal(out, x)
-
-
 @pytest.mark.parametrize("shape", [(19, 6, 13), (19, 6, 3)])
 @pytest.mark.parametrize("planes", [1, 2, 5])
 def test_patches_in_parts_have_the_bits_of_one_part(
@@ -194,17 +147,6 @@ def test_patches_in_parts_have_the_bits_of_one_part(
     monkeypatch.setattr(volumes, "_AT_ONCE", planes * plane)
     gpu.denoise(x, 0.7, False, None, parts)
     assert torch.equal(parts, whole)
-
-
-@pytest.mark.parametrize("nonnegative", [False, True])
-def test_a_pulled_step_is_the_cpus(nonnegative: bool, rng: np.random.Generator) -> None:
-    x, change, gradient, z = drawn(rng, (5, 6, 7), 4)
-    there = [gpu.array(each) for each in (x, change, gradient, z)]
-    for momentum, pace in ((0.0, 0.7), (0.4, 0.9), (0.6, 0.8)):
-        patches.pulled_step(x, change, momentum, pace, gradient, 0.03, z, nonnegative)
-        gpu.pulled_step(there[0], there[1], momentum, pace, there[2], 0.03, there[3], nonnegative)
-    assert_close(there[0], x, 8)
-    assert_close(there[1], change, 16)  # a difference of two x
 
 
 class OneDevice(TorchFunctionMode):

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from simulators.effects.beam.open_beam import BeamBend, BlackBand, LostBeam, NarrowField, RingCurrent
 from simulators.effects.chain import Label
-from simulators.frame import sensor
 from simulators.frame.shot import Detector
 from tests.simulators import anomalies, shots
 
@@ -31,7 +30,6 @@ def test_flats_stay_as_they_are() -> None:
     assert (BEND.apply(np.ones((6, 8)), shots.shot(sample=False)) == 1).all()
 
 
-CONVERSION = sensor.CONVERSION["standard"]
 TAU = 100.0
 RINGS = {
     "falls": RingCurrent(TAU),
@@ -40,12 +38,6 @@ RINGS = {
     "by the current": RingCurrent(TAU, top_up_below=0.8),
     "by the current, with a ramp": RingCurrent(TAU, top_up_below=0.8, refill=4.0),
 }
-
-
-def test_a_frame_halves_in_the_half_life() -> None:
-    scene = shots.scene({"kind": "ring_current", "lifetime": TAU})
-    half = shots.frame(scene, shots.shot(elapsed=TAU * math.log(2) - 0.005), sample=False)  # the middle of 10 ms
-    assert (half == round(2000 / CONVERSION)).all()
 
 
 @pytest.mark.parametrize("ring", RINGS.values(), ids=RINGS)

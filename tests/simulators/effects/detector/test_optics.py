@@ -39,32 +39,6 @@ def test_a_transmission_that_falls_exponentially_has_its_closed_form(
     np.testing.assert_allclose(_mean(seen, rate), expected, atol=2 * share * rest + 1e-12)
 
 
-@given(
-    decays=st.lists(st.floats(1e-3, 0.1), min_size=1, max_size=3),
-    samples=st.integers(1, 5),
-    blur=st.integers(2, 6),
-    power=st.integers(0, 9),
-)
-def test_powers_of_time_have_the_mean_of_all_components_and_all_moments(
-    decays: list[float], samples: int, blur: int, power: int
-) -> None:
-    """E (t - s)^m = sum of binomials E t^(m-k) (-1)^k k! tau^k, up to m = 2 samples - 1."""
-    power = min(power, 2 * samples - 1)
-    within = np.sort(np.random.default_rng(blur).random(blur)) * 0.05
-    before = Moments(np.tile(within[:, None], 60), np.arange(1.0, blur + 1) * 2 / (blur * (blur + 1)))
-    shares = tuple(0.3 / (i + 1) for i in range(len(decays)))
-    seen = Afterglow(shares, tuple(decays), samples).moments(before, shots.shot())
-    assert seen.times.shape[0] == blur + samples
-    mean = sum(
-        share * math.comb(power, k) * float(before.weights @ before.times[:, 0] ** (power - k))
-        * (-1) ** k * math.factorial(k) * decay**k
-        for share, decay in zip(shares, decays, strict=True) for k in range(power + 1)
-    )  # fmt: skip
-    mean += (1 - sum(shares)) * float(before.weights @ before.times[:, 0] ** power)
-    size = math.factorial(power) * (0.05 + max(decays)) ** power
-    assert float(seen.weights @ seen.times[:, 0] ** power) == pytest.approx(mean, abs=1e-10 * size, rel=1e-10)
-
-
 def test_weights_are_those_of_a_mean_and_rows_keep_their_own_times() -> None:
     rolled = Moments(np.arange(60) * 3.6e-6 + np.array([[1e-3], [4e-3]]), np.array([0.25, 0.75]))
     seen = Afterglow((0.1, 0.05), (0.01, 0.2)).moments(rolled, shots.shot())
@@ -219,25 +193,6 @@ def _amplitude(effect: ScintillatorBlur, k: int, shot: Shot) -> float:
     return 2 / rows * float(wave @ seen.mean(axis=1))
 
 
-@settings(max_examples=40)
-@given(
-    rows=st.integers(1, 50),
-    cols=st.integers(1, 50),
-    fwhm=st.floats(0, 200),
-    share=st.floats(0, 0.99),
-    width=st.floats(0.1, 1000),
-    tail=st.sampled_from(["exponential", "lorentzian"]),
-)
-def test_light_is_kept_and_none_is_negative(
-    rows: int, cols: int, fwhm: float, share: float, width: float, tail: Any
-) -> None:
-    image = np.random.default_rng(rows * 50 + cols).exponential(1000.0, (rows, cols))
-    image[image < 1000] = 0.0
-    seen = ScintillatorBlur(fwhm, share, width, tail).apply(image.copy(), _shot((rows, cols)))
-    assert seen.sum() == pytest.approx(image.sum(), rel=1e-11)
-    assert seen.min() >= 0
-
-
 def test_the_core_is_the_gaussian_of_another_implementation(rng: np.random.Generator) -> None:
     image = rng.random((60, 90))
     seen = ScintillatorBlur(150.0).apply(image.copy(), _shot((60, 90)))
@@ -251,15 +206,6 @@ def test_the_taps_have_the_variance_of_the_gaussian_however_narrow(variance: flo
     assert 2 * float(n**2 @ taps) == pytest.approx(variance, rel=1e-5)
     assert taps[0] + 2 * taps[1:].sum() == pytest.approx(1.0, rel=1e-14)
     assert (taps >= 0).all()
-
-
-@given(variance=st.floats(1.0, 50), omega=st.floats(0, math.pi))
-def test_the_taps_have_the_transfer_of_the_sampled_gaussian(variance: float, omega: float) -> None:
-    """By Poisson's sum the Gaussian's transfer and its aliases."""
-    taps = discrete_gaussian(variance)
-    transfer = taps[0] + 2 * float(taps[1:] @ np.cos(omega * np.arange(1, taps.size)))
-    aliases = sum(math.exp(-variance * (omega + 2 * math.pi * m) ** 2 / 2) for m in (-1, 0, 1))
-    assert transfer == pytest.approx(aliases, abs=2e-8)
 
 
 @pytest.mark.parametrize("pixel_um", [2.0, 4.0])

@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.motor import PulseMotor
-from simulators.effects.chain import Label
+from simulators.effects.chain import Label, PoseEffect
 from simulators.effects.stage.errors import EncoderError, Jump, Runout, StageWobble, came_forwards, series
 from simulators.frame.shot import Detector, Pose, Shot
 from tests.simulators import shots
-from tests.simulators.poses import posed, seen
+
+
+def seen(pose: Pose, point: ArrayLike) -> NDArray[np.float64]:
+    """(u, b, v) in mm of a point of the sample in each row, [row, 3]."""
+    axes, origin = pose.frames()
+    return np.einsum("rij,ri->rj", axes, np.asarray(point, dtype=np.float64) - origin)
+
+
+def posed(effect: PoseEffect, angle: float | NDArray[np.float64], rows: int = 3, **changes: Any) -> Pose:
+    """The pose that an effect makes of a sample that is turned by `angle` radians; `changes` are the shot's."""
+    return effect.pose(Pose.turned(angle, rows), np.zeros(rows), shots.shot(**changes))
+
 
 ANGLES = np.linspace(-4.0, 9.0, 27)
 
@@ -47,12 +60,25 @@ def test_a_frame_equals_the_frame_at_the_true_angle() -> None:
     assert (shots.frame(scene) != shots.frame(shots.scene())).any()
 
 
-def test_the_rest_is_drawn_for_each_frame() -> None:
-    error = np.array([1e3 * np.degrees(posed(EncoderError((), 3.0), 0.3, frame=k).angle - 0.3) for k in range(400)])
-    assert (error == error[:, :1]).all()
-    # Mean and variance of 400 Gaussian draws; 5 standard errors fail once in 1.7 million.
-    assert abs(error[:, 0].mean()) < 5 * 3.0 / math.sqrt(400)
-    assert error[:, 0].var() == pytest.approx(9.0, rel=5 * math.sqrt(2 / 400))
+@pytest.mark.parametrize(
+    ("effect", "of", "spreads"),
+    [
+        (EncoderError((), 3.0), lambda pose: 1e3 * np.degrees(pose.angle - 0.3)[:, None], [3.0]),
+        (StageWobble(random_urad=7.0), lambda pose: 1e6 * pose.tilt, [7.0, 7.0]),
+        (Runout(radial_random_um=2.0, axial_random_um=0.5), lambda pose: 1e3 * pose.shift, [2.0, 2.0, 0.5]),
+    ],
+    ids=["encoder", "wobble", "runout"],
+)
+def test_the_rest_is_drawn_for_each_frame_and_the_same_at_every_moment_of_it(
+    effect: PoseEffect, of: Callable[[Pose], Any], spreads: list[float]
+) -> None:
+    drawn = np.array([of(posed(effect, 0.3, frame=k)) for k in range(500)])
+    assert (drawn == drawn[:, :1]).all()
+    # Mean and variance of 500 Gaussian draws; 5 standard errors fail once in 1.7 million.
+    np.testing.assert_allclose(drawn[:, 0].mean(axis=0) / spreads, 0, atol=5 / math.sqrt(500))
+    np.testing.assert_allclose(drawn[:, 0].var(axis=0), np.square(spreads), rtol=5 * math.sqrt(2 / 500))
+    others = np.corrcoef(drawn[:, 0].T).reshape(len(spreads), -1) - np.eye(len(spreads))
+    assert np.abs(others).max() < 5 / math.sqrt(500)
 
 
 class TrapezoidStage:
@@ -137,17 +163,6 @@ def test_no_wave_is_an_axis_that_leans_always_to_the_same_side() -> None:
     np.testing.assert_allclose(about_b, [[0.4e-3, 0.0, 0.4]] * 3, atol=1e-6)
 
 
-def test_the_rest_is_drawn_for_each_frame_and_the_same_at_every_moment_of_it() -> None:
-    effect = StageWobble(random_urad=7.0)
-    tilts = np.array([posed(effect, 0.3, frame=k).tilt for k in range(400)])
-    assert (tilts == tilts[:, :1]).all()
-    np.testing.assert_array_equal(posed(effect, 0.9, frame=5).tilt, tilts[5])
-    assert abs(np.corrcoef(tilts[:, 0].T)[0, 1]) < 5 / math.sqrt(400)
-    # Mean and variance of 800 Gaussian draws; 5 standard errors fail once in 1.7 million.
-    assert abs(tilts[:, 0].mean()) < 5 * 7e-6 / math.sqrt(800)
-    assert tilts[:, 0].var() == pytest.approx(49e-12, rel=5 * math.sqrt(2 / 800))
-
-
 RUNOUT_ANGLES = np.linspace(-2.0, 5.0, 9)
 
 
@@ -169,15 +184,6 @@ def test_zero_waves_shift_the_axis_and_others_are_cosines() -> None:
     across, along = 3.0 + 2.0 * np.cos(at), -2.0 * np.sin(at)
     up = 5.0 * np.cos(2 * RUNOUT_ANGLES - math.radians(40.0))
     np.testing.assert_allclose(1e3 * (there - here), np.stack([across, along, up], axis=1), atol=1e-10)
-
-
-def test_the_rest_is_drawn_for_each_frame_of_runout() -> None:
-    effect = Runout(radial_random_um=2.0, axial_random_um=0.5)
-    shift = 1e3 * np.array([posed(effect, 0.3, frame=k).shift for k in range(500)])
-    assert (shift == shift[:, :1]).all()
-    # Variance of 500 Gaussian draws; 5 standard errors fail once in 1.7 million.
-    np.testing.assert_allclose(shift[:, 0].var(axis=0), [4.0, 4.0, 0.25], rtol=5 * math.sqrt(2 / 500))
-    assert abs(np.corrcoef(shift[:, 0].T)[0, 1]) < 5 / math.sqrt(500)
 
 
 def test_a_frame_is_seen_shifted_by_whole_pixels() -> None:

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError, choose
 from simulators.frame.shot import Detector
-from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, POLYHEDRON, pack
+from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import SOLIDS as KINDS
 from simulators.samples.bodies.solids import (
@@ -72,14 +72,6 @@ def test_truth_has_the_solid_s_mass(name: str) -> None:
     assert mass == pytest.approx(solid.attenuation * bodies.volume(solid), rel=tolerance.get(name, 3e-3))
     sure = (truth == 0) | (truth == np.float32(solid.attenuation))
     np.testing.assert_array_equal(truth[sure] > 0, inside(solid, _centres(grid))[sure])
-
-
-def test_truth_of_all_together_has_the_mass_of_all() -> None:
-    """Upright faces lie midway between the points that are counted, but for those of a hexagon."""
-    solids = [solid for name, solid in SOLIDS.items() if name != "upright plate"]
-    grid = Grid((30, 34, 32), 0.03)
-    mass = Phantom.of(solids).attenuation(grid, supersample=6).sum(dtype=np.float64) * grid.voxel_size**3
-    assert mass == pytest.approx(sum(solid.attenuation * bodies.volume(solid) for solid in solids), rel=1e-3)
 
 
 def test_truth_on_a_face_is_the_filled_share() -> None:
@@ -153,28 +145,6 @@ def test_a_scene_can_give_a_polyhedron_by_its_corners_alone() -> None:
     assert bodies.volume(solid) == pytest.approx(1 / 6)
     with pytest.raises(SceneError, match="'faces'"):
         choose("here", KINDS, {"kind": "polyhedron", "attenuation": 2, "faces": []})
-
-
-@pytest.mark.parametrize("name", bodies.SOLIDS)
-def test_packed_faces_and_corners_are_the_hull(name: str) -> None:
-    """A hull of the packed corners has the packed faces' planes, the solid's volume and the box that is given."""
-    solid = bodies.SOLIDS[name]
-    p = pack([Cylinder(1.0, 1.0, 1.0), solid, Ellipsoid((1.0, 1.0, 1.0), 1.0)])
-    assert p.kind[[0, -1]].tolist() == [CYLINDER, ELLIPSOID]
-    if p.kind[1] != POLYHEDRON:
-        assert p.faces.size == p.vertices.size == 0
-        return
-    faces = p.faces[p.first_face[1] : p.first_face[2]]
-    corners = p.vertices[p.first_vertex[1] : p.first_vertex[2]]
-    hull = ConvexHull(corners)
-    assert hull.volume == pytest.approx(bodies.volume(solid), rel=1e-12)
-    assert set(hull.vertices) == set(range(len(corners)))
-    planes = np.unique(np.round(hull.equations * [1, 1, 1, -1], 9), axis=0)
-    ours = np.unique(np.round(faces, 9), axis=0)
-    np.testing.assert_allclose(ours[np.lexsort(ours.T)], planes[np.lexsort(planes.T)], atol=2e-9)
-    np.testing.assert_allclose(np.linalg.norm(faces[:, :3], axis=1), 1)
-    np.testing.assert_allclose(corners.max(axis=0), p.extent[1], atol=1e-12)
-    np.testing.assert_allclose(corners.min(axis=0), -p.extent[1], atol=1e-12)
 
 
 def test_habits_have_the_volumes_that_textbooks_give() -> None:

@@ -58,10 +58,6 @@ def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
     ("wrong", "words"),
     [
         ({"field_of_view": [0.0, 1.0]}, r"field_of_view\[0\] must be greater than"),
-        ({"field_of_view": [1e308, 1.0]}, r"field_of_view\[0\] must be less than or equal to 1000000000"),
-        ({"n_particles": 10**30}, "n_particles must be less than or equal to 5000"),
-        ({"n_particles": -1}, "n_particles must be greater than or equal to 0"),
-        ({"fill": -1.0}, "fill must be greater than 0"),
     ],
 )
 def test_wrong_settings_are_refused(wrong: dict[str, Any], words: str) -> None:

@@ -176,14 +176,6 @@ def test_the_rise_is_as_wide_as_the_core_hole() -> None:
     np.testing.assert_allclose(without_line, [0.25, 0.75], atol=1e-12)
 
 
-@pytest.mark.parametrize("z", Z)
-def test_the_table_takes_over_without_a_step(z: int) -> None:
-    """The tails of the form, a thousandth of the jump at 150 eV, are gone by there."""
-    for away in (-FAR, FAR):
-        low, high = _near(z, _edge(z) + np.array([away - 0.01, away + 0.01]) * 1e-3)
-        assert abs(high - low) < 2e-5 * 400  # 0.02 eV of the table's own fall
-
-
 @given(away=st.floats(-400, 400), charge=st.floats(0, 1))
 def test_there_is_no_step_left_and_no_negative_matter(away: float, charge: float) -> None:
     around = _edge(28) + np.array([away, away + 0.01]) * 1e-3

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
 
 from simulators.light.beam import Beam, Tube
 from simulators.samples.materials.spectrum import Attenuation, Spectrum, fewer, light
@@ -126,23 +125,3 @@ def test_energies_that_all_matter_are_all_kept() -> None:
     kept, found = fewer(attenuation, weights, 1.0, 1e-9)
     np.testing.assert_array_equal(kept, [0, 1, 2, 3])
     np.testing.assert_allclose(found, weights, atol=1e-6)
-
-
-def test_a_long_table_takes_no_longer_than_its_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Energies are chosen among the hundred or so that are enough, not one after another of all that there are: 4000
-    of them, for seven materials, took seven minutes."""
-    solved: list[int] = []
-
-    def counted(a: Reals, b: Reals) -> tuple[Reals, float]:
-        solved.append(a.shape[1])
-        return nnls(a, b)
-
-    monkeypatch.setattr("scipy.optimize.nnls", counted)
-    energies = np.linspace(5, 100, 600)
-    weights = np.random.default_rng(0).dirichlet(np.ones(600))
-    attenuation = np.stack([(energies / 20) ** -3 + 0.02, 8 * (energies / 20) ** -2.7 + 0.1], axis=1)
-    kept, found = fewer(attenuation, weights, 5.0, 2e-6)
-    assert len(solved) < 80 and kept.size < 40
-    rays = np.geomspace(1e-3, 5, 30)[:, None] * np.array([0.7, 0.3])
-    expected = np.exp(-rays @ attenuation.T) @ weights
-    np.testing.assert_allclose(np.exp(-rays @ attenuation[kept].T) @ found, expected, atol=1e-5)

@@ -83,7 +83,6 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
         ({"window": [3.0, 3.0], "scale": 1.0}, r"window must be \(low, high\)"),
         ({"window": [3.0, 4.0]}, "a window needs attenuation_max"),
         ({"scale": 1.0, "attenuation_max": 2.0}, "scale and attenuation_max exclude each other"),
-        ({"largest_line_integral": 0.0}, "largest_line_integral must be greater than 0"),
         ({"file": 7}, "file must be text"),
         ({"thresholds": [3.0, 2.0]}, "thresholds must ascend"),
         ({"voxel_mm": None}, "voxel_mm is missing"),

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
-from simulators.samples.builders.packed.arrangement import _near, arrange, bodies_of
+from simulators.samples.builders.packed.arrangement import arrange, bodies_of
 from simulators.samples.builders.packed.cathode import Habit, grain
 from tests.simulators.bodies import volume
 
@@ -105,17 +105,6 @@ def test_a_gap_is_kept(rng: np.random.Generator) -> None:
     placed = _placed(boxes, arrange(rng, bodies_of(boxes), 0.06, 0.1, gap=0.002))
     gaps = [to_hull((corners(a)[:, None] - corners(b)).reshape(-1, 3)) for a, b in combinations(placed, 2)]
     assert min(gaps) >= 0.002 * (1 - 1e-5)  # the heavy row is not infinitely heavy
-
-
-@pytest.mark.parametrize("reach", [1e-3, 0.02, 0.3])
-def test_neighbours_are_those_that_looking_at_every_pair_finds(rng: np.random.Generator, reach: float) -> None:
-    """However few and far between: small bodies in a large room had a cell each, and 1 GB of empty ones."""
-    centres, reaches = rng.uniform(-1, 1, (200, 3)) * (1.0, 1.0, 3.0), rng.uniform(0.5, 1.0, 200) * reach
-    near = np.linalg.norm(centres[:, None] - centres, axis=2) < reaches[:, None] + reaches + 0.1 * reach
-    expected = {(i, j) for i, j in np.argwhere(near).tolist() if i < j}
-    found = [tuple(pair) for pair in _near(centres, reaches, 0.1 * reach).tolist()]
-    assert len(found) == len(expected)
-    assert set(found) == expected
 
 
 def test_balls_fill_half_of_a_cylinder(rng: np.random.Generator) -> None:

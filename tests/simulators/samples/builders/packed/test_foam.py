@@ -99,17 +99,7 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
     ("changed", "message"),
     [
         ({"diameter": 0}, "diameter must be greater than"),
-        ({"edges": [1, 1, 0]}, r"edges\[2\] must be greater than"),
         ({"smallest_um": 100}, "from largest_um down"),
-        ({"gap_um": -1}, "gap_um must be greater than"),
-        ({"candidates": 0}, "candidates must be greater than or equal to 1"),
-        ({"n_holes": -1}, "n_holes must be greater than or equal to 0"),
-        ({"diameter": 1e-308}, "diameter must be greater than .*, got 1e-308"),
-        ({"edges": [1e308, 1, 1]}, r"edges\[0\] must be less than"),
-        ({"smallest_um": 1e-308}, "smallest_um must be greater than"),
-        ({"gap_um": 1e308}, "gap_um must be less than or equal to 1000000000000"),
-        ({"n_holes": 10**30}, "n_holes must be less than or equal to 200000"),
-        ({"candidates": 10**30}, "candidates must be less than or equal to 10000000"),
         ({"attenuation": {"foam": 1.0}}, "part of this phantom 'foam' is unknown"),
     ],
 )

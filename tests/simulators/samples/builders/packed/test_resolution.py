@@ -11,7 +11,6 @@ import pytest
 
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
-from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.builders.packed.resolution import Resolution
 from simulators.samples.composed import build_sample
@@ -84,15 +83,6 @@ def test_volumes_of_all_parts_are_those_of_their_solids() -> None:
     assert radii == pytest.approx([0.02, 0.01, 0.005])
 
 
-def test_the_mass_is_that_of_the_carrier_and_what_displaces_it() -> None:
-    sample = _sample(attenuation={"carrier": 1.0, "bar": 5.0, "star": 4.0, "ball": 3.0})
-    pieces = Resolution(**SETTINGS).pieces()
-    extra = {"carrier": 1.0, "bar": 4.0, "star": 3.0, "ball": 2.0}
-    mass = sum(extra[piece.role] * volume(piece.solid) for piece in pieces)
-    seen = sample.line_integrals(0.3, Detector.centred((320, 330), 1e-3)).sum() * 1e-6
-    assert seen == pytest.approx(mass, rel=0.005)
-
-
 def test_a_pattern_may_have_one_kind_only() -> None:
     assert _sample(widths_um=[], star_um=0).names == ("carrier", "ball")
     assert _sample(balls_um=[], star_um=0).names == ("carrier", "bar")
@@ -103,15 +93,8 @@ def test_a_pattern_may_have_one_kind_only() -> None:
     ("changed", "message"),
     [
         ({"widths_um": [10, 0]}, r"widths_um\[1\] must be greater than"),
-        ({"balls_um": [-1.0]}, r"balls_um\[0\] must be greater than"),
-        ({"bars": 1}, "bars must be greater than or equal to 2"),
-        ({"spokes": 2}, "spokes must be greater than or equal to 3"),
         ({"widths_um": [], "balls_um": [], "star_um": 0}, "needs widths_um"),
-        ({"bars": 10**30}, "bars must be less than or equal to 100"),
-        ({"spokes": 10**30}, "spokes must be less than or equal to 1000"),
         ({"balls_um": [1.0] * 101}, "100 widths and balls at most, got 2 and 101"),
-        ({"star_um": 1e308}, "star_um must be less than"),
-        ({"widths_um": [1e-300]}, r"widths_um\[0\] must be greater than"),
         ({"made_of": {"wedge": "Al"}}, "part of this phantom 'wedge' is unknown"),
     ],
 )
