@@ -1,6 +1,5 @@
 """`beamline recon` refuses: one sentence, an exit code, and nothing left behind."""
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from recon.methods import taking, with_trait
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import BEAM, DARK, write_exchange
 
@@ -150,22 +148,6 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
-MODELS = ", ".join(taking("steps"))
-OTHER_TAKERS = {
-    "--device": ", ".join(("auto", *with_trait("device"))), "--budget": "auto, r2, fista-tv, os-sirt-tv",
-    "--steps": MODELS,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("option", ["--steps 5", "--device cuda", "--resume scan.h5", "--budget 30s"])
-def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str) -> None:
-    result = beamline("recon", "scan.h5", "-m", "sirt", *option.split())
-    assert result.exit_code == 2 and result.stdout == ""
-    takers = OTHER_TAKERS.get(option.split()[0], ", ".join(with_trait("checkpoints")))
-    assert f"{option.split()[0]} is of {takers}; it does not go with --method sirt." in result.stderr
-    assert left(folder) == {"scan.h5"}
-
-
 @pytest.mark.parametrize("name", ["missing.h5", "text.h5", "empty.h5", "half.h5", "folder"])
 def test_files_that_cannot_be_read(folder: Path, name: str) -> None:
     (folder / "text.h5").write_text("no scan")
@@ -178,21 +160,6 @@ def test_files_that_cannot_be_read(folder: Path, name: str) -> None:
     assert name in result.stderr
     assert result.stderr.startswith("beamline: ")
     assert left(folder) == before
-
-
-def test_a_failure_is_the_last_json_event(folder: Path) -> None:
-    result = beamline("recon", "missing.h5", "--json")
-    assert result.exit_code == 5
-    last = json.loads(result.stdout.splitlines()[-1])
-    assert (last["event"], last["exit_code"]) == ("failed", 5)
-    assert "missing.h5" in last["message"]
-
-
-def test_results_are_never_overwritten(folder: Path) -> None:
-    (folder / "scan_fbp.h5").write_text("precious")
-    result = beamline("recon", "scan.h5", "-m", "fbp")
-    assert result.exit_code == 5
-    assert (folder / "scan_fbp.h5").read_text() == "precious"
 
 
 def test_as_a_process(folder: Path) -> None:
@@ -208,13 +175,6 @@ def test_as_a_process(folder: Path) -> None:
     assert left(folder) == {"scan.h5"}
 
 
-@pytest.mark.parametrize("options", [["-m", "fbp"], ["--follow"]])
-def test_budgets_are_of_finished_scans_and_the_fit(folder: Path, options: list[str]) -> None:
-    result = beamline("recon", "scan.h5", "--budget", "1m", *options)
-    assert result.exit_code == 2
-    assert "--budget" in result.stderr and left(folder) == {"scan.h5"}
-
-
 @pytest.mark.parametrize("options", [[], ["--dry-run"]])
 def test_a_source_within_the_field_is_refused_by_a_dry_run_too(folder: Path, options: list[str]) -> None:
     write_exchange(folder / "scan.h5", SCAN)
@@ -224,12 +184,3 @@ def test_a_source_within_the_field_is_refused_by_a_dry_run_too(folder: Path, opt
     assert result.exit_code == 5, result.output
     assert "cannot be reconstructed by sirt: the box reaches" in " ".join(result.stderr.split())
     assert left(folder) == {"scan.h5", "whole.txt"}
-
-
-def test_a_long_name_of_a_scan_gives_a_shorter_one_and_one_that_is_asked_for_is_refused_first(folder: Path) -> None:
-    Path("scan.h5").rename(f"{'x' * 240}.h5")
-    asked = beamline("recon", f"{'x' * 240}.h5", "-m", "fbp", "-o", f"{'y' * 240}.h5")
-    assert asked.exit_code == 5 and "too long: it has 243 bytes, and 211 are possible" in asked.output
-    assert left(folder) == {f"{'x' * 240}.h5"}
-    assert beamline("recon", f"{'x' * 240}.h5", "-m", "fbp", "--axis", "19.5").exit_code == 0
-    assert left(folder) == {f"{'x' * 240}.h5", f"{'x' * 120}_fbp.h5", f"{'x' * 120}_fbp.html"}

@@ -1,10 +1,8 @@
 """Section monitor: every limit of every check is a key with a type, a range and a default, and nothing else is."""
 
-from dataclasses import fields
-
 import pytest
 
-from beamline.config.load import config_folder, load, schema
+from beamline.config.load import config_folder, load
 from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
 from beamline.monitor.beam import BeamCheck
@@ -52,12 +50,3 @@ def test_a_limit_that_cannot_be_is_refused_with_the_legal_ones(word: str, messag
 def test_each_check_has_a_policy_and_by_default_its_own() -> None:
     read = policies(load(config_folder() / "demo.yaml", ["monitor.policy.beam=pause"], {}).monitor)
     assert read == {check.name: check.policy for check in CHECKS} | {"beam": Policy.PAUSE}
-
-
-def test_the_schema_describes_every_limit() -> None:
-    definitions = schema()["$defs"]
-    for check in CHECKS:
-        for limit in fields(check):
-            entry = definitions[f"{type(check).__name__}Limits"]["properties"][limit.name]
-            assert entry["default"] == limit.default
-            assert entry["description"] and "minimum" in entry

@@ -115,18 +115,6 @@ def test_a_simulated_configuration_stays_as_it_is() -> None:
     assert load(path, environment={}, rehearse=True) == load(path, environment={})
 
 
-def test_what_simulation_is_asked_for_goes_before() -> None:
-    found = _rehearsed("simulation.clock=real", "simulation.seed=7")
-    assert found.simulation is not None
-    assert (found.simulation.clock, found.simulation.seed) == ("real", 7)
-    assert isinstance(found.simulation.scene, dict)
-
-
-def test_a_fault_of_the_real_configuration_is_told_first() -> None:
-    with pytest.raises(ConfigError, match=r"devices\.camera\.ring_mb is 0"):
-        _rehearsed("devices.camera.ring_mb=0")
-
-
 def _edited(path: Path, **changes: Any) -> Path:
     """instrument.yaml with text replaced, line by line."""
     text = INSTRUMENT.read_text("utf-8")

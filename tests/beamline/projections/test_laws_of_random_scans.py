@@ -9,7 +9,6 @@ from beamline.projections.selection import Selection
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
 from tests.recon.prep.balls import Balls
-from tests.slow_cases import others_slow
 
 LAWS = "mass", "centre of mass", "higher or lower", "turn", "as the flats", "noise of the views", "scaled by itself"
 
@@ -56,11 +55,3 @@ def test_scans_at_rest_break_no_law(first: int) -> None:
 def test_a_mass_that_changes_is_told(factor_of: object) -> None:
     (sentence,) = told(random_scan(1, factor_of=factor_of))
     assert sentence.startswith("The mass of the views changes by ")
-
-
-@pytest.mark.parametrize("by_deg", others_slow([20.0, 40.0]))
-def test_views_that_are_late_from_the_middle_on_are_told(by_deg: float) -> None:
-    def late(angles: np.ndarray) -> np.ndarray:
-        return angles + np.radians(by_deg) * (angles > angles[-1] / 2)
-
-    assert any("angles" in each for each in told(random_scan(1, angles_of=late)))

@@ -43,7 +43,6 @@ from tests.beamline.reconstruct.growing_scan import (
     SCAN,
     ScanClock,
     StandingClock,
-    alarms,
     close,
     options,
     schedule,
@@ -151,15 +150,6 @@ def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: P
     assert read_reconstruction(tmp_path / "recon.h5").parameters["n_views"] == 30
 
 
-def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(12))
-    selection = Selection("every:2", axis_col=SCAN.axis_col)
-    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), [].append, clock)
-    n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
-    assert n_views in (14, 15)  # of 30, one of them or of the others with an alarm
-
-
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
@@ -236,16 +226,6 @@ def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert asked[0][0] >= 24 and asked[-1][0] == enough["n_views"]
 
 
-@pytest.mark.slow
-def test_where_the_plan_is_not_known_no_views_are_enough(tmp_path: Path) -> None:
-    clock, events = ScanClock(), list[Event]()
-    scan = replace(INTERLACED, angles=np.radians(np.arange(0, 180, 3.0))[np.argsort(np.arange(60) * 0.618 % 1)])
-    schedule(clock, tmp_path / "scan.h5", frames_of(scan))
-    reconstruct_file(options(tmp_path, enough=Goal(psnr_loss=9.0)), events.append, clock)
-    assert sum("planned views" in str(e.data.get("message")) for e in events) == 1
-    assert "enough" not in [event.event for event in events]
-
-
 FRAMES = frames_of(INTERLACED)
 SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
 
@@ -312,16 +292,6 @@ def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch:
     assert h5py.is_hdf5(tmp_path / "recon.h5")
 
 
-@pytest.mark.slow
-def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(replace(INTERLACED, shape=(4, 40))))
-    selection = Selection(rows=(1, 3), binning=2, axis_col=SCAN.axis_col)
-    reconstruct_file(options(tmp_path, selection=selection), lambda event: None, clock)
-    grid = read_reconstruction(tmp_path / "recon.h5").volume.grid
-    assert grid.shape == (1, 20, 20) and grid.voxel_size == pytest.approx(1.0)
-
-
 def _follower(folder: Path, clock: ScanClock, frames: list[Frame]) -> tuple[ScanFollower, list[Event]]:
     """Of a file that takes a frame a second, without an axis."""
     events: list[Event] = []
@@ -369,12 +339,3 @@ def test_a_method_that_needs_all_views_waits_for_the_end(tmp_path: Path) -> None
     record = reconstruct_file(wanted, events.append, clock)
     assert record.method == "fbp" and record.parameters["n_views"] == SCAN.angles.size
     assert [e.data["state"] for e in events if e.event == "state"][:2] == ["waiting", "waiting"]  # for it, for its end
-
-
-def test_a_method_that_needs_all_views_tells_of_a_scan_that_died(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), status=None)
-    with pytest.raises(DataError, match=r"is not finished; it has 34 frames"):
-        reconstruct_file(options(tmp_path, method=Fbp()), lambda event: None, clock)
-    assert not (tmp_path / "recon.h5").exists()
-    close(clock)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
-from beamline.config.monitor import reference_limits
-from beamline.core.errors import ConfigError, ReferencesError
+from beamline.core.errors import ReferencesError
 from beamline.core.events import Event
 from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
@@ -94,20 +93,6 @@ def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> Non
     assert ("error", "bad-references") in found
     with open_scan(folder / "scan.h5") as source:
         assert not (source.image_key == FrameKind.PROJECTION).any()
-
-
-def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
-    path = config_folder() / "demo.yaml"
-    assert reference_limits(load(path, (), {}).references) == ReferenceLimits()
-    assert reference_limits(load(path, ["references.light_in_darks=0.5"], {}).references) == ReferenceLimits(
-        light_in_darks=0.5
-    )
-    for word, message in (
-        ("references.light_in_darks=2", r"references\.light_in_darks is 2; expected a number > 0 and < 1"),
-        ("references.on_fault=go", r"references\.on_fault is 'go'.*expected stop \| log"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            load(path, [word], {})
 
 
 def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:

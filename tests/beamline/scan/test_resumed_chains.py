@@ -263,16 +263,6 @@ def test_every_command_refuses_a_joined_file_that_lacks_a_part(stale: Path, tmp_
     assert _beamline("recover", stale.parent)[1].count("in order") == 4
 
 
-@pytest.mark.slow
-def test_processes_of_their_own_refuse_it_too(stale: Path, tmp_path: Path) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("method: fbp\n")
-    code, said = _beamline("tradeoff", stale, "-o", tmp_path / "tradeoff")
-    assert (code, "part-3" in said) == (5, True)
-    code, said = _beamline("batch", stale, "--config", recipe, "-o", tmp_path / "batch")
-    assert code != 0 and "part-3" in (tmp_path / "batch" / "batch.csv").read_text() + said
-
-
 def _fewer_frames(run: Path) -> None:
     with h5py.File(run / "part-2" / "scan.h5", "r+") as file:
         file[layout.COMMITTED][()] -= 1

@@ -120,13 +120,6 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
         assert flags.alarmed[left].all()
 
 
-def test_a_stop_before_the_last_view_takes_nothing_again(tmp_path: Path) -> None:
-    stop = StopRequest()
-    instrument = FakeInstrument(Faults(repeats={8}), at={12: stop.stop})
-    ran = Ran(tmp_path, instrument, *WORDS, stop=stop)
-    assert type(ran.error) is ScanStopped and retakes(ran) == 0
-
-
 def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)

@@ -15,7 +15,6 @@ from beamline.features.files.validate import describe
 from beamline.storage.structure import dtype_of, require_held, shape_of
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume, write_volume
-from beamline.storage.volumes.images import tiff
 from tests.beamline.storage.volumes.test_files import RECORD
 
 NUMBERS: tuple[Any, ...] = (
@@ -83,29 +82,6 @@ def test_ome_zarr(tmp_path: Path, where: str) -> None:
         _refused(tmp_path / "v.ome.zarr")
 
 
-FACTS = ("voxel_size", "slice_pitch", "centre_zyx", "date", "parameters", "metrics", "length_unit", "title")
-
-
-@pytest.mark.parametrize("where", [*FACTS, "centre_zyx/0", "metrics/psnr_db"])
-def test_facts_of_another_type_are_refused_or_words(tmp_path: Path, where: str) -> None:
-    write_volume(tmp_path / "v.nrrd", RECORD)
-    content = (tmp_path / "v.nrrd").read_bytes()
-    head, _, voxels = content.partition(b"\n\n")
-    before, _, text = head.partition(b"splatline:=")
-    for n in (*NUMBERS, "\x1b[2J"):
-        said = json.loads(text.replace(b"\\\\", b"\\"))
-        said["metrics"] = {"psnr_db": 1.0}
-        group, key = _place(said, where)
-        group[key] = n
-        changed = json.dumps(said).replace("\\", "\\\\").encode()
-        (tmp_path / "v.nrrd").write_bytes(before + b"splatline:=" + changed + b"\n\n" + voxels)
-        for work in (_read_all, describe):
-            try:
-                work(tmp_path / "v.nrrd")
-            except DataError as error:
-                assert "v.nrrd" in str(error)
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
@@ -131,16 +107,3 @@ def test_npy(tmp_path: Path, shape: str) -> None:
     content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(64)
     (tmp_path / "v.npy").write_bytes(content if len(header) < 2**16 else b"")
     _refused(tmp_path / "v.npy")
-
-
-@pytest.mark.parametrize("suffix", [".tif", ""])
-@pytest.mark.parametrize("n", NUMBERS, ids=range(len(NUMBERS)))
-def test_tiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, n: Any) -> None:
-    path, key = tmp_path / f"v{suffix}", "shape" if suffix else "slices"
-    write_volume(path, RECORD)
-    facts = tiff.facts_of_imagej(path if suffix else path / "slice_00000.tif")
-    assert facts is not None
-    for said in (n, [n, 4, 5], [3, 4, n]):
-        monkeypatch.setattr(tiff, "facts_of_imagej", lambda path, said=said: {**facts, key: said})
-        with pytest.raises(DataError):
-            _read_all(path)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import Config, config_folder, load
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.stop import StopRequest
 from beamline.features.demo.command import run_demo
@@ -95,18 +95,6 @@ def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
         run_demo(_small("scan.angles.views=4", "scan.period_s=2"), here / "runs", [], StopRequest(), "beamline demo")
     (folder,) = (here / "runs").iterdir()
     assert (folder / "scan.h5").is_file()
-
-
-def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from beamline.instrument.connect import connect
-
-    def without_truth(config: Config) -> object:
-        return replace(connect(config), simulated=None)
-
-    monkeypatch.setattr("beamline.instrument.connect.connect", without_truth)
-    with pytest.raises(ConfigError, match="simulated devices"):
-        run_demo(_small(), here / "runs", [], StopRequest(), "beamline demo")
-    assert list(here.iterdir()) == []
 
 
 def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,16 +43,6 @@ def folder(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    "command", ["segment loop.h5", "export scan.h5 -o loop.h5", "simulate plain --frames 2 --out loop.h5"]
-)
-def test_a_link_that_leads_to_itself_is_a_file_that_is_not_there(folder: Path, command: str) -> None:
-    (folder / "loop.h5").symlink_to("loop.h5")
-    result = beamline(*command.split())
-    assert result.exit_code in (2, 5) and "loop.h5" in result.stderr, result.output
-    assert (folder / "loop.h5").is_symlink()
-
-
 def test_info_for_people(folder: Path) -> None:
     result = beamline("info", "scan.h5")
     assert result.exit_code == 0, result.output
@@ -66,28 +56,12 @@ def test_info_for_people(folder: Path) -> None:
     assert said["sample"] == "two cylinders"
 
 
-def test_info_takes_a_line_for_each_fact_of_a_volume(folder: Path) -> None:
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
-    lines = beamline("info", "v.h5").stdout.splitlines()
-    assert [line.split(maxsplit=1)[1] for line in lines if line.startswith("recipe ")] == ["method: fbp; axis: 19.5"]
-
-
 def test_info_for_machines(folder: Path) -> None:
     result = beamline("info", "exchange.h5", "--json")
     (line,) = result.stdout.splitlines()
     said = json.loads(line)
     assert (said["event"], said["quantity"], said["pixel_size_mm"]) == ("done", "counts", 0.5)
     assert said["kinds"] == {"projection": 18, "flat": 2, "dark": 2}
-
-
-def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
-    with h5py.File("exchange.h5", "r+") as file:
-        file.attrs["quantity"] = "NOT what we call it"
-    lines = beamline("info", "exchange.h5").stdout.splitlines()
-    assert [" ".join(line.split()) for line in lines if line.startswith("quantity")] == [
-        "quantity counts",
-        "quantity (of the file) NOT what we call it",
-    ]
 
 
 def test_info_takes_what_the_caller_says(folder: Path) -> None:
@@ -111,17 +85,6 @@ def test_info_tells_of_fringes(folder: Path, square: float) -> None:
     assert ("phase fringes" in beamline("info", "can.h5").stdout) == bool(square)
 
 
-def test_info_tells_of_the_fringes_of_a_tooth(shared_data: Path) -> None:
-    """Of which recon tells, too: both look at as many views. A third of these are not certain of them."""
-    assert "phase fringes" in beamline("info", str(shared_data / "aps2bm_tooth_181x2x640.h5")).stdout
-
-
-def test_validate_passes_what_we_write(folder: Path) -> None:
-    result = beamline("validate", "scan.h5")
-    assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines() == ["scan.h5: 0 errors, 0 warnings"]
-
-
 def test_validate_names_each_fault(folder: Path) -> None:
     with h5py.File("scan.h5", "r+") as file:
         file["entry/sample/rotation_angle"][7] = np.nan
@@ -134,14 +97,6 @@ def test_validate_names_each_fault(folder: Path) -> None:
     assert [event["event"] for event in events][-1] == "done"
     assert events[-1]["error"] == 1
     assert events[0]["rule"] == "angles"
-
-
-def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
-    for name in ("diad_k11-18014.nxs", "esrf_bm05_nxtomo_20x16x16.nx"):
-        result = beamline("info", str(shared_data / "fixtures" / name))
-        assert result.exit_code == 0, result.output
-        assert "reconstructable" in result.stdout
-    assert "there is no beam in them" in result.stdout
 
 
 def _stack(folder: Path) -> Path:
@@ -164,13 +119,6 @@ def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
         assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
         np.testing.assert_allclose(source.angles, SCAN.angles)
         np.testing.assert_array_equal(source.read([0, 17]), SCAN.line_integrals().astype(np.float32)[[0, 17]])
-
-
-def test_ingest_for_machines(folder: Path) -> None:
-    _stack(folder)
-    result = beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
-    said = json.loads(result.stdout.splitlines()[-1])
-    assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
 
 
 def test_ingest_says_how_far_it_is(folder: Path) -> None:
@@ -249,16 +197,6 @@ def test_messages_speak_of_options_as_they_are_typed(
     assert "Errno" not in result.output
 
 
-@pytest.mark.parametrize("command", ["info", "validate"])
-def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
-    _bare(folder)
-    said = beamline(command, "stack.tif").stdout
-    assert "say --quantity counts, --quantity transmission or --quantity line-integrals." in said
-    said = beamline(command, "stack.tif", "--quantity", "counts").stdout
-    assert "Counts without flats: give --flats FILE (or a folder). If the frames were divided" in said
-    assert "Counts without darks: give --darks FILE (or a folder). If the frames were divided" in said
-
-
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     good = beamline("validate", "scan.h5", "--deep")
     assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
@@ -288,19 +226,6 @@ def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command:
     result = beamline(command, "scan.h5")
     assert result.exit_code == 5, result.output
     assert len(parts) > 1 and "damaged" in result.output
-
-
-@pytest.mark.parametrize("entry", ["entry", "entry0000"])  # where volumes are, and other scans
-def test_a_group_that_cannot_be_listed_is_called_damaged(tmp_path: Path, entry: str) -> None:
-    path = tmp_path / f"{'x' * 250}.h5"  # longer than a name beside it can be
-    with h5py.File(path, "w") as file:
-        file[f"{entry}/definition"] = "NXtomo"
-        file[f"{entry}/instrument/detector/data"] = np.ones((3, 4, 5), np.uint16)
-    *above, instrument, detector = path.read_bytes().split(b"SNOD")  # where HDF5 keeps the names in a group
-    path.write_bytes(b"SNOD".join([*above[:-1], above[-1] + b"?NOD" + instrument, detector]))
-    for command in ("info", "validate"):
-        result = beamline(command, path)
-        assert result.exit_code == 5 and "damaged" in result.output, result.output
 
 
 def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:

@@ -76,17 +76,6 @@ def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
         assert browser.complaints() == []
 
 
-def test_what_a_name_holds_is_text(browser: Browser, tmp_path: Path) -> None:
-    evil = "<img src=x onerror=window.evil=1>"
-    events = f'{{"event": "warning", "time": 1.0, "message": "{evil}"}}\n'
-    (tmp_path / "events.jsonl").write_text(events, encoding="utf-8")
-    write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
-    with served(tmp_path) as page:
-        browser.open(page.addresses.look)
-        browser.until(lambda: evil in browser.text("log"), "the warning is in the log")
-        assert browser.script("return window.evil === undefined && document.querySelector('#log img') === null")
-
-
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
     with page_of([*BEAMLINE, "watch", str(tmp_path / "scan.h5")], r"^watch +(\S+)") as (_, address):

@@ -25,8 +25,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.closable import Closable
 from tests.beamline.scans import seal
-from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, append
-from tests.clock import SteppedClock
+from tests.beamline.storage.conftest import EPOCH, SHAPE, append
 
 Write = Callable[[list[Frame]], Path]
 DETECTOR = "entry/instrument/detector"
@@ -138,11 +137,6 @@ def shorter(name: str, n: int) -> Spoil:
     return lambda file: swap(file, name, file[name][:-n])
 
 
-def copied_link(file: h5py.File) -> None:
-    del file["entry/data/data"]
-    file["entry/data/data"] = file[FRAMES][()]
-
-
 def repainted(rows: Iterable[int], pixels: Callable[[h5py.Dataset, int], np.ndarray]) -> Spoil:
     """A file with other pixels in these rows, as if they had been written."""
 
@@ -232,16 +226,6 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
     assert validate(write(lost, "lost.h5")) == []  # type: ignore[call-arg]
     back = [replace(frame, trigger=0, framestamp=0) if frame.index == 12 else frame for frame in frames]
     assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
-
-
-def test_degrees_that_are_radians(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
-    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        append(writer, *frames[:5])
-        for i in range(40):
-            angle = np.radians(i * np.pi / 39)
-            frame = replace(frames[5], index=5 + i, framestamp=i, angle=angle, counts=frames[5].counts + np.uint16(i))
-            append(writer, frame)
-    assert "radians" in angles_told(SourceOptions(tmp_path / "s.h5"))[0].message
 
 
 @pytest.mark.parametrize(
@@ -392,13 +376,6 @@ def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None
         for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
             step = (180 - lost) / (views - 1)
             assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
-
-
-def test_angles_at_random_are_rarely_a_limited_angle() -> None:
-    rng = np.random.default_rng(5)
-    for views in (30, 60, 200):
-        alarms = sum(half_turn_unseen(rng.uniform(0, np.pi, views)) > 0 for _ in range(400))
-        assert alarms <= 4  # a thousandth is asked: more than 4 of 400 have a chance of 1 in 16 000
 
 
 def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:
