@@ -171,21 +171,6 @@ def test_events_and_sentences_are_those_of_the_command(
     assert out == "" and f"Scan complete: {FRAMES} frames" in err
 
 
-def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
-    values = {
-        **SMALL,
-        "scan.angles": {"scheme": "fixed", "views": 45, "span_deg": 45, "start_deg": 10},
-        "simulation.clock": "virtual",
-        "storage.folder": tmp_path,
-        "devices.camera.roi": [1144, 2024, 16, 48],
-    }
-    with api.connect(SIMULATED, set=values, say=None) as instrument:
-        results = [instrument.scan(sample=f"cell-{n}") for n in (1, 2)]
-    assert [result.frames for result in results] == [50, 50]
-    first, second = (list(api.stream(result.path)) for result in results)
-    assert second[0].time > first[-1].time
-
-
 def test_importing_the_package_loads_nothing_heavy() -> None:
     heavy = {"torch", "numba", "matplotlib", "h5py", "pydantic", "click", "scipy"}
     code = f"import sys, beamline.api; print(sorted({heavy} & set(sys.modules)))"
@@ -194,19 +179,3 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, beamline.api as api; api.connect; api.stream; print('torch' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "False"
-
-
-def test_an_energy_moves_the_monochromator_that_there_is(tmp_path: Path) -> None:
-    values = {
-        **SMALL,
-        "devices.monochromator": {"kind": "simulated"},
-        "simulation.clock": "virtual",
-        "storage.folder": tmp_path,
-        "scan.angles.views": 4,
-        "scan.mode": "step",
-    }
-    with api.connect(SIMULATED, say=None, set=values) as instrument:
-        result = instrument.scan(energy_kev=8.34, live=False)
-        with open_scan(result.path) as source:
-            assert source.energy_kev == 8.34
-        assert result.folder.name.endswith("_battery_8.34keV")

@@ -133,28 +133,6 @@ def test_a_pause_of_the_plan_pauses_the_scan_and_no_view_is_lost(engine: Any, tm
         np.testing.assert_array_equal(heard.read("tomo-kind"), kinds)
 
 
-def test_a_plan_that_is_aborted_in_a_pause_ends_the_scan_in_order(engine: Any, tmp_path: Path) -> None:
-    from bluesky.utils import RunEngineInterrupted
-
-    from beamline.bluesky.devices import fly, tomography
-
-    settings = _small("simulation.clock=real", "scan.period_s=0.1", "scan.angles={scheme: fixed, views: 900}", FLUSH)
-    with tomography(settings, tmp_path) as (scan, _):
-        asked: list[threading.Thread] = []
-
-        def pause(name: str, document: dict[str, Any]) -> None:
-            if name == "stream_datum" and not asked:
-                asked.append(threading.Thread(target=engine.request_pause))
-                asked[0].start()
-
-        engine.subscribe(pause)
-        with pytest.raises(RunEngineInterrupted):
-            engine(fly(scan, flush=0.1))
-        engine.abort()
-        with h5py.File(next(tmp_path.iterdir()) / "scan.h5") as file:
-            assert file["entry/progress/status"].asstr()[()] == "stopped"
-
-
 def test_lost_frames_fail_the_plan_and_are_named(engine: Any, tmp_path: Path) -> None:
     from beamline.bluesky.devices import TomoScan, fly
 

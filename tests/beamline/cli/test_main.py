@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import click
-import h5py
 import pytest
 from click.shell_completion import get_completion_class
 from click.testing import CliRunner
@@ -102,26 +101,6 @@ def test_a_number_of_threads_that_cannot_be_is_usage(monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
     done = CliRunner().invoke(module.main, ["info", "x.h5"])
     assert done.exit_code == 2 and f"NUMBA_NUM_THREADS={threads} in the environment" in done.stderr
-
-
-def test_a_file_that_hdf5_cannot_close_does_not_cost_the_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After a full disk such a file stays open, and HDF5 would crash at the end of the process."""
-    ended: list[int] = []
-
-    def failing(**_: object) -> None:
-        raise SystemExit(5)
-
-    monkeypatch.setattr(module, "main", failing)
-    monkeypatch.setattr(module.os, "_exit", ended.append)
-    with h5py.File(tmp_path / "open.h5", "w"), pytest.raises(SystemExit):
-        module.run()
-    assert ended == [5]
-    monkeypatch.setattr(module, "main", lambda **_: None)
-    with h5py.File(tmp_path / "other.h5", "w"), pytest.raises(SystemExit) as done:
-        module.run()
-    assert (done.value.code, ended) == (0, [5])
 
 
 def test_every_command_has_its_line_in_the_page_on_commands() -> None:

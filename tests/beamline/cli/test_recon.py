@@ -2,18 +2,15 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beamline.monitor.check import Level
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.assess.metrics import psnr
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
-from tests.beamline.scans import frames_of, write_exchange, write_flagged
+from tests.beamline.scans import write_exchange
 from tests.recon.prep.ring_score import ring_score
 from tests.slow_cases import others_slow
 
@@ -130,25 +127,6 @@ def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> N
     assert "of 1 s; " in lines["chosen"]
     parameters = read_reconstruction(folder / "scan_auto.h5").parameters
     assert parameters["budget"] == 1 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
-
-
-def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None:
-    """A third of the views nearly black and flagged: the volume is as good as from the others, and lost with all."""
-    levels = {4 + i: Level.ALARM for i in range(8, 18)}
-    frames = [replace(f, counts=101 + f.counts // 25) if f.index in levels else f for f in frames_of(SCAN)]
-    write_flagged(folder / "flagged.h5", frames, levels, SCAN.pixel_size_mm)
-    plain = ("-m", "sirt", "--iterations", "20", "--axis", "20.7", "--air", "none")
-    for name in ("use", "ignore"):
-        result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")  # with the report
-        assert result.exit_code == 0, result.output
-        assert ("10 have an alarm and are left out" in result.stderr) is (name == "use")
-    page = (folder / "use.html").read_text(encoding="utf-8")
-    assert "Alarm (beam): frames 12-21, worst 1 fraction of the reference light in frame 12: the light" in page
-    assert ">Flagged frames</summary>" in page
-    used, ignored = (read_reconstruction(folder / f"{name}.h5") for name in ("use", "ignore"))
-    truth = SCAN.truth(used.volume.grid)
-    assert psnr(truth, used.volume.data) > psnr(truth, ignored.volume.data) + 10
-    assert (used.parameters["flags"], used.parameters["views_left_out"], used.parameters["n_views"]) == ("use", 10, 20)
 
 
 def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) -> None:

@@ -1,6 +1,5 @@
 """`beamline recon` ended from outside: it delivers what it has, or leaves nothing; a checkpoint goes on."""
 
-import json
 import signal
 import sys
 from collections.abc import Callable
@@ -38,21 +37,6 @@ def _signal_at_step(monkeypatch: pytest.MonkeyPatch, number: signal.Signals, at:
 
     monkeypatch.setattr(fit, "step", watched)
     return taken
-
-
-def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of writing: nothing half-written stays, and the last event says why."""
-
-    def interrupted(*_: object) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr("beamline.storage.writers.recon_file.write_entry", interrupted)
-    before = signal.getsignal(signal.SIGTERM)
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--json")
-    assert result.exit_code == 130
-    assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 130
-    assert left(folder) == {"scan.h5"}
-    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *HANGUP])

@@ -148,21 +148,3 @@ def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path
     for path, said in ((tmp_path, "It is a folder"), (large, "at most 1048576 are read")):
         with pytest.raises(ConfigError, match=said):
             load(path)
-
-
-@pytest.mark.parametrize(
-    ("places", "said"),
-    [
-        ("[]", "devices.filter.places is []; expected a list of 1 or more: text of 1 to 80 characters"),
-        ("['']", "devices.filter.places.0 is ''; expected text of 1 to 80 characters"),
-        ("[3]", "devices.filter.places.0 is 3; expected text of 1 to 80 characters"),
-        ("[Al, Cu, Al]", "places lists Al more than once; each place needs its own name"),
-    ],
-)
-def test_a_list_of_names_says_what_it_expects(tmp_path: Path, places: str, said: str) -> None:
-    path = tmp_path / "my.yaml"
-    path.write_text(f"devices:\n  filter: {{kind: simulated, places: {places}}}\n")
-    with pytest.raises(ConfigError) as refused:
-        load(path)
-    assert said in str(refused.value)
-    assert ": None" not in str(refused.value)

@@ -6,9 +6,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
-from multiprocessing import get_context
-from multiprocessing.synchronize import Event as MpEvent
 from pathlib import Path
 
 import h5py
@@ -18,14 +15,12 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.sinks import Warnings
-from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
 from beamline.reconstruct.live_fit import FollowState, ScanFollower
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame
 from recon.assess.metrics import psnr
@@ -42,7 +37,6 @@ from tests.beamline.reconstruct.growing_scan import (
     RHYTHM,
     SCAN,
     ScanClock,
-    StandingClock,
     close,
     options,
     schedule,
@@ -173,36 +167,6 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert known[-1] < known[0] < 1  # of views that no step had seen
     assert (tmp_path / "recon.live.png").exists()  # the report links it
     assert not (tmp_path / "recon.snapshot.h5").exists()  # the volume is there
-
-
-def _write_and_wait(path: Path, frames: list[Frame], written: MpEvent, close: MpEvent) -> None:
-    writer = NXtomoWriter(path, ScanInfo(sample="two cylinders"), frames[0].counts.shape, clock=StandingClock())
-    for frame in frames:
-        writer.append(frame, digest(frame.counts), [])
-    written.set()
-    close.wait(60)
-    writer.close("complete")
-
-
-@pytest.mark.slow  # a process starts
-def test_the_report_has_the_facts_of_the_closed_file(tmp_path: Path) -> None:
-    """A writer of another process writes texts anew when it closes the file, which the follower has open."""
-    spawn = get_context("spawn")
-    written, close = spawn.Event(), spawn.Event()
-    arguments = (tmp_path / "scan.h5", frames_of(INTERLACED), written, close)
-    writer = spawn.Process(target=_write_and_wait, args=arguments)
-    writer.start()
-    assert written.wait(60)
-
-    def look(event: Event) -> None:
-        if event.event == "snapshot" and not close.is_set():
-            close.set()
-            writer.join(60)
-
-    target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
-    reconstruct_file(options(tmp_path, target=target), look, ScanClock())
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert f"end_time</th><td>{datetime.fromtimestamp(EPOCH, UTC).isoformat(timespec='milliseconds')}</td>" in page
 
 
 def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

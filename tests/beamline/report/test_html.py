@@ -154,21 +154,6 @@ def test_y_and_z_run_downwards_in_slices_and_views(monkeypatch: pytest.MonkeyPat
         assert (panel.images[0].origin, top < bottom) == ("upper", True)
 
 
-def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) -> None:
-    data = np.zeros((3, 30, 40), np.float32)
-    data[:, :, 20:] = 1
-    grid = Grid(data.shape, 0.5)
-    both = {
-        "sharp": Volume(data, grid),
-        "noise": Volume(data + rng.normal(0, 0.1, data.shape).astype(np.float32), grid),
-    }
-    assert _pixels(figures.profile_and_values(both, "mm")).ndim == 3
-    for shape in ((1, 1, 5), (2, 8, 8)):
-        assert _pixels(
-            figures.profile_and_values({"v": Volume(np.zeros(shape, np.float32), Grid(shape, 1.0))}, "px")
-        ).ndim
-
-
 def test_differences_are_from_the_first_in_one_scale_about_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
     monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")

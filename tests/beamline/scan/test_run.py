@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 import h5py
@@ -183,36 +182,6 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
         run_scan(small(), tmp_path, [events.append])
     done = [event.data for event in events if event.event == "scan_done"]
     assert [(data["status"], data["n_frames"]) for data in done] == [("complete", 19)]
-
-
-def test_two_scans_in_one_process_carry_their_own_metadata(tmp_path: Path) -> None:
-    """Name, description, start, plan, configuration, times and events of each; nothing of the other."""
-    instrument, results, told = FakeInstrument(), [], list[list[Event]]()
-    for name, views in (("anode", 12), ("cathode", 9)):
-        instrument.clock.sleep(5000.0)
-        events: list[Event] = []
-        config = small(f"sample.name={name}", f"sample.description=An {name}.", f"scan.angles.views={views}")
-        results.append(run_scan(config, tmp_path, [events.append], instrument=instrument.connected()))
-        told.append(events)
-    starts = []
-    for result, events, name, views in zip(results, told, ("anode", "cathode"), (12, 9), strict=True):
-        assert result.path.parent.name.endswith(f"_{name}")
-        with h5py.File(result.path) as file:
-            assert file["entry/sample/name"].asstr()[()] == name
-            assert file["entry/title"].asstr()[()] == f"An {name}."
-            assert len(json.loads(file["entry/record/plan"][()])["angles_deg"]) == views
-            assert f"name: {name}\n" in file["entry/record/config"].asstr()[()]
-            start = datetime.fromisoformat(file["entry/start_time"].asstr()[()]).timestamp()
-            end = datetime.fromisoformat(file["entry/end_time"].asstr()[()]).timestamp()
-            times = file["entry/frame_log/time"][()]
-            assert start <= times.min() <= times.max() <= end + 1e-3
-            starts.append((start, end))
-        assert f"name: {name}\n" in (result.path.parent / "config.resolved.yaml").read_text()
-        (begun,) = (event for event in events if event.event == "run_started")
-        assert (begun.data["sample"], begun.data["path"]) == (name, result.path)
-        lines = (result.path.parent / "events.jsonl").read_text(encoding="utf-8").splitlines()
-        assert [json.loads(line)["event"] for line in lines] == [event.event for event in events]
-    assert starts[1][0] > starts[0][1] + 4000
 
 
 def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

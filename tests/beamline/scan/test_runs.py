@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import sys
 import time
 from contextlib import ExitStack
@@ -219,20 +218,3 @@ def test_on_a_disk_without_locks_no_run_is_said_to_have_died(tmp_path: Path, mon
     assert (describe(tmp_path / "a").state, describe(tmp_path / "a").frames) == (State.ACQUIRING, 3)
     file.close()
     assert describe(tmp_path / "a").state == State.FAILED
-
-
-@pytest.mark.bench
-def test_five_hundred_runs_take_less_than_two_seconds(tmp_path: Path) -> None:
-    """A tenth of them have died."""
-    run = _run(tmp_path / "one", 9)
-    record = read_record(run)
-    assert record is not None
-    for i in range(500):
-        one = tmp_path / "runs" / f"2026-01-02T03-{i // 60:02}-{i % 60:02}_a"
-        _part(one, replace(record, state=State.ACQUIRING, over=False) if i % 10 == 0 else record)
-        os.link(run / "scan.h5", one / "scan.h5") if hasattr(os, "link") else shutil.copy(run / "scan.h5", one)
-    began_at = time.process_time()
-    found = [describe(each) for each in runs_in(tmp_path / "runs")]
-    assert time.process_time() - began_at < 2
-    assert {each.state for each in found} == {"aborted", "died"}
-    assert len({each.frames for each in found}) == 1

@@ -6,7 +6,6 @@ import errno
 import io
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -118,26 +117,6 @@ def test_a_real_folder_is_left_as_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     assert check.values["written"] == disk.LEAST
     assert [path.name for path in tmp_path.iterdir()] == ["scan.h5"]
     assert (tmp_path / "scan.h5").read_bytes() == b"precious"
-
-
-def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    def opens(folder: Path) -> IO[bytes]:
-        """A named file, so that leaving it would show."""
-        return tempfile.NamedTemporaryFile(dir=folder, buffering=0)
-
-    class Interrupted(VirtualClock):
-        def now(self) -> float:
-            assert list(tmp_path.iterdir()) != [] or self.looks == 0
-            self.looks += 1
-            if self.looks > 1:
-                raise KeyboardInterrupt
-            return super().now()
-
-        looks = 0
-
-    with pytest.raises(KeyboardInterrupt):
-        disk.measure(tmp_path, Interrupted(), opens, most=10**9)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_that_fills_up_or_refuses(synced: list[int], room: object, tmp_path: Path) -> None:

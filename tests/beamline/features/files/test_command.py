@@ -165,38 +165,6 @@ def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...],
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def _bare(folder: Path) -> None:
-    """stack.tif: five pages without angles; long.txt: nine angles for them."""
-    tifffile.imwrite(folder / "stack.tif", np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6))
-    (folder / "long.txt").write_text("0\n0\n0\n10\n20\n30\n40\n40\n40\n")
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ((), "--angles FILE (degrees, one a line)"),
-        (("--angles", "long.txt"), "--angle-rows A:B"),
-        (("--angles", "long.txt"), "--angle-rows 2:7 takes the 5 neighbours"),
-        (("--angles", "long.txt", "--angle-rows", "5"), "--angle-rows 5 is not of the form A:B"),
-        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 is out of range: the file has 9 angles"),
-        (("--angle-rows", "1:6"), "--angle-rows 1:6 needs angles to choose from: give --angles FILE."),
-        (("--angles", "none.txt"), "The angles in none.txt cannot be read (No such file or directory)."),
-        (("--flats", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
-        (("--darks", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
-    ],
-)
-@pytest.mark.parametrize("command", ["info", "validate", "ingest", "recon"])
-def test_messages_speak_of_options_as_they_are_typed(
-    folder: Path, command: str, options: tuple[str, ...], said: str
-) -> None:
-    _bare(folder)
-    result = beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
-    assert result.exit_code == (0 if command == "info" and not options else 5)
-    assert said in result.output
-    assert "angle_rows" not in result.output
-    assert "Errno" not in result.output
-
-
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     good = beamline("validate", "scan.h5", "--deep")
     assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
@@ -207,25 +175,6 @@ def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
     events = [json.loads(line) for line in beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
-
-
-def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) -> None:
-    with h5py.File("scan.h5", "r+") as file:
-        file["entry/title"][()] = "a\x1b]0;owned\x07\x1b[2J"
-    for command in ("info", "validate"):
-        output = beamline(command, "scan.h5").output
-        assert "\x1b" not in output and "\x07" not in output
-    assert "a\\x1b]0;owned" in beamline("info", "scan.h5").stdout
-
-
-@pytest.mark.parametrize("command", ["info", "validate", "monitor"])
-def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command: str) -> None:
-    data = (folder / "scan.h5").read_bytes()
-    parts = data.split(b"EAIB")  # where HDF5 keeps the places of chunks
-    (folder / "scan.h5").write_bytes(b"EAIB".join([parts[0], *(part[:8] + b"?" + part[9:] for part in parts[1:])]))
-    result = beamline(command, "scan.h5")
-    assert result.exit_code == 5, result.output
-    assert len(parts) > 1 and "damaged" in result.output
 
 
 def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:

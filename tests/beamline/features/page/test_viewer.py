@@ -14,7 +14,6 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.storage.volumes.base import Pixels, bare_record
 from beamline.storage.volumes.files import write_volume
-from recon.base.greys import grey_windows
 from tests.beamline.features.page.served import Served, viewed
 from tests.beamline.features.page.test_app import tile
 
@@ -176,34 +175,6 @@ def test_an_array_of_a_file_with_several_is_shown_by_its_name(tmp_path: Path) ->
     np.testing.assert_array_equal(volume.cut(0, 2, ALL).values, 3 * RAMP[2])
     volume.close()
     assert view_command._named(path) == (tmp_path / "two.npz", None)
-
-
-def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> None:
-    for value in (3.0, np.nan, -65535.0, 3e38):
-        np.save(tmp_path / "v.npy", np.full(SHAPE, value, np.float32))
-        volume = ShownVolume(tmp_path / "v.npy")
-        low, high = volume.facts()["window"]
-        assert low < high
-        assert sum(volume.histogram()["voxels"]) in (0, RAMP.size)
-        volume.close()
-
-
-def _sample_of(*parts: tuple[float, float], noise: float = 0.0, n: int = 40_000) -> np.ndarray:
-    """Values of which these shares have these levels, with noise."""
-    rng = np.random.default_rng(0)
-    values = np.concatenate([np.full(round(share * n), level) for share, level in parts])
-    return (values + noise * rng.standard_normal(values.size)).astype(np.float32)
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-@pytest.mark.parametrize("metal", [0.005, 0.05, 0.15])
-@pytest.mark.parametrize("times", [10.0, 30.0])
-def test_weak_matter_beside_metal_is_not_black_at_first(metal: float, times: float, noise: float) -> None:
-    values = _sample_of((0.6, 0.0), (0.4 - metal, 1.0), (metal, times), noise=noise)
-    low, high = grey_windows(values)["matter"]
-    assert (1.0 - low) / (high - low) > 0.3
-    wide = grey_windows(values)["all"]
-    assert (1.0 - wide[0]) / (wide[1] - wide[0]) < 0.13
 
 
 def test_windows_are_buttons_of_the_page(tmp_path: Path) -> None:

@@ -6,8 +6,6 @@ import json
 import math
 import re
 import signal
-import struct
-import sys
 from pathlib import Path
 
 import h5py
@@ -156,19 +154,6 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
     assert (run.kind, run.first, run.last) == ("black_band", 2, 5)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there SIGTERM cannot be caught")
-def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def asked(*arguments: object) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    before = left(folder)
-    monkeypatch.setattr("beamline.scenes.scene_file.write_truth", asked)
-    result = beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
-    assert result.exit_code == 130
-    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
-    assert left(folder) == before
-
-
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = left(folder)
     for arguments, code, words in (
@@ -181,16 +166,6 @@ def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monk
         assert re.search(words, result.stderr), result.stderr
         assert left(folder) == before
     assert beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
-
-
-@pytest.mark.usefixtures("real_pictures")
-@pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
-def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
-    wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")
-    result = beamline("simulate", "scene.yaml", *wanted)
-    assert result.exit_code == 0, result.output
-    width, height = struct.unpack(">II", Path("p.png").read_bytes()[16:24])
-    assert 100 <= height < 3 * width
 
 
 def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:

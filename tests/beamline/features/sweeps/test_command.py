@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from beamline.features.sweeps import sweep
 from beamline.features.sweeps.command import sweepable
 from beamline.features.sweeps.sweep import SweptSlice, scores_of
-from beamline.features.sweeps.values import MOST, swept_option
+from beamline.features.sweeps.values import swept_option
 from beamline.projections.prepared import PreparedProjections
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -161,15 +159,6 @@ LEGAL = ("tv-weight", "rings", "axis")
 def test_ranges_and_lists(text: str, expected: tuple[str, tuple[str, ...]]) -> None:
     option = swept_option(text, LEGAL)
     assert (option.name, option.values) == expected
-
-
-@given(st.integers(-500, 500), st.integers(1, 60), st.integers(1, MOST - 1))
-def test_a_range_has_each_step_and_both_ends_without_rounding(first: int, step: int, steps: int) -> None:
-    """In hundredths, which binary numbers do not hold."""
-    last = first + steps * step
-    values = swept_option(f"axis={first / 100}:{last / 100}:{step / 100}", LEGAL).values
-    assert [round(100 * float(value)) for value in values] == list(range(first, last + 1, step))
-    assert all(len(value) <= 8 for value in values)
 
 
 @pytest.mark.parametrize(

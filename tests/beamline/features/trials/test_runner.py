@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import runner, tradeoff
@@ -172,23 +172,6 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
     assert "failed: no room" in text(table) and "No trial has both" in text(table)
     assert "failed: no room" in (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
     assert left(tmp_path / "out") == {"tradeoff.csv", "tradeoff.html"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "said"),
-    [
-        ({"folder": Path()}, DataError, "never overwritten"),
-        ({"folder": Path("no/such/folder")}, DataError, "does not exist"),
-        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
-    ],
-)
-def test_what_cannot_be_done_leaves_nothing(
-    tmp_path: Path, changes: dict[str, Any], error: type[Exception], said: str
-) -> None:
-    with pytest.raises(error, match=said):
-        run_tradeoff(_options(tmp_path, **changes))
-    assert left(tmp_path) == {"scan.h5"}
 
 
 @pytest.mark.parametrize(

@@ -144,13 +144,6 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
         assert getattr(method, "seconds", seconds) == seconds
 
 
-def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"method 'art' is unknown; legal: r2, "):
-        plan(("fbp", "art"), 60, 1000, "quick")
-    with pytest.raises(ValueError, match=r"'steps' \(r2.* has\)"):
-        Trial("method", "sirt", 60, settings={"steps": 5}).build()
-
-
 def test_quality_is_decibels_either_way() -> None:
     outcome = Outcome(Trial("method", "fbp", 4), "done", 1.0, metrics={"psnr": 30.0, "residual_held_out": 0.1})
     assert outcome.quality("psnr") == 30

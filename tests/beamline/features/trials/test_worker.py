@@ -99,20 +99,6 @@ def test_a_volume_that_is_written_is_the_one_measured(data: TrialData, tmp_path:
     assert said["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{}, {"binning": 2, "fit.loss": "l2"}, {"fit.ssim_weight": 0.0, "fit.loss": "poisson"},
-     {"fit.truncation.sigmas": 2.5, "start": "tv"}],
-)  # fmt: skip
-def test_a_fit_with_each_setting(data: TrialData, change: dict[str, Any]) -> None:
-    binning = change.pop("binning", 1)
-    trial = Trial("method", "r2", 27, binning, {"steps": 120, "gaussians": 150, **change})
-    found = run(trial, data, 0)
-    assert found["metrics"]["psnr"] > 15
-    assert found["gaussians"] >= 100
-    json.dumps(found)
-
-
 def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
     """Spoiling them changes its residual and nothing else."""
     trial = Trial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})

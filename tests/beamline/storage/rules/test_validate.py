@@ -205,14 +205,6 @@ def test_a_frame_that_the_camera_counted_is_missed_unless_it_was_taken_again(wri
     assert validate(write([*lost, again], "again.h5")) == []  # type: ignore[call-arg]
 
 
-def test_missing_references(write: Write, frames: list[Frame]) -> None:
-    projections = [replace(frame, index=i) for i, frame in enumerate(frames[5:])]
-    hits = [finding for finding in validate(write(projections)) if finding.rule == "references"]
-    assert [finding.severity for finding in hits] == ["error", "error"]
-    assert "without flats" in hits[0].message
-    assert "without darks" in hits[1].message
-
-
 def test_one_view_is_no_scan(write: Write, frames: list[Frame]) -> None:
     assert ("error", "views") in found(write(frames[:6]))
 
@@ -310,30 +302,10 @@ def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:
     assert ("error", "quantity") in found(tmp_path / "s.h5")
 
 
-def test_what_cannot_be_opened_is_a_finding(tmp_path: Path) -> None:
-    (tmp_path / "s.h5").write_bytes(b"no HDF5")
-    assert found(tmp_path / "s.h5") == {("error", "readable")}
-    assert found(tmp_path / "nowhere.h5") == {("error", "readable")}
-    with h5py.File(tmp_path / "empty.h5", "w"):
-        pass
-    assert found(tmp_path / "empty.h5") == {("error", "readable")}
-
-
 def test_a_growing_file_can_be_validated(writer: NXtomoWriter, tmp_path: Path, frames: list[Frame]) -> None:
     append(writer, *frames)
     assert found(tmp_path / "s.h5") == {("warning", "unfinished")}
     writer.close()
-
-
-def test_describe(path: Path) -> None:
-    said = describe(path)
-    assert said["format"] == "nxtomo"
-    assert said["kinds"] == {"projection": 9, "flat": 3, "dark": 2}
-    assert (said["first_angle_deg"], said["last_angle_deg"]) == (0, pytest.approx(180))
-    assert said["step_deg"] == pytest.approx(22.5)
-    assert (said["quantity"], said["exposure_s"], said["missing_triggers"]) == ("counts", 0.05, 0)
-    assert said["findings"] == []
-    assert said["reconstructable"] is True
 
 
 def test_the_beamless_scan_is_refused(shared_data: Path) -> None:
