@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.digest import digest
 from beamline.page.shown_scan import ShownScan
 from beamline.page.tiles import TileRegion
@@ -20,10 +19,8 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
-from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.prep.align import AxisEstimate
 from recon.voxels.direct import fdk
 from tests.beamline.cli.small_scan import beamline
 
@@ -101,24 +98,6 @@ def test_an_axis_that_is_not_stated_or_wrong_is_found_by_views_held_out(
     assert len(warnings) == len(told) and all(words in warning for words, warning in zip(told, warnings, strict=True))
 
 
-def test_the_axis_of_one_row_is_found_on_pixels_as_coarse_as_that_of_all_rows(
-    scan: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked, columns, told = list[Geometry](), 12, list[str]()
-
-    def find(data: NDArray[np.float32], geometry: Geometry, *_: object) -> AxisEstimate:
-        asked.append(geometry)
-        return axis_by_views(data, geometry)
-
-    monkeypatch.setattr("beamline.projections.axis.COLS", columns)
-    monkeypatch.setattr("beamline.projections.axis.axis_by_views", find)
-    with open_scan(scan) as source:
-        for row in (14, 26):
-            prepare_projections(source, replace(PLAIN, rows=(row, row + 1)), told.append)
-    assert [each.detector_shape for each in asked] == 2 * [(1, columns)]
-    assert [each.axis_row for each in asked] == pytest.approx([1.5, -1.5])
-
-
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
     with open_scan(scan) as source:
         given = replace(PLAIN, axis_col=AXIS)  # it is not searched for
@@ -151,17 +130,6 @@ def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path, row: int)
     inside = np.hypot(x[None] - CENTRE[0], y[:, None] - CENTRE[1]) < radius
     assert tile.values[inside].mean() == pytest.approx(MU, rel=0.1)
     assert tile.values.sum() == pytest.approx(MU * inside.sum(), rel=0.1)
-
-
-def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
-    for name, info, error, words in (
-        ("axis", replace(INFO, axis_col=None), DataError, "4 views are too few .* Give it with --axis COLUMN"),
-        ("pixel", replace(INFO, pixel_size_mm=None), ConfigError, "which a cone beam needs: give --pixel-size-um"),
-    ):
-        path = tmp_path / f"{name}.h5"
-        _write(path, info, views=4)
-        with open_scan(path) as source, pytest.raises(error, match=words):
-            prepare_projections(source, PLAIN, _never)
 
 
 def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(

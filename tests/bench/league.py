@@ -31,8 +31,16 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from tests.bench import quality_cases
 from tests.bench.league_peers import LEAGUE
-from tests.bench.quality_cases import Case, cone, diamond, rows_of, seen_by_simulator, slab, strip_integrals
-from tests.bench.test_patch_prior import TEXTURED
+from tests.bench.quality_cases import (
+    TEXTURED,
+    Case,
+    cone,
+    diamond,
+    rows_of,
+    seen_by_simulator,
+    slab,
+    strip_integrals,
+)
 
 F32 = NDArray[np.float32]
 VIEWS, PHOTONS, THREADS = 50, 1e5, 2

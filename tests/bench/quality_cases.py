@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, zoom
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
@@ -258,6 +258,38 @@ SLABS: dict[str, Callable[[Path], F32]] = {
     "grains": _grains,
     "foam": _foam,
 }  # fmt: skip
+
+
+def _textured(name: str, own_voxels: bool) -> Callable[[Path], F32]:
+    """Slices of a CT volume, 0 outside the field.
+
+    Args:
+        own_voxels: 24 slices, interpolated to twice the resolution, so that the voxels of the case are those of the CT,
+            whose edges are one or two wide; else 80 slices as they are, whose structure is finer than those voxels.
+    """
+
+    def load(folder: Path) -> F32:
+        slices = slice(52, 76) if own_voxels else slice(24, 104)
+        volume = tifffile.imread(folder / f"qim3d_{name}_128x128x128.tif").astype(np.float32)[slices]
+        _, y, x = np.indices(volume.shape, np.float32)
+        inside = np.where(np.hypot(y - 63.5, x - 63.5) < 62, volume / volume.max(), 0).astype(np.float32)
+        return zoom(inside, 2, order=1, mode="nearest", grid_mode=True) if own_voxels else inside
+
+    return load
+
+
+TEXTURED = {
+    f"{name}{', binned' * (not own)}": _textured(name, own) for name in ("bone", "cement") for own in (True, False)
+}
+
+
+def walnut_held_out(folder: Path) -> Case:
+    """60 of 240 measured views, and the 60 between them."""
+    case, other = walnut_halved(folder, 120), np.arange(1, 120, 2)
+    rays = np.ones(case.projections[other].shape, np.bool_)
+    unseen = case.projections[other], case.geometry.select(other), rays
+    seen = np.arange(0, 120, 2)
+    return replace(case, projections=case.projections[seen], geometry=case.geometry.select(seen), unseen=unseen)
 
 
 def padded(volume: F32, side: int) -> F32:

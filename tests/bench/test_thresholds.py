@@ -30,9 +30,9 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.splatting.settings import DensityPolicy, FitSettings
 from tests.bench import quality_cases
-from tests.bench.quality_cases import SLABS, Case, rows_of
-from tests.bench.test_patch_prior import PHOTONS, TEXTURED, TUNED, VIEWS
+from tests.bench.quality_cases import SLABS, TEXTURED, Case, rows_of, walnut_held_out
 
+VIEWS, PHOTONS = 50, 1e5
 VALIDATION = "bone", "cement", "12 bone", "12 cement", "180 bone", "180 cement"
 
 
@@ -60,7 +60,7 @@ def _wild(folder: Path, share: float, value: float) -> Case:
 
 ROWS: dict[str, Callable[[Path], Case]] = {
     **{name: lambda folder, name=name: _slab(folder, name) for name in ("shell", "teapot", "foam", "bone", "cement")},
-    "walnut": lambda folder: rows_of(TUNED["walnut"](folder, "walnut"), range(12, 20)),
+    "walnut": lambda folder: rows_of(walnut_held_out(folder), range(12, 20)),
     "teapot, cone": lambda folder: quality_cases.cone(folder, "teapot", VIEWS, 64),
     "shell, cone": lambda folder: quality_cases.cone(folder, "shell", VIEWS, 64),
     "region": _region,

@@ -12,9 +12,7 @@ import pytest
 
 from beamline import api
 from beamline.config.load import config_folder
-from beamline.scan.live_process import Commands
 from beamline.storage.readers.open import open_scan
-from drivers.base.errors import DeviceError
 from tests.beamline.fakes import FakeInstrument, Faults
 
 SIMULATED = config_folder() / "simulated.yaml"
@@ -173,45 +171,6 @@ def test_events_and_sentences_are_those_of_the_command(
     assert out == "" and f"Scan complete: {FRAMES} frames" in err
 
 
-def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
-    values = {
-        **SMALL,
-        "scan.angles": {"scheme": "fixed", "views": 45, "span_deg": 45, "start_deg": 10},
-        "simulation.clock": "virtual",
-        "storage.folder": tmp_path,
-        "devices.camera.roi": [1144, 2024, 16, 48],
-    }
-    with api.connect(SIMULATED, set=values, say=None) as instrument:
-        results = [instrument.scan(sample=f"cell-{n}") for n in (1, 2)]
-    assert [result.frames for result in results] == [50, 50]
-    first, second = (list(api.stream(result.path)) for result in results)
-    assert second[0].time > first[-1].time
-
-
-def test_the_live_volume_is_asked_for_as_configured_and_named(
-    connected: Connected, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = """import json; print(json.dumps({"event": "state", "state": "ready", "message": ""}))
-print(json.dumps({"event": "done", "output": "recon.h5"}))"""
-    live = Commands(live=lambda scan, output: [sys.executable, "-c", done], remark="A remark.")
-    monkeypatch.setattr("beamline.api.instrument.commands_of", lambda config: live)
-    with connected() as instrument:
-        assert instrument.scan().volume == Path("recon.h5")
-        assert instrument.scan(live=False).volume is None
-
-
-def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeInstrument], tmp_path: Path) -> None:
-    connected()  # the fake instrument stands in from now on
-    values = {**SMALL, "devices.stage.max_speed_deg_s": 20}
-    result = api.scan(SIMULATED, set=values, sample="one", output=tmp_path / "elsewhere", say=None)
-    assert result.sample == "one" and result.folder.parent.name == "elsewhere" and len(closed) == 1
-
-
-def test_a_device_that_does_not_answer_is_the_projects_own_error(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match="no-port"):
-        api.connect(config_folder() / "instrument.yaml", set={"devices.stage.port": str(tmp_path / "no-port")})
-
-
 def test_importing_the_package_loads_nothing_heavy() -> None:
     heavy = {"torch", "numba", "matplotlib", "h5py", "pydantic", "click", "scipy"}
     code = f"import sys, beamline.api; print(sorted({heavy} & set(sys.modules)))"
@@ -220,24 +179,3 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, beamline.api as api; api.connect; api.stream; print('torch' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == "False"
-
-
-def test_every_name_is_there_and_typed() -> None:
-    for name in api.__all__:
-        assert getattr(api, name).__doc__
-
-
-def test_an_energy_moves_the_monochromator_that_there_is(tmp_path: Path) -> None:
-    values = {
-        **SMALL,
-        "devices.monochromator": {"kind": "simulated"},
-        "simulation.clock": "virtual",
-        "storage.folder": tmp_path,
-        "scan.angles.views": 4,
-        "scan.mode": "step",
-    }
-    with api.connect(SIMULATED, say=None, set=values) as instrument:
-        result = instrument.scan(energy_kev=8.34, live=False)
-        with open_scan(result.path) as source:
-            assert source.energy_kev == 8.34
-        assert result.folder.name.endswith("_battery_8.34keV")

@@ -50,11 +50,6 @@ def test_the_verdict_is_that_of_the_command(run: Path) -> None:
     assert verdict.clean is (not verdict.alarmed and not verdict.references)
 
 
-def test_limits_of_a_configuration_count(run: Path) -> None:
-    few = api.monitor(run, config=run / "config.resolved.yaml", set={"monitor.dark.drift": 0})
-    assert few.flags != api.monitor(run).flags
-
-
 def test_frames_of_a_file_in_order(run: Path) -> None:
     frames = list(api.stream(run))
     assert [frame.index for frame in frames] == list(range(19))
@@ -114,10 +109,6 @@ def test_the_live_volume_each_time_that_it_is_new_then_the_finished_one(run: Pat
     assert len(list(api.volumes(run))) == 1
 
 
-def test_no_volume_is_no_error(run: Path) -> None:
-    assert list(api.volumes(run)) == []
-
-
 @pytest.fixture
 def left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The folder of temporary files, which is empty afterwards."""
@@ -171,9 +162,3 @@ def test_what_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(error, match=said):
         api.reconstruct(scan, say=None, **{"method": "fbp", **arguments})  # type: ignore[arg-type]
-
-
-def test_no_scan_is_the_projects_own_error(tmp_path: Path) -> None:
-    for call in (api.monitor, api.reconstruct, lambda path: list(api.stream(path, follow=False))):
-        with pytest.raises(api.DataError):
-            call(tmp_path / "nothing.h5")  # type: ignore[operator]

@@ -98,14 +98,6 @@ def test_the_page_shows_what_a_tutorial_prints_and_draws(
     assert np.abs(grey(tmp_path / f"{name}.png") - grey(SHOWN / f"{name}.png")).mean() < apart
 
 
-def test_more_views_and_better_methods_are_more_accurate() -> None:
-    rows = [line.split() for line in (SHOWN / "cost_of_accuracy.txt").read_text(encoding="utf-8").splitlines()[1:]]
-    quality = {(method, int(views)): float(psnr) for method, views, psnr, _ in rows}
-    for method in ("FBP", "CGLS", "FISTA-TV"):
-        assert quality[method, 15] < quality[method, 30] < quality[method, 60]
-    assert quality["FBP", 60] < quality["CGLS", 60] < quality["FISTA-TV", 60]
-
-
 if __name__ == "__main__":
     SHOWN.mkdir(exist_ok=True)
     for tutorial in TUTORIALS:

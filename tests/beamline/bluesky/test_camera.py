@@ -1,7 +1,6 @@
 """The camera alone in plans of bluesky: frames in a file of ours, documents that are valid, lost frames named."""
 
 import math
-import time
 from collections.abc import Generator
 from contextlib import ExitStack
 from importlib.util import find_spec
@@ -180,34 +179,3 @@ def test_a_plan_that_ends_before_its_frames_leaves_a_stopped_scan(engine: Any, t
         assert ending_in(file) == ScanEnding(
             "stopped", tuple(range(N)), "0 of 5 frames were taken, as the plan ended before."
         )
-
-
-@pytest.mark.parametrize(("livetime", "deadtime"), [(0.03, 0.0), (0.03, 20.0), (20.0, 0.0)])
-def test_frames_by_its_own_trigger_end_with_the_plan(
-    engine: Any, tmp_path: Path, livetime: float, deadtime: float
-) -> None:
-    """Neither the frames that are left, nor the time between two, nor a long exposure holds the end up."""
-    from bluesky import plan_stubs, preprocessors
-    from ophyd_async.core import TriggerInfo
-
-    from beamline.bluesky.camera import CameraDetector
-
-    settings = small("recon.live=false", "simulation.clock=real")
-    with connect(settings) as instrument:
-        camera = CameraDetector(settings, instrument, tmp_path)
-
-        @preprocessors.stage_decorator([camera])
-        @preprocessors.run_decorator()
-        def plan() -> Generator[Any, Any, None]:
-            frames = TriggerInfo(number_of_events=60, livetime=livetime, deadtime=deadtime)
-            yield from plan_stubs.prepare(camera, frames, wait=True)
-            yield from plan_stubs.declare_stream(camera, name="primary", collect=True)
-            yield from plan_stubs.kickoff(camera, wait=True)
-            began.append(time.monotonic())
-
-        began: list[float] = []
-        engine(plan())
-        assert time.monotonic() - began[0] < 2 and not instrument.devices.shutter.is_open()
-    with h5py.File(_file(tmp_path)) as file:
-        ending = ending_in(file)
-    assert ending.status == "stopped" and len(ending.missing) > 50

@@ -133,55 +133,6 @@ def test_a_pause_of_the_plan_pauses_the_scan_and_no_view_is_lost(engine: Any, tm
         np.testing.assert_array_equal(heard.read("tomo-kind"), kinds)
 
 
-def test_a_plan_that_is_aborted_in_a_pause_ends_the_scan_in_order(engine: Any, tmp_path: Path) -> None:
-    from bluesky.utils import RunEngineInterrupted
-
-    from beamline.bluesky.devices import fly, tomography
-
-    settings = _small("simulation.clock=real", "scan.period_s=0.1", "scan.angles={scheme: fixed, views: 900}", FLUSH)
-    with tomography(settings, tmp_path) as (scan, _):
-        asked: list[threading.Thread] = []
-
-        def pause(name: str, document: dict[str, Any]) -> None:
-            if name == "stream_datum" and not asked:
-                asked.append(threading.Thread(target=engine.request_pause))
-                asked[0].start()
-
-        engine.subscribe(pause)
-        with pytest.raises(RunEngineInterrupted):
-            engine(fly(scan, flush=0.1))
-        engine.abort()
-        with h5py.File(next(tmp_path.iterdir()) / "scan.h5") as file:
-            assert file["entry/progress/status"].asstr()[()] == "stopped"
-
-
-def test_a_plan_that_ends_while_its_kickoff_begins_leaves_no_scan_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from beamline.bluesky import devices
-
-    asked, ended, usual = threading.Event(), threading.Event(), devices.ScanStream
-
-    def slow(*given: Any) -> Any:
-        asked.set()
-        ended.wait(10)
-        return usual(*given)
-
-    instrument = FakeInstrument()
-    scan = devices.TomoScan(ran.small(), tmp_path, instrument=instrument.connected())
-    monkeypatch.setattr(devices, "ScanStream", slow)
-
-    async def plan() -> None:
-        begun = asyncio.ensure_future(scan.kickoff().task)
-        await asyncio.to_thread(asked.wait, 10)
-        await scan.unstage()
-        ended.set()
-        await asyncio.gather(begun, return_exceptions=True)
-
-    asyncio.run(plan())  # which waits for its threads
-    assert not [what for what in instrument.log if "arm" in what or "move" in what]
-
-
 def test_lost_frames_fail_the_plan_and_are_named(engine: Any, tmp_path: Path) -> None:
     from beamline.bluesky.devices import TomoScan, fly
 
@@ -194,15 +145,6 @@ def test_lost_frames_fail_the_plan_and_are_named(engine: Any, tmp_path: Path) ->
     assert "LedgerError" in f"{failed.value!r} {failed.value.__cause__!r} {said}"
     assert "1 of 12 projections are missing: 4" in said
     assert heard.of("stop")[0]["exit_status"] == "fail"
-
-
-def test_a_scan_that_cannot_begin_fails_the_kickoff(engine: Any, tmp_path: Path) -> None:
-    from beamline.bluesky.devices import fly, tomography
-
-    with tomography(_small("scan.period_s=0.0001"), tmp_path) as (scan, _), pytest.raises(Exception) as failed:
-        engine(fly(scan))
-    assert "limits are violated, nothing was started" in "".join(map(str, [failed.value, *failed.value.args]))
-    assert not list(tmp_path.iterdir())
 
 
 def test_the_stage_moves_in_a_plan(engine: Any, tmp_path: Path) -> None:

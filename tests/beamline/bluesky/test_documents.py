@@ -49,7 +49,3 @@ def test_the_live_reconstruction_does_not_end_the_run() -> None:
 def test_a_scan_that_fails_says_why(status: str, exit_status: str) -> None:
     name, stop = _told(STARTED, FRAME, _done(status, 20), Failed("the disk is full", 5))[-1]
     assert (name, stop["exit_status"], stop["reason"]) == ("stop", exit_status, "the disk is full")
-
-
-def test_a_failure_before_the_run_tells_nothing() -> None:
-    assert _told(Failed("no camera", 3)) == []

@@ -90,15 +90,3 @@ def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path])
     parts = _prepared(scans["bent"], buffer=buffer)
     np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
     assert parts.done["background"].sentence == whole.done["background"].sentence
-
-
-@pytest.mark.slow
-def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:
-    said, record = _recon(scans["bent"], tmp_path / "v.h5", "--follow", "--seconds", "1", "--no-report")
-    assert "taken off" in record and record in said
-
-
-@pytest.mark.parametrize("wrong", ["surface", "surface:4", "line"])
-def test_models_that_are_none_are_refused(scans: dict[str, Path], wrong: str) -> None:
-    done = CliRunner().invoke(main, ["recon", str(scans["bent"]), "--air", wrong])
-    assert done.exit_code == 2 and "surface:ORDER" in done.output

@@ -10,7 +10,6 @@ from beamline.cli.main import main
 from beamline.config import load as config
 
 DEMO = str(config.config_folder() / "demo.yaml")
-REPOSITORY = Path(__file__).parents[3]
 
 
 def run(*arguments: str) -> Result:
@@ -36,18 +35,6 @@ def test_a_good_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert list(tmp_path.iterdir()) == []  # no run folder, nothing
 
 
-def test_json_is_one_event() -> None:
-    result = run(DEMO, "--json")
-    assert result.exit_code == 0
-    (line,) = result.stdout.splitlines()
-    event = json.loads(line)
-    assert event["event"] == "done"
-    assert (event["n_frames"], event["step_counts"]) == (210, 1000)
-    assert event["total_bytes"] == 210 * (144 * 160 * 2 + 36 * 40 * 4)
-    assert sum(block["n"] for block in event["blocks"]) == 210
-    assert event["free_bytes"] > 0
-
-
 def test_violations() -> None:
     broken = ("--set", "scan.period_s=0.02", "--set", "scan.angles.start_deg=190")
     result = run(DEMO, *broken)
@@ -61,13 +48,6 @@ def test_violations() -> None:
     event = json.loads(line)
     assert (event["event"], event["exit_code"]) == ("failed", 2)
     assert "period_s 0.02" in event["message"]
-
-
-def test_one_violation_is_one_sentence() -> None:
-    result = run(DEMO, "--set", "scan.flats.count=0")
-    assert result.exit_code == 2
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert "a limit is violated, nothing was started: no flats" in result.stderr
 
 
 def test_configuration_faults(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """`beamline home`: asks before the stage turns, says where it stands, and stops it when it is cut off."""
 
-from pathlib import Path
-
 import pytest
 from click.testing import CliRunner, Result
 
@@ -60,10 +58,3 @@ def test_an_interrupted_search_stops_the_stage(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(ZaberStage, "stop", lambda self: stopped.append(self.name))
     result = run("--yes", "--set", f"devices.stage={{kind: zaber, port: 'sim://zaber', {FIGURES}}}")
     assert (result.exit_code, stopped) == (130, ["stage"])
-
-
-def test_a_port_that_is_not_there(tmp_path: Path) -> None:
-    instrument = str(config.config_folder() / "instrument.yaml")
-    result = CliRunner().invoke(main, ["home", instrument, "--yes", "--set", "devices.stage.port=COM_NONE"])
-    assert result.exit_code == 3
-    assert "COM_NONE" in result.stderr

@@ -3,21 +3,18 @@
 import errno
 import subprocess
 import sys
-import tempfile
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import click
-import h5py
 import pytest
 from click.shell_completion import get_completion_class
 from click.testing import CliRunner
 
 from beamline.cli import main as module
 from beamline.core import errors
-from beamline.core.errors import INTERRUPTED, leave_traceback, user_message
+from beamline.core.errors import user_message
 from drivers.base.errors import DeviceError, DeviceTimeout
 
 
@@ -89,16 +86,6 @@ def test_a_defect_is_one_sentence_and_a_file_with_its_traceback(
     assert "in command\n    raise error" in log.read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("no_debug")
-def test_a_defect_in_a_folder_that_takes_no_file_leaves_its_traceback_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    left = leave_traceback(TypeError("x"), tmp_path / "nowhere")
-    assert left is not None
-    assert left.parent == tmp_path
-
-
 @pytest.mark.parametrize(("arguments", "environment"), [(["--debug"], {}), ([], {"BEAMLINE_DEBUG": "1"})])
 def test_a_developer_sees_the_defect_itself(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], environment: dict[str, str]
@@ -109,55 +96,11 @@ def test_a_developer_sees_the_defect_itself(
     assert isinstance(result.exception, ZeroDivisionError)
 
 
-@pytest.mark.parametrize("arguments", [["nonsense"], ["--nonsense"]])
-def test_unknown_words_are_usage(arguments: list[str]) -> None:
-    result = CliRunner().invoke(module.main, arguments)
-    assert result.exit_code == 2
-    assert "nonsense" in result.stderr
-
-
 @pytest.mark.parametrize("threads", ["0", "-1", "many"])
 def test_a_number_of_threads_that_cannot_be_is_usage(monkeypatch: pytest.MonkeyPatch, threads: str) -> None:
     monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
     done = CliRunner().invoke(module.main, ["info", "x.h5"])
     assert done.exit_code == 2 and f"NUMBA_NUM_THREADS={threads} in the environment" in done.stderr
-
-
-def test_help_names_every_command() -> None:
-    shown = CliRunner().invoke(module.main, ["--help"]).stdout
-    for name in module.LazyGroup().list_commands(click.Context(module.main)):
-        assert f"  {name} " in shown
-
-
-def test_version() -> None:
-    result = CliRunner().invoke(module.main, ["--version"])
-    assert result.exit_code == 0
-    assert result.stdout.startswith("beamline, version ")
-
-
-def test_a_file_that_hdf5_cannot_close_does_not_cost_the_exit_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """After a full disk such a file stays open, and HDF5 would crash at the end of the process."""
-    ended: list[int] = []
-
-    def failing(**_: object) -> None:
-        raise SystemExit(5)
-
-    monkeypatch.setattr(module, "main", failing)
-    monkeypatch.setattr(module.os, "_exit", ended.append)
-    with h5py.File(tmp_path / "open.h5", "w"), pytest.raises(SystemExit):
-        module.run()
-    assert ended == [5]
-    monkeypatch.setattr(module, "main", lambda **_: None)
-    with h5py.File(tmp_path / "other.h5", "w"), pytest.raises(SystemExit) as done:
-        module.run()
-    assert (done.value.code, ended) == (0, [5])
-
-
-def test_the_installed_command_is_the_process() -> None:
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))
-    assert project["project"]["scripts"] == {"beamline": f"{module.__name__}:{module.run.__name__}"}
 
 
 def test_every_command_has_its_line_in_the_page_on_commands() -> None:
@@ -182,12 +125,6 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     monkeypatch.setattr("beamline.cli.commands.import_module", None)
     assert completed("re")[:3] == ["resume", "recon", "recover"]
     assert completed("--v") == ["--version"]
-
-
-def test_an_interruption_that_went_through_a_text_of_code_has_its_exit_code_too() -> None:
-    """Python would end by the signal: dataclasses, which modules make while they load, run such texts."""
-    code = "import beamline.cli.main as m; m.main = lambda **_: exec('raise KeyboardInterrupt'); m.run()"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == INTERRUPTED
 
 
 def test_figures_do_not_depend_on_the_back_end_of_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder
-from tests.beamline.cli.small_scan import beamline, succeeds
+from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(8, 40))
@@ -36,12 +36,6 @@ def test_flags_are_listed_with_frames_score_limit_and_advice(here: Path) -> None
     assert "2 of 34 frames have an alarm; stdout lists them" in result.stderr.splitlines()[-1]
     assert "34/34" in result.stderr
     assert (here / "scan.h5").read_bytes() == before
-
-
-def test_a_clean_scan_of_another_format(here: Path) -> None:
-    write_exchange(here / "clean.h5", SCAN)
-    result = succeeds("monitor", "clean.h5")
-    assert result.stdout.splitlines() == ["clean.h5: 34 frames, flagged: none"]
 
 
 def test_json_has_an_event_where_a_check_begins_and_all_frames_at_the_end(here: Path) -> None:

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from beamline.cli.commands import own_commands
 from beamline.cli.main import main
-from beamline.cli.recipe import GROUPS, METHOD, OUTPUT, Grouped, heading
+from beamline.cli.recipe import GROUPS, Grouped
 from beamline.cli.terminal import Terminal
 from beamline.core.events import FitReached
 from beamline.core.process import with_our_path
@@ -34,10 +34,6 @@ def names(text: str) -> list[str]:
     return re.findall(r"^  (?:-\w, )?(--[\w-]+)", lists[start.start() if start else 0 :], flags=re.M)
 
 
-def test_a_command_with_more_than_twenty_options_has_groups() -> None:
-    assert {name for name, command in COMMANDS.items() if len(command.params) > 20} <= set(GROUPED)
-
-
 @pytest.mark.parametrize("name", GROUPED)
 def test_help_shows_ten_options_and_where_the_others_are(name: str) -> None:
     assert len(set(names(shown(name, "--help")))) == 12
@@ -53,32 +49,6 @@ def test_help_all_shows_every_option_once_under_its_heading(name: str) -> None:
     assert headings == [group for group in (*GROUPS, "Help") if group in headings]
     assert names(text.split("\nHelp:\n")[1]) == ["--help-all", "--help"]
     assert f"all {len(options)} options" in text
-
-
-def test_a_heading_holds_down_to_the_next_one() -> None:
-    @click.command(cls=Grouped, first=["b"])
-    @heading(METHOD)
-    @click.option("--a")
-    @click.option("--b")
-    @heading(OUTPUT)
-    @click.option("--c")
-    def command(**_: object) -> None: ...
-
-    text = CliRunner().invoke(command, ["--help-all"]).stdout
-    assert names(text.split(f"{METHOD}:")[1].split(f"{OUTPUT}:")[0]) == ["--a", "--b"]
-    assert names(text.split(f"{OUTPUT}:")[1].split("Help:")[0]) == ["--c"]
-    assert names(CliRunner().invoke(command, ["--help"]).stdout) == ["--b", "--help-all", "--help"]
-
-
-def test_help_all_belongs_to_no_recipe() -> None:
-    written = CliRunner().invoke(main, ["recon", "x.h5", "--bin", "2", "--write-config", "-"])
-    assert "bin: 2\n" in written.stdout and "help" not in written.stdout
-
-
-def test_help_names_every_exit_code() -> None:
-    assert re.findall(r"^ *(\d+)  ", shown("--help").split("Exit codes:")[1], flags=re.M) == [
-        "0", "1", "2", "3", "4", "5", "6", "7", "130",
-    ]  # fmt: skip
 
 
 CPU = """

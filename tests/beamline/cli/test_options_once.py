@@ -2,9 +2,7 @@
 
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
-import click
 import pytest
 from click.testing import CliRunner
 
@@ -13,8 +11,8 @@ from beamline.cli.options import declared
 from beamline.cli.recon import recon
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import ReconOptions
-from recon.base.method import Method, Traits
-from recon.methods import build, by_name, taking
+from recon.base.method import Traits
+from recon.methods import taking
 
 OPTIONS = declared(recon)
 TYPED = {
@@ -70,18 +68,6 @@ def test_what_an_option_needs_is_told_alike(name: str, end: str) -> None:
 def test_an_option_of_other_methods_is_refused(name: str) -> None:
     told = refusal("-m", "fbp", *words(name))
     assert told == f"--{name} is of {', '.join(takers(OPTIONS[name]))}; it does not go with --method fbp."
-
-
-@pytest.mark.parametrize("name", [name for name in OF_METHODS if OPTIONS[name].setting])
-def test_methods_take_the_least_that_the_command_takes(name: str) -> None:
-    kind: Any = OPTIONS[name].type
-    least = getattr(kind, "min", None)
-    if least is None or getattr(kind, "min_open", False):
-        assert isinstance(kind, click.Choice | click.types.BoolParamType) or least is not None
-        return
-    for method in takers(OPTIONS[name]):
-        made: Method = build(by_name(method), {OPTIONS[name].setting: least})
-        assert made.name == method
 
 
 def test_defaults_of_the_command_are_those_of_python() -> None:

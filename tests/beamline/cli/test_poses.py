@@ -82,15 +82,6 @@ def test_bad_tables_are_bad_usage_and_leave_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["auto", "r2"])
-def test_methods_that_judge_by_views_held_out_take_poses(tmp_path: Path, method: str) -> None:
-    words = ["--axis", AXIS, "--method", method, "--views", "every:2"]
-    words += ["--steps", "20"] if method == "r2" else []
-    code, said = run("recon", scan(tmp_path, posed()), "--poses", every(tmp_path), *words, "-o", tmp_path / "a.h5")
-    assert code == 0, said
-
-
-@pytest.mark.slow
 def test_slabs_take_shifts_and_refuse_views_that_lean(tmp_path: Path) -> None:
     geometry = replace(posed(0 * TURNS), detector_shape=(160, SHAPE[1]), axis_row=79.5)
     path = scan(tmp_path, geometry, AXES * (1, 1, 8))

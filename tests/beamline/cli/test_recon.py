@@ -2,21 +2,15 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from beamline.core.errors import DataError
-from beamline.monitor.check import Level
-from beamline.reconstruct.options import report_beside
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.assess.metrics import psnr
-from recon.base.empirical import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
-from tests.beamline.scans import frames_of, write_exchange, write_flagged
+from tests.beamline.scans import write_exchange
 from tests.recon.prep.ring_score import ring_score
 from tests.slow_cases import others_slow
 
@@ -71,16 +65,6 @@ def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndar
     succeeds("validate", name)
 
 
-def test_a_report_that_fails_leaves_the_folder_of_slices(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise DataError("v.html could not be written (No space left on device).")
-
-    monkeypatch.setattr("beamline.report.html.write_report", full)
-    done = beamline("recon", "scan.h5", "-m", "fbp", "-o", "v")
-    assert done.exit_code == 0 and "There is no report: DataError: v.html" in done.stderr
-    assert left(folder) == {"scan.h5", "v"} and len(list((folder / "v").iterdir())) > 1
-
-
 def _axis(lines: dict[str, str]) -> dict[str, str]:
     assert float(lines["axis_col"]) == pytest.approx(SCAN.axis_col, abs=0.25)
     return {"axis_col": lines["axis_col"]}
@@ -102,19 +86,6 @@ def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
     assert (parameters["steps"], parameters["seed"], parameters["views"]) == (10, 2, "fixed:10")
 
 
-def test_settings_reach_the_file(folder: Path) -> None:
-    options = "-m fbp --rows 1:2 --air 3,4 --filter hann --pixel-size-um 250 --no-report --axis 20.7"
-    succeeds("recon", "scan.h5", *options.split())
-    parameters = read_reconstruction(folder / "scan_fbp.h5").parameters
-    said = {name: parameters[name] for name in ("rows", "correction_air", "filter", "pixel_pitch")}
-    assert said == {"rows": "1:2", "correction_air": "(3, 4)", "filter": "hann", "pixel_pitch": 0.25}
-
-
-def test_a_filter_with_an_iterative_method_is_of_the_fbp_it_is_compared_with(folder: Path) -> None:
-    succeeds("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--filter", "ram-lak", "--no-report")
-    assert read_reconstruction(folder / "scan_sirt.h5").parameters["iterations"] == 2
-
-
 def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     result = succeeds("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
     start = int(read_reconstruction(folder / "scan_r2.h5").parameters["gaussians_at_start"])
@@ -124,15 +95,6 @@ def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     assert result.exit_code == 0 and "The fit started" not in result.stderr
     # Two steps of fifty Gaussians, not finished on voxels, do not explain the views, and that is said.
     assert "leaves structure in the residual of the views" in result.stderr
-
-
-def test_the_default_of_steps_is_told_as_it_is() -> None:
-    assert f"Default: {DEFAULT_STEPS};" in " ".join(beamline("recon", "--help-all").stdout.split())
-
-
-def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:
-    result = succeeds("recon", "scan.h5", "--steps", "60", "--gaussians", "50", "--early-stop", "--no-report")
-    assert "3 of 30 views are held out to say when to stop" in result.stderr
 
 
 @pytest.mark.slow
@@ -167,30 +129,6 @@ def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> N
     assert parameters["budget"] == 1 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
 
 
-def test_names() -> None:
-    assert report_beside(Path("runs/x/recon.h5")) == Path("runs/x/report.html")
-    assert report_beside(Path("walnut_r2.h5")) == Path("walnut_r2.html")
-
-
-def test_black_views_with_an_alarm_do_not_reach_the_volume(folder: Path) -> None:
-    """A third of the views nearly black and flagged: the volume is as good as from the others, and lost with all."""
-    levels = {4 + i: Level.ALARM for i in range(8, 18)}
-    frames = [replace(f, counts=101 + f.counts // 25) if f.index in levels else f for f in frames_of(SCAN)]
-    write_flagged(folder / "flagged.h5", frames, levels, SCAN.pixel_size_mm)
-    plain = ("-m", "sirt", "--iterations", "20", "--axis", "20.7", "--air", "none")
-    for name in ("use", "ignore"):
-        result = beamline("recon", "flagged.h5", *plain, "--flags", name, "-o", f"{name}.h5")  # with the report
-        assert result.exit_code == 0, result.output
-        assert ("10 have an alarm and are left out" in result.stderr) is (name == "use")
-    page = (folder / "use.html").read_text(encoding="utf-8")
-    assert "Alarm (beam): frames 12-21, worst 1 fraction of the reference light in frame 12: the light" in page
-    assert ">Flagged frames</summary>" in page
-    used, ignored = (read_reconstruction(folder / f"{name}.h5") for name in ("use", "ignore"))
-    truth = SCAN.truth(used.volume.grid)
-    assert psnr(truth, used.volume.data) > psnr(truth, ignored.volume.data) + 10
-    assert (used.parameters["flags"], used.parameters["views_left_out"], used.parameters["n_views"]) == ("use", 10, 20)
-
-
 def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) -> None:
     scan, options = str(shared_data / "diamond_24737_parallel_91x135x160.h5"), ("--axis", "85.75", "--rows", "60:64")
     scores, middle = {}, 79.5
@@ -203,11 +141,6 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
     assert "Rings: removed by sort; stripes of" in result.stderr
     assert str(record.parameters["rings_removed"]) in result.stderr
     assert scores["auto"] < 0.5 * scores["none"], scores
-
-
-def test_rings_need_columns(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--rings", "sort", "--no-report")
-    assert result.exit_code == 0 and "30 views of 40 columns are too few" in result.stderr
 
 
 def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
@@ -252,20 +185,3 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
         text = " ".join(result.stderr.replace("│", " ").split())
         assert (result.exit_code, error in text) == (code, True), result.stderr
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html", "lens.txt", "recipe.yaml"}
-
-
-def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
-    result = succeeds("recon", "scan.h5", "-m", "fbp", "--hardening", "Al:60kV,Al=1", "--no-report")
-    said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["hardening"])
-    assert said in result.stderr and said.startswith("Hardening: corrected by the curve of Al:60kV,Al=1")
-    for options, error in (
-        (("--hardening", "Al:80"), "80 is neither a tube such as 60kV,Al=1 nor a table"),
-        (("--hardening", "bone:60kV"), "'bone' is neither a material"),
-        (("--hardening", "Al"), "expected none, fit or MATERIAL:BEAM"),
-        (("--hardening", "fit", "--follow"), "--hardening is for a finished scan"),
-    ):
-        result = beamline("recon", "scan.h5", *options, "-o", "other.h5")
-        assert (result.exit_code, error in " ".join(result.stderr.replace("│", " ").split())) == (2, True), (
-            result.stderr
-        )
-    assert left(folder) == {"scan.h5", "scan_fbp.h5"}

@@ -1,6 +1,5 @@
 """`beamline recon` ended from outside: it delivers what it has, or leaves nothing; a checkpoint goes on."""
 
-import json
 import signal
 import sys
 from collections.abc import Callable
@@ -11,14 +10,10 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.reconstruct import budget, checkpoints, job, pipeline
+from beamline.reconstruct import checkpoints, job, pipeline
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
-from recon.forecast import Pace
+from recon.base.method import Progress
 from recon.splatting import optimise as fit
-from recon.splatting import train
-from recon.splatting.initialise import place
-from recon.voxels import direct
 from recon.voxels import fbp as fbp_module
 from recon.voxels.fbp import FbpPlan, fbp_block
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
@@ -44,21 +39,6 @@ def _signal_at_step(monkeypatch: pytest.MonkeyPatch, number: signal.Signals, at:
     return taken
 
 
-def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of writing: nothing half-written stays, and the last event says why."""
-
-    def interrupted(*_: object) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    monkeypatch.setattr("beamline.storage.writers.recon_file.write_entry", interrupted)
-    before = signal.getsignal(signal.SIGTERM)
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--json")
-    assert result.exit_code == 130
-    assert json.loads(result.stdout.splitlines()[-1])["exit_code"] == 130
-    assert left(folder) == {"scan.h5"}
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, *HANGUP])
 def test_a_fit_that_is_interrupted_delivers_what_it_has(
     folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
@@ -76,20 +56,6 @@ def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatc
     _signal_at_step(monkeypatch, signal.SIGINT, {20}, times=2)
     result = beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
     assert result.exit_code == 130
-    assert left(folder) == {"scan.h5"}
-
-
-def test_a_fit_that_is_interrupted_before_its_first_step_ends_at_once_and_leaves_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*arguments: Any, **options: Any) -> Any:
-        if arguments[2].n_views == SCAN.angles.size:  # not the toy that is fitted before
-            signal.raise_signal(signal.SIGTERM)
-        return place(*arguments, **options)
-
-    monkeypatch.setattr(train, "place", interrupted)
-    result = beamline("recon", "scan.h5", "-m", "r2", "--gaussians", "50", "--no-report")
-    assert result.exit_code == 130, result.output
     assert left(folder) == {"scan.h5"}
 
 
@@ -127,35 +93,6 @@ def test_an_fbp_that_is_interrupted_ends_at_once_and_leaves_nothing(
     result = beamline("recon", "scan.h5", "-m", "fbp", "-o", "out.h5")
     assert result.exit_code == 130, result.output
     assert set(folder.iterdir()) == before
-
-
-def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = direct.Fbp.run
-
-    def interrupted(method: direct.Fbp, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        if problem.geometry.n_views == SCAN.angles.size:  # not the toy that is reconstructed before
-            signal.raise_signal(signal.SIGINT)
-        return run(method, problem, control)
-
-    monkeypatch.setattr(direct.Fbp, "run", interrupted)
-    monkeypatch.setattr(budget, "paces_of", lambda *_: {"fbp": Pace(0.1, 0.0, 0)})
-    result = succeeds("recon", "scan.h5", "--budget", "20s", "-o", "out.h5", "--no-report")
-    assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output
-    parameters = read_reconstruction(folder / "out.h5").parameters
-    assert parameters["method"] == "fbp" and "ended_early" not in parameters
-
-
-@pytest.mark.parametrize(("finish", "code"), [(("--finish", "0"), 0), ((), 4)])
-def test_a_fit_that_is_interrupted_in_its_last_step_is_complete_if_it_has_no_finish(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, finish: tuple[str, ...], code: int
-) -> None:
-    _signal_at_step(monkeypatch, signal.SIGINT, {20})
-    result = beamline("recon", "scan.h5", "--steps", "20", "--gaussians", "50", *finish, "--no-report")
-    assert result.exit_code == code, result.output
-    parameters = read_reconstruction(folder / "scan_r2.h5").parameters
-    assert ("ended_early" in parameters) is (code == 4) and parameters["finish"] == 0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")

@@ -15,7 +15,6 @@ from click.testing import CliRunner, Result
 from beamline.cli.main import main
 from beamline.config.load import config_folder
 from beamline.scan import run as run_module
-from beamline.scan.live_process import Commands
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceError
 from drivers.in_beam import Ask, ManualShutter
@@ -130,14 +129,6 @@ def test_4_with_documents_a_scan_that_is_stopped_says_so(tmp_path: Path, monkeyp
     stop = json.loads(told.read_text("utf-8").splitlines()[-1])
     assert stop["name"] == "stop" and stop["doc"]["exit_status"] == "abort"
     assert "Stopped after" in stop["doc"]["reason"]
-
-
-@pytest.mark.parametrize("address", ["http://localhost:5577", "tcp://localhost", "tcp://localhost:port"])
-def test_2_documents_go_to_a_file_or_a_proxy(tmp_path: Path, address: str) -> None:
-    pytest.importorskip("zmq")
-    result = scan("-o", str(tmp_path / "runs"), "--documents", address)
-    assert (result.exit_code, "expected tcp://HOST:PORT" in result.stderr) == (2, True)
-    assert not (tmp_path / "runs").exists()
 
 
 def test_2_documents_without_the_library_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,34 +327,6 @@ def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monk
     assert {"--follow", "--json"} <= set(command)
     parsed = recon.make_context("recon", command[4:]).params  # and the command understands it
     assert (parsed["seconds"], parsed["axis"], parsed["output"]) == (7.0, 80.5, Path("recon.h5"))
-
-
-def test_a_resumed_run_keeps_that_it_has_no_reconstruction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def live_of(*words: str) -> list[bool]:
-        asked = list[bool]()
-
-        def run_scan(config: Any, *_: Any, live: Any = None, afterwards: Any = None, **__: Any) -> Any:
-            asked.append(config.recon.live)
-            assert (live is afterwards is None) is not config.recon.live
-            raise KeyboardInterrupt
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("beamline.scan.run.run_scan", run_scan)
-            said = CliRunner().invoke(main, ["scan", *words])
-        assert said.exit_code == 130, said.output
-        return asked
-
-    for no_live, runs in ((["--no-live"], tmp_path / "without"), ([], tmp_path / "with")):
-        instrument = FakeInstrument(at={8: lambda: signal.raise_signal(signal.SIGINT)})
-        on(monkeypatch, instrument)
-        monkeypatch.setattr("beamline.scan.live_process.commands_of", lambda config, series=None: Commands())
-        words = [word for key, value in SMALL.items() for word in ("--set", f"{key}={value}")]
-        stopped = CliRunner().invoke(main, ["scan", SIMULATED, *words, *no_live, "-o", str(runs)])
-        assert stopped.exit_code == 4, stopped.output
-        monkeypatch.undo()
-        (run,) = runs.iterdir()
-        assert live_of("--resume", str(run)) == [not no_live]
-        assert live_of(SIMULATED, *words, "--resume", str(run)) == [not no_live]
 
 
 def test_7_a_complete_scan_with_alarms_says_so_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

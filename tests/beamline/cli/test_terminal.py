@@ -1,15 +1,12 @@
 """A bar where a terminal is, few plain lines where there is none, and every event as words or nothing."""
 
 import io
-import math
-import re
-import sys
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from beamline.cli.terminal import Terminal, fit, rates
+from beamline.cli.terminal import Terminal
 from beamline.core.events import FitReached, FrameStored, Warned, event_of
 from beamline.core.sinks import UserLog, sentence
 
@@ -50,21 +47,6 @@ def shown(stream: io.StringIO, *events: tuple[str, dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-class HungUp(io.StringIO):
-    """A stream whose terminal has closed, or whose disk is full."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__()
-        self.number = number
-
-    def write(self, text: str) -> int:
-        raise OSError(self.number, "no")
-
-
-def test_the_figures_an_operator_watches() -> None:
-    assert rates(FrameStored(**FRAME)) == "90/360  10.0 frames/s  188.2 MB/s  1:02:05 left"
-
-
 def test_without_a_terminal_there_are_plain_lines_and_not_too_many() -> None:
     frames = [("frame", {**FRAME, "n": n}) for n in range(1, 361)]
     text = shown(io.StringIO(), ("state", {"state": "acquiring", "message": "Acquiring"}), *frames)
@@ -91,16 +73,6 @@ def test_names_in_a_bar_and_in_sentences_are_text(stream: io.StringIO) -> None:
     assert text.count("[/b]\\x1b[2J :boom:\\u202e.h5") >= 2 and "\x1b[2J" not in text
 
 
-def test_what_others_print_beside_the_bar_goes_where_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rich would put streams of its own in the place of those that show control characters."""
-    stream = Tty()
-    monkeypatch.setattr(sys, "stderr", stream)
-    before = sys.stdout
-    with Terminal(stream) as terminal:
-        terminal(FrameStored(**FRAME))
-        assert sys.stderr is stream and sys.stdout is before
-
-
 def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:
     stream = Tty()
     with Terminal(stream) as terminal:
@@ -118,58 +90,7 @@ def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:
     assert "91/360" in stream.getvalue().split("Open the beam shutter.")[1]
 
 
-def test_the_fit_has_a_bar_of_its_own() -> None:
-    progress = {**FIT, "n_views": 40, "n_gaussians": 2000, "residual": None}
-    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown(Tty(), ("frame", FRAME), ("progress", progress)))
-    assert "40 views, 2000 Gaussians" in text
-    assert "90/360" in text
-
-
-def test_compilation_is_told_with_its_time() -> None:
-    progress = {"stage": "kernels", "n": 12, "seconds": 19.4}
-    said = "kernels: 12 compiled in 19 s; once on a machine, 1 to 2 minutes\n"
-    assert shown(io.StringIO(), ("progress", progress)) == said
-
-
-FITTED = {"n_gaussians": 2000, "residual": 0.12344, "per_s": 20.0, "eta_s": 75.0}
-ITERATED = {"n_gaussians": 0, "residual": 0.2, "held_out": math.nan, "per_s": 0.5, "eta_s": 74.0}
-SLICED = {"n_gaussians": 0, "residual": math.nan, "held_out": math.nan, "per_s": 2.0, "eta_s": 48.0, "unit": "slices"}
-
-
-@pytest.mark.parametrize(
-    ("progress", "said"),
-    [
-        (FITTED, "500/2000 steps, 20 steps/s, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"),
-        (
-            {**FITTED, "held_out": 0.2},
-            "500/2000 steps, 20 steps/s, 91 views, 2000 Gaussians, residual 0.1234, held out 0.2000, 0:01:15 left",
-        ),
-        (ITERATED, "500/2000 iterations, 0.5 iterations/s, 91 views, residual 0.2000, 0:01:14 left"),
-        (SLICED, "500/2000 slices, 2 slices/s, 91 views, 0:00:48 left"),
-    ],
-    ids=["fit", "views held out", "iterations", "slices"],
-)
-def test_what_has_an_end_says_how_far_it_is(progress: dict[str, Any], said: str) -> None:
-    progress = {**FIT, "step": 500, "steps": 2000, "n_views": 91, **progress}
-    assert fit(FitReached(**progress)) == said
-    assert shown(io.StringIO(), ("progress", progress)) == f"volume: {said}\n"
-
-
-def test_the_end_is_said_once() -> None:
-    progress = {**FIT, "step": 9, "steps": 9, "n_views": 9, "n_gaussians": 9}
-    again = ("progress", {**progress, "residual": 0.2})
-    text = shown(io.StringIO(), ("progress", {**progress, "step": 8}), ("progress", progress), again)
-    assert [line[:11] for line in text.splitlines()] == ["volume: 8/9", "volume: 9/9"]
-
-
 SNAPSHOT = {"path": "v.h5", "picture": "p.html", "n_views": 40, "seconds": 1.0, "unlearnt": None}
-
-
-def test_the_same_snapshot_is_said_once() -> None:
-    snapshot = ("snapshot", SNAPSHOT)
-    text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {**SNAPSHOT, "n_views": 60}))
-    assert text.count("from 40 views") == 1
-    assert text.count("from 60 views") == 1
 
 
 BLOCK = {

@@ -74,11 +74,6 @@ def test_a_key_that_takes_text_takes_it_as_it_stands(tmp_path: Path, value: str,
     assert load(path, "scan.period_s=0.2 # s").scan.period_s == 0.2
 
 
-def test_the_process_environment_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("BEAMLINE_SAMPLE__NAME", "from-outside")
-    assert config.load(write(tmp_path)).sample.name == "from-outside"
-
-
 @pytest.mark.parametrize("name", CONFIGS)
 def test_resolved_reads_back_as_itself(name: str, tmp_path: Path) -> None:
     loaded = config.load(config.config_folder() / f"{name}.yaml", environment={})
@@ -118,13 +113,6 @@ def test_plan_of_every_scheme(tmp_path: Path) -> None:
     # An angle file is found beside the configuration file, wherever the command runs.
     beside = write(tmp_path, GOOD.replace("{scheme: fixed, views: 12}", "{scheme: file, path: angles.txt}"), "b.yaml")
     np.testing.assert_allclose(config.plan_of(load(beside)).angles, [0, math.pi / 4])
-
-
-def test_plan_of_carries_exposures_and_places(tmp_path: Path) -> None:
-    plan = config.plan_of(load(write(tmp_path), "scan.flats={count: 3, at: both, exposure_s: 0.2}", "scan.mode=step"))
-    assert (plan.flats.count, plan.flats.at, plan.flats.exposure) == (3, Place.BOTH, 0.2)
-    assert plan.darks.exposure == plan.exposure == 0.01
-    assert (plan.mode, plan.scheme) == (Mode.STEP, "fixed")
 
 
 def test_several_frames_a_view_are_of_a_step_scan_that_takes_none_again(tmp_path: Path) -> None:

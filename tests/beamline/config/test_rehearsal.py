@@ -4,10 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from beamline.config.load import Config, config_folder, load
-from beamline.config.stages import STAGES
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.scan.preflight import dry_run
@@ -80,14 +78,6 @@ def test_every_device_has_a_simulated_counterpart(tmp_path: Path, overrides: tup
     assert (planned.n_frames, planned.duration) == (wanted.n_frames, wanted.duration)
 
 
-@pytest.mark.parametrize("kind", STAGES)
-def test_every_stage_has_a_simulated_counterpart(kind: str) -> None:
-    if kind not in STAGE:
-        pytest.skip("of another package")
-    found = _rehearsed(f"devices.stage={STAGE[kind] % LIMITS}", "scan.mode=step")
-    assert found.devices.stage.port == f"sim://{kind}"
-
-
 @pytest.mark.parametrize(
     "name", others_slow(["as shipped", "inverted pulses", "sample moved by a motor", "filters behind EPICS"], 2)
 )
@@ -113,18 +103,6 @@ def test_a_transcript_is_a_file_of_its_own(tmp_path: Path) -> None:
 def test_a_simulated_configuration_stays_as_it_is() -> None:
     path = config_folder() / "simulated.yaml"
     assert load(path, environment={}, rehearse=True) == load(path, environment={})
-
-
-def test_what_simulation_is_asked_for_goes_before() -> None:
-    found = _rehearsed("simulation.clock=real", "simulation.seed=7")
-    assert found.simulation is not None
-    assert (found.simulation.clock, found.simulation.seed) == ("real", 7)
-    assert isinstance(found.simulation.scene, dict)
-
-
-def test_a_fault_of_the_real_configuration_is_told_first() -> None:
-    with pytest.raises(ConfigError, match=r"devices\.camera\.ring_mb is 0"):
-        _rehearsed("devices.camera.ring_mb=0")
 
 
 def _edited(path: Path, **changes: Any) -> Path:
@@ -156,32 +134,3 @@ def test_keys_of_a_real_camera_are_one_fault_that_names_the_way(tmp_path: Path) 
     said = str(refused.value)
     assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: library, index, link, ")
     assert "are no keys of this kind" in said and "--rehearse" in said and "\n" not in said
-
-
-@pytest.mark.parametrize(("left", "key"), [("stage", "stage:"), ("shutter", "shutter:"), ("mover", "sample_mover:")])
-def test_a_real_device_among_simulated_ones_is_named_with_its_line(tmp_path: Path, left: str, key: str) -> None:
-    path = _edited(tmp_path / "my.yaml", **{name: change for name, change in SIMULATED.items() if name != left})
-    tree = yaml.safe_load(path.read_text("utf-8"))
-    simulated = ("kind", "model", "roi", "binning", "readout", "trigger_polarity")
-    for name in set(tree["devices"]["camera"]) - set(simulated):
-        text = path.read_text("utf-8").splitlines(keepends=True)
-        path.write_text("".join(line for line in text if not line.strip().startswith(f"{name}:")), "utf-8")
-    with pytest.raises(ConfigError, match="cannot be mixed") as refused:
-        load(path, environment={})
-    assert str(refused.value).startswith(f"{path}:{_line(path, key)}: ")
-
-
-@pytest.mark.parametrize(
-    ("override", "line"),
-    [
-        ("scan.filter=Cu", "--set scan.filter=Cu"),
-        ("scan.energy=8.3", "--set scan.energy=8.3"),
-        ("devices.stage.low_deg=400", "--set devices.stage.low_deg=400"),
-        ("recon.stop_when={psnr_loss: null}", "--set recon.stop_when={psnr_loss: null}"),
-        ("devices.camera.binning=true", "--set devices.camera.binning=true"),
-    ],
-)
-def test_a_fault_between_keys_names_the_key_that_is_to_be_looked_at(override: str, line: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        load(INSTRUMENT, [override], environment={})
-    assert str(refused.value).startswith(f"{line}: ")

@@ -2,7 +2,7 @@
 
 import threading
 
-from beamline.core.events import Event, KernelsCompiled, StateEntered
+from beamline.core.events import Event, KernelsCompiled
 from beamline.core.sinks import Announcer
 from simulators.devices.clock import VirtualClock
 
@@ -49,26 +49,3 @@ def test_threads_may_speak_at_once() -> None:
     assert len(heard) == 400
     for t in range(4):
         assert [e.data["n"] for e in heard if e.data["stage"] == f"{t}"] == list(range(100))
-
-
-def test_two_sinks_that_break_at_once_are_each_given_up_once() -> None:
-    """As both logs of a run do on a full disk: the word that one is given up is what breaks the other."""
-    heard: list[Event] = []
-
-    class Full:
-        def __init__(self) -> None:
-            self.calls = 0
-
-        def __call__(self, event: Event) -> None:
-            self.calls += 1
-            raise OSError(28, "No space left on device")
-
-    logs = [Full(), Full()]
-    with Announcer([*logs, heard.append], VirtualClock()) as sink:
-        sink(StateEntered("idle", "a"))
-        sink(StateEntered("idle", "b"))
-    assert [log.calls for log in logs] == [1, 1]
-    assert [e.data["message"] for e in heard if e.event == "state"] == ["a", "b"]
-    warnings = [e.data["message"] for e in heard if e.event == "warning"]
-    assert len(warnings) == 2
-    assert all("gets no further events" in text and "No space left" in text for text in warnings)

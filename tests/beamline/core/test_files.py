@@ -5,14 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.core.files import bytes_below, parts_of, require_regular, text_in
-
-
-def test_what_is_not_there_or_a_link_to_a_file_is_fine(tmp_path: Path) -> None:
-    require_regular(tmp_path / "nowhere")
-    (tmp_path / "a").write_text("1\n", encoding="utf-8")
-    (tmp_path / "b").symlink_to(tmp_path / "a")
-    assert text_in(tmp_path / "b") == "1\n"
+from beamline.core.files import bytes_below, parts_of, text_in
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")

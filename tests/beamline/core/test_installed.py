@@ -56,11 +56,3 @@ def test_a_distribution_that_has_overwritten_a_package(environment: Path) -> Non
     assert told.startswith(
         f"{environment / 'drivers/__init__.py'} is not splatline's: it belongs to another distribution"
     )
-
-
-def test_a_package_that_is_not_there(environment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "drivers")
-    (environment / "drivers/__init__.py").unlink()
-    (environment / "drivers").rmdir()
-    monkeypatch.setattr(sys, "meta_path", [])
-    assert "finds no package 'drivers'. Install it again" in installed.package_problem(str(environment))

@@ -32,11 +32,3 @@ def test_a_phase_says_how_far_it_is_at_most_a_few_times_a_second() -> None:
     assert (last["n"], last["of"], last["eta_s"]) == (100, 100, 0.0)
     assert last["per_s"] == pytest.approx(20)
     assert last["counted"] == "views"
-
-
-def test_a_phase_with_nothing_done_says_no_more_than_that_it_has_begun() -> None:
-    said = list[Event]()
-    phases = Phases(said.append, SteppedClock(100.0))
-    phases.enter("axis", "guesses")
-    phases.progress(0, 100)
-    assert [(event.data["n"], event.data["counted"]) for event in said] == [(0, "guesses")]

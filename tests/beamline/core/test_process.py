@@ -10,7 +10,7 @@ from typing import Any
 import psutil
 import pytest
 
-from beamline.core.process import ChildProcess, ProcessEnd, json_object
+from beamline.core.process import ChildProcess, ProcessEnd
 from tests.clock import wait_until
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
@@ -19,17 +19,6 @@ SLEEPS = "import time; print('begun', flush=True); time.sleep(100)"
 DELIVERS = """
 import signal, sys, time
 def deliver(*_):
-    print("delivered", flush=True)
-    sys.exit(4)
-signal.signal(signal.SIGTERM, deliver)
-print("begun", flush=True)
-time.sleep(100)
-"""
-WORKS = """
-import signal, sys, time
-def deliver(*_):
-    while time.process_time() < 1.2:
-        pass
     print("delivered", flush=True)
     sys.exit(4)
 signal.signal(signal.SIGTERM, deliver)
@@ -102,13 +91,6 @@ def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) ->
     assert len(chatter.lines) == 6
 
 
-def test_silence_counts_from_the_wait(tmp_path: Path) -> None:
-    """Nobody waits for a process during a scan: it may be silent for as long as the scan takes."""
-    child = _Child(tmp_path, "import time; time.sleep(1.0)")
-    time.sleep(0.7)
-    assert child.process.wait(silence=0.6) is ProcessEnd.EXITED
-
-
 def test_leaving_the_context_kills_the_process(tmp_path: Path) -> None:
     child = _Child(tmp_path, SLEEPS)
     with pytest.raises(ZeroDivisionError), child.process:
@@ -127,24 +109,6 @@ os._exit(0)
     noticed = tmp_path / "noticed"
     subprocess.run([sys.executable, "-c", parent, str(noticed)], check=True, timeout=60)
     wait_until(noticed.exists)
-
-
-def test_the_end_of_a_process_that_is_tethered_leaves_no_open_pipe(tmp_path: Path) -> None:
-    child = _Child(tmp_path, "import sys; print(sys.stdin.readline() == '')", tether=True)
-    assert child.process.wait(seconds=0.2) is ProcessEnd.OUT_OF_TIME  # stdin is open as long as we live
-    assert child.lines == []
-
-
-def test_a_program_that_is_not_there_is_an_error(tmp_path: Path) -> None:
-    with (tmp_path / "log").open("w") as stderr, pytest.raises(OSError, match="no such"):
-        ChildProcess([str(tmp_path / "no such program")], stderr, print)
-
-
-@pytest.mark.parametrize(
-    ("line", "found"), [('{"a": 1}\n', {"a": 1}), ("[1]", None), ("3", None), ("a library's print", None), ("", None)]
-)
-def test_only_objects_are_taken_from_lines(line: str, found: dict[str, Any] | None) -> None:
-    assert json_object(line) == found
 
 
 @pytest.mark.parametrize("behind", [False, True])

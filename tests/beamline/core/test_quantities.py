@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.config import load as config
-from beamline.core.quantities import RANGES, doubt, doubt_span, is_impossible, range_of
+from beamline.core.quantities import RANGES, doubt, is_impossible, range_of
 from beamline.projections import prepare
 from beamline.projections.selection import Selection
 from beamline.scan.preflight import doubts
@@ -87,21 +87,6 @@ def test_a_thousand_times_the_typical_value_is_told(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(path.name for path in config.config_folder().glob("*.yaml")))
 def test_no_shipped_configuration_is_doubted(name: str) -> None:
     assert doubts(config.load(config.config_folder() / name, environment={})) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("energy_kev", 0.28), ("energy_kev", 450.0), ("pixel_size_um", 0.1), ("pixel_size_um", 200.0),
-                        ("distance_mm", 0.0), ("distance_mm", 12000.0), ("exposure_s", 1e-5), ("energy_kev", None)]
-)  # fmt: skip
-def test_values_of_instruments(name: str, value: float | None) -> None:
-    assert doubt(name, value) == ""
-
-
-def test_a_span_in_radians() -> None:
-    assert "did you mean 180?" in doubt_span(3.14159)
-    assert "did you mean -360?" in doubt_span(-6.2832)
-    assert "did you mean 90?" in doubt_span(1.5708)
-    assert doubt_span(180.0) == doubt_span(3.0) == ""
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import pytest
 from beamline.config.load import config_folder, load, resolved_yaml
 from beamline.core.files import CONFIG
 from beamline.core.process import ChildProcess, ProcessEnd, with_our_path
-from beamline.features.trials.runner import COMMAND
 from beamline.scan.watchdog import watched
 
 OURS = ("beamline", "drivers", "recon", "simulators")
@@ -45,13 +44,6 @@ def test_the_watchdog_starts(tmp_path: Path, executed: Callable[[], list[str]]) 
     with watched(tmp_path, lambda event: told.append(event.event)):
         pass
     assert (told, executed()) == ([], [])
-
-
-@pytest.mark.slow
-def test_reconstructions_and_trials_start(tmp_path: Path, executed: Callable[[], list[str]]) -> None:
-    assert "Usage" in said([sys.executable, "-m", "beamline.cli.main", "recon", "--help"], tmp_path)
-    assert "FileNotFoundError" in said([*COMMAND, str(tmp_path / "no_job.json")], tmp_path, with_our_path())
-    assert executed() == []
 
 
 def test_what_they_start_is_as_safe(tmp_path: Path, executed: Callable[[], list[str]]) -> None:

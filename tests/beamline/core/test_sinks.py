@@ -35,11 +35,6 @@ def test_a_crumb_in_twelve_frames_is_one_line_of_the_log() -> None:
     assert lines == ["Warning: something else", "Warn (floater, 14 frames, 38 to 51): to 51"]
 
 
-def test_one_that_lasts_is_told_once_a_minute() -> None:
-    long = [crumb(38 + 8 * n, 45 + 8 * n, time=5.0 * n) for n in range(16)]
-    assert flags([*long, stored(400)]) == [(12, 38, 133), (16, 134, 165)]
-
-
 def test_two_crumbs_are_two_lines_and_an_alarm_waits_for_nobody() -> None:
     assert flags([crumb(38, 40), crumb(41, 44), crumb(70, 72), stored(120)]) == [(2, 38, 44), (3, 70, 72)]
     assert flags([crumb(38, 40, level=Level.ALARM), crumb(41, 44, level=Level.ALARM)]) == [(0, 38, 40), (1, 41, 44)]

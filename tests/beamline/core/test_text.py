@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.core.text import csv_text, printable, rounded, safe_name, with_points
+from beamline.core.text import csv_text, printable, rounded, safe_name
 
 
 def test_control_characters_are_shown_not_sent() -> None:
@@ -30,11 +30,6 @@ def test_rounded_has_three_digits_on_the_side_asked_for(value: float) -> None:
     assert down <= value * (1 + 1e-11) and up >= value * (1 - 1e-11)
     assert up - down <= 0.0101 * value
     assert all(math.isclose(number, float(f"{number:.3g}")) for number in (down, up))
-
-
-@pytest.mark.parametrize("value", [0.0, math.inf])
-def test_what_has_no_digits_stays(value: float) -> None:
-    assert rounded(value) == rounded(value, up=True) == value
 
 
 @given(st.text(), st.integers(8, 130))
@@ -66,8 +61,3 @@ def test_a_table_has_no_formula_of_a_foreign_text(text: str) -> None:
 def test_numbers_of_a_table_stay_numbers() -> None:
     row = [-1.5, "-1.5", "+3", "-1e-07", "-.5", "-inf", "-", None, Path("=1")]
     assert csv_text([row]) == "-1.5,-1.5,+3,-1e-07,-.5,-inf,-,,'=1\n"
-
-
-def test_a_line_of_many_numbers_is_not_quoted_whole() -> None:
-    with pytest.raises(ValueError, match=r"^0\.00,1\.00.{1,40}\.\.\. has a comma, which .* write one number a line"):
-        with_points([",".join(f"{n}.00" for n in range(90))])

@@ -73,13 +73,3 @@ def test_a_link_to_what_is_not_there_is_never_replaced(tmp_path: Path) -> None:
         partial.write_text("new")
         (tmp_path / "late").symlink_to("away/out")  # made while the file was written
     assert {*tmp_path.iterdir()} == {tmp_path / "link", tmp_path / "late"}
-
-
-def test_where_a_file_is_replaced_a_link_to_it_stays(tmp_path: Path) -> None:
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "disk" / "out").write_text("old")
-    (tmp_path / "link").symlink_to("disk/out")
-    write_whole(tmp_path / "link", "new", replace=True)
-    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk" / "out").read_text() == "new"
-    with pytest.raises(DataError, match="never overwritten"):
-        write_whole(tmp_path / "link", "newer")

@@ -106,11 +106,6 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     assert stage.closed == 2
 
 
-def test_a_port_that_is_not_there() -> None:
-    with pytest.raises(DeviceError, match="COM_NONE"):
-        devices.connect(shipped("instrument", "devices.stage.port=COM_NONE"))
-
-
 def test_every_camera_option_reaches_the_driver(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -168,15 +168,6 @@ def test_clocks() -> None:
         assert instrument.clock is given
 
 
-def test_benches_do_not_share_a_controller() -> None:
-    settings = small()
-    with devices.connect(settings) as one, devices.connect(settings) as two:
-        one.devices.stage.start_move(1.0, one.devices.stage.limits.max_speed)
-        one.devices.stage.wait(60.0)
-        assert one.devices.stage.position() == pytest.approx(1.0, abs=1e-4)
-        assert two.devices.stage.position() == 0.0
-
-
 def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     """A region off the sensor's middle: z counts from the middle of the rows that were read."""
     settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's

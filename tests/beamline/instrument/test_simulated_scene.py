@@ -14,7 +14,6 @@ from beamline.core.stop import StopRequest
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.scan import run as module
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
@@ -28,7 +27,6 @@ from tests.beamline.simulate.read_labels import read_labels
 ROI = [1136, 2028, 32, 40]
 GHOST = {"kind": "ghost", "view": 4, "width": 0.05, "speed": 0.02}
 BAND = {"kind": "black_band", "width": 0.01, "penumbra": 0.001}
-FRINGES = {"kind": "phase_fringes", "delta_beta": 3000, "distance": 1, "energy": 20}
 
 
 def _config(scene: dict[str, object], *overrides: str) -> Config:
@@ -99,26 +97,6 @@ def test_labels_end_with_the_frames_that_are_in_the_file(tmp_path: Path, monkeyp
     assert _labels(folder) == {"black_band": (2, 5)}
 
 
-def test_labels_that_cannot_be_written_do_not_hide_why_the_scan_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object) -> None:
-        raise DataError("no room for labels")
-
-    monkeypatch.setattr(module, "write_labels", refused)
-    with pytest.raises(DataError, match="no room for labels"):
-        run_scan(_config(BALL), tmp_path / "whole")
-    (folder,) = (tmp_path / "whole").iterdir()
-    with open_scan(folder / "scan.h5") as source:
-        assert (source.image_key.size, source.attributes["status"]) == (16, "complete")
-
-
-def test_a_scene_that_cannot_be_exposed_is_refused_before_there_is_a_folder(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"simulation\.scene"):
-        run_scan(_config(BALL | {"effects": [FRINGES]}), tmp_path / "runs")
-    assert not (tmp_path / "runs").exists()
-
-
 SOD, SDD = 1.0, 3.0
 CONE = BALL | {"beam": {"photons_per_s": 1.0e5, "sod": SOD, "sdd": SDD}, "axis_offset_px": 1.5}
 
@@ -158,8 +136,3 @@ def test_a_cone_that_its_file_could_not_tell_is_refused(tmp_path: Path, override
     with pytest.raises(ConfigError, match=words):
         run_scan(settings, tmp_path / "runs")
     assert not (tmp_path / "runs").exists()
-
-
-def test_a_seed_that_no_generator_takes_is_refused() -> None:
-    with pytest.raises(ConfigError, match="seed"):
-        shipped("simulated", "simulation.seed=-1")

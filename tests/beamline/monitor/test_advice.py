@@ -81,16 +81,6 @@ def test_a_key_of_the_configuration_exists_and_takes_its_value(key: str, value: 
         section = getattr(section, part)
 
 
-def test_there_is_advice() -> None:
-    assert {"recon --calibrate shifts", "recon --time N"} <= set(COMMANDS)
-    assert ("monitor.retake", "true") in KEYS and ("scan.flats.at", "both") in KEYS
-    assert "--air" in OPTIONS
-
-
-def test_views_are_taken_again_by_a_key_and_not_by_a_wish() -> None:
-    assert [(name, text) for name, text in ADVICE if re.search(r"repeat th|more often", text)] == []
-
-
 @pytest.mark.parametrize("check", [check.name for check in CHECKS])
 def test_every_check_may_be_named_for_views_that_are_taken_again(check: str) -> None:
     config = load(config_folder() / "simulated.yaml", [f"monitor.retake=[{check}]"], environment={})

@@ -61,16 +61,6 @@ def test_a_stage_that_slips_turns_by_as_many_steps() -> None:
     assert (found.across, found.down) == pytest.approx((0, 0), abs=0.1)
 
 
-def test_a_dense_crumb_moves_none_of_the_figures() -> None:
-    light = OPEN * np.exp(-Blobs().line_integrals(SPAN))
-    light[10:14, 40:44] *= 0.3
-    found = change_of(view_of(light.astype(np.float32), GRID, SPAN, SPAN * STEP, 1.0), BEFORE, GRID)
-    assert found is not None
-    assert found.gain == pytest.approx(0, abs=1e-3)
-    assert (found.across, found.down) == pytest.approx((0, 0), abs=0.1)
-    assert found.residual[11, 41] == pytest.approx(-np.log(0.3), rel=0.05)
-
-
 def test_a_gap_of_two_views_is_bridged_and_uneven_angles_are_not() -> None:
     assert change(i=SPAN + 2).turn == pytest.approx(0, abs=0.05)
     assert change_of(view(SPAN + 9), BEFORE, GRID) is None

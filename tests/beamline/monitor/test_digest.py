@@ -1,6 +1,5 @@
 """Digest against numpy and scipy, which know nothing of it."""
 
-import time
 import zlib
 
 import numpy as np
@@ -13,7 +12,6 @@ from scipy.stats import entropy as scipy_entropy
 from beamline.monitor.digest import (
     ENOUGH,
     ENTROPY_BINS,
-    _count_greys,
     block_means,
     check_block,
     digest,
@@ -137,57 +135,6 @@ def test_invalid_pixels_are_counted_and_never_spread(image: np.ndarray, bin_: in
     assert found.variance == pytest.approx(values.var(), rel=1e-7, abs=1e-6)
     assert found.sum_abs == pytest.approx(np.abs(values).sum(), rel=1e-9)
     assert found.entropy == pytest.approx(naive_entropy(values), abs=1e-9)
-
-
-def test_variance_keeps_its_digits_far_from_zero(rng: np.random.Generator) -> None:
-    small = rng.normal(size=(50, 40))
-    assert digest(small + 1e7).variance == pytest.approx(small.var(), rel=1e-6)
-
-
-def test_a_view_into_a_larger_array_is_digested_like_its_copy(rng: np.random.Generator) -> None:
-    large = rng.integers(0, 65536, (40, 60)).astype(np.uint16)
-    view = large[3:30, 5:50:2]
-    a, b = digest(view), digest(view.copy())
-    assert (a.checksum, a.mean, a.variance) == (b.checksum, b.mean, b.variance)
-    np.testing.assert_array_equal(a.preview, b.preview)
-
-
-def test_one_frame_compiles_the_kernel_for_all(rng: np.random.Generator) -> None:
-    digest(np.zeros((3, 3), np.uint16))
-    before = len(_count_greys.signatures)
-    image = rng.poisson(100, (20, 20)).astype(np.uint16)
-    for writeable in (True, False):
-        image.flags.writeable = writeable
-        digest(image)
-    digest(image[:, ::2])
-    assert len(_count_greys.signatures) == before
-    assert not image.flags.writeable  # the caller's array is as it was
-
-
-@pytest.mark.parametrize("bad", [np.zeros((2, 2, 2)), np.zeros((0, 4)), np.zeros((2, 2), complex), np.zeros(4)])
-def test_what_is_no_frame_is_refused(bad: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r"real \[row, col\]"):
-        digest(bad)
-    with pytest.raises(ValueError, match="at least 1"):
-        digest(np.zeros((2, 2)), preview_bin=0)
-
-
-@pytest.mark.bench
-@pytest.mark.parametrize(("shape", "limit"), [((2304, 4096), 0.05), ((200, 200), 0.002)])
-def test_a_frame_takes_a_few_milliseconds(shape: tuple[int, int], limit: float, rng: np.random.Generator) -> None:
-    image = rng.poisson(1400, shape).astype(np.uint16)
-    digest(image)
-    start = time.perf_counter()
-    digest(image, saturation=65535)
-    seconds = time.perf_counter() - start
-    print(f"{shape}: {seconds * 1e3:.2f} ms")
-    assert seconds < limit
-
-
-@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2), (1, 1)])
-def test_block_means_are_the_preview_of_a_digest(shape: tuple[int, int]) -> None:
-    image = np.random.default_rng(0).integers(0, 2**16, shape, np.uint16)
-    np.testing.assert_array_equal(block_means(image, 4), digest(image, 60_000, 4).preview)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float16, np.float32, np.float64])

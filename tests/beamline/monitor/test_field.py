@@ -44,22 +44,6 @@ def test_flats_without_beam_are_said_in_a_sentence_and_not_by_bands(fake: Any) -
     assert "shutter" in flag.advice and "rows" not in flag.advice
 
 
-def test_of_many_shadows_four_are_named(fake: Any) -> None:
-    light = fake.expected(None)
-    for first in range(0, FAKE_COLS, 16):
-        light[:, first : first + 4] = 0
-    flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
-    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfViewCheck()])
-    assert "columns 48 ... 51, and 2 more" in flag.advice
-
-
-def test_a_profile_and_a_line_in_the_shadow_of_a_slit_are_no_shadow(fake: Any) -> None:
-    light = fake.expected(None) * np.linspace(0.3, 1.0, FAKE_COLS)
-    light[0] = 0
-    flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
-    assert fake.flags([*fake.darks(), *flats], checks=[FieldOfViewCheck()]) == []
-
-
 @pytest.mark.parametrize(("first", "sides"), [(0, "left"), (COLS - 8, "right")])
 def test_a_sample_beyond_the_field_is_a_fact_about_the_scan(first: int, sides: str) -> None:
     wide = np.zeros((ROWS, COLS))
@@ -70,10 +54,6 @@ def test_a_sample_beyond_the_field_is_a_fact_about_the_scan(first: int, sides: s
     assert "beside the rotation axis" not in flag.advice
     (flag,) = of_field(Blobs(30, depth=lambda view, image: image + wide * (view > 12)))
     assert "beside the rotation axis" in flag.advice and sides in flag.advice
-
-
-def test_a_sample_within_the_field_and_a_beam_that_drifts_by_5_percent_are_none() -> None:
-    assert of_field(Blobs(30, counts=lambda view, light: 0.95 * light)) == []
 
 
 def of_pixels(fake: Any, frames: list[Frame]) -> list[Flag]:

@@ -76,15 +76,6 @@ def test_a_single_group_of_flats_with_the_sample_in_is_refused(
     assert hit.message.startswith("The flats 4-7: ") and said in hit.message
 
 
-@pytest.mark.parametrize(("degrees", "refused"), [(None, False), (45.0, True)])
-def test_where_the_sample_fills_the_field_one_view_without_detail_is_no_flat(
-    degrees: float | None, refused: bool
-) -> None:
-    """No view has air: the ball within is in some views, and the others are smooth, as a drift of the beam is."""
-    held = np.zeros((ROWS, COLS)) if degrees is None else depth(WIDE, np.radians([degrees]))[0]
-    assert bool(told(scan(WIDE, held))) is refused
-
-
 def test_views_that_show_nothing_beside_their_flats_are_named() -> None:
     """A round sample that was never moved out, and no sample at all, cannot be told apart."""
     for balls in (ROUND, []):

@@ -121,11 +121,6 @@ def test_a_missing_trigger_is_told_and_is_no_fault_of_the_frame_after_it(fake: A
     assert bitmask(flags) == 0  # a reconstruction uses it: before, it left the good view out, too
 
 
-def test_a_step_scan_has_no_rhythm(fake: Any) -> None:
-    frames = [replace(f, time=f.time + f.trigger**2) for f in fake.views(8)]
-    assert fake.of("timing", frames, period=None) == []
-
-
 @pytest.mark.parametrize(("armed_anew", "found"), [(False, 1), (True, 0)])
 def test_a_wait_before_the_camera_was_armed_anew_is_no_finding(fake: Any, armed_anew: bool, found: int) -> None:
     """As between two passes, or after a pause: the camera counts from 0 again."""
@@ -199,10 +194,6 @@ def test_every_view_without_light_is_flagged_and_none_after(left: float) -> None
     assert flags[0].score == pytest.approx(1 - left, abs=0.05)
 
 
-def test_without_light_from_the_first_view_on() -> None:
-    assert len(lost(Blobs(6, counts=lambda view, light: 0 * light))) == 6
-
-
 def test_a_view_of_one_value_was_never_written() -> None:
     dark = ScanContext(np.inf, 64, None, 0.1, light_left=0.0)
     for image, said in ((np.zeros((8, 8)), "Every pixel has one value"), (100 + np.eye(8), "The beam is lost: 100%")):
@@ -210,11 +201,6 @@ def test_a_view_of_one_value_was_never_written() -> None:
         frame = Frame(counts, FrameKind.PROJECTION, 7, 7, 7, 0.0, 0.0, 1.0)
         flag = LostCheck().look(LostState(), frame, digest(counts), dark).flag
         assert flag is not None and flag.level is Level.ALARM and flag.advice.startswith(said)
-
-
-def test_a_dip_by_a_third_is_not_lost_nor_is_a_sample_that_covers_more() -> None:
-    assert lost(Blobs(40, counts=lambda view, light: light * (0.67 if view >= 20 else 1.0))) == []
-    assert lost(Blobs(40, depth=lambda view, image: image + 3.0 * (np.arange(128) < 2 * view))) == []
 
 
 def test_it_alone_ends_a_scan() -> None:

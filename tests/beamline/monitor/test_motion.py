@@ -9,7 +9,6 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
-from tests.beamline.monitor.foreign.test_ghost import fog
 
 
 def of_motion(scan: Blobs) -> list[Flag]:
@@ -42,32 +41,11 @@ def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
     assert "steps more than its step" in flags[0].advice
 
 
-def test_a_quarter_of_a_pixel_is_no_finding() -> None:
-    assert of_motion(jumping(0.2, 0.2)) == []
-
-
 def test_vibration_raises_the_limit() -> None:
     scan = Blobs(120)
     rng = np.random.default_rng(4)
     scan.depth = lambda view, image: scan.line_integrals(view, tuple(rng.normal(0, 0.4 / BLOCK, 2)))
     assert [flag.level for flag in of_motion(scan)] == [Level.WARN]  # it is named, and no view is a jump
-
-
-GHOSTS = [(0.6, 8.0, 30.0), (0.3, 3.0, 12.0), (0.1, 15.0, 30.0), (-0.1, 8.0, 30.0), (-0.3, 15.0, 12.0)]
-
-
-@pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
-def test_the_edges_of_a_ghost_are_no_jump(gain: float, speed: float, half_width: float) -> None:
-    assert of_motion(Blobs(80, counts=fog(gain, speed, half_width))) == []
-
-
-@pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
-@pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, -1.0)])
-def test_a_jump_behind_a_ghost_is_one(gain: float, speed: float, half_width: float, shift: tuple[float, float]) -> None:
-    scan = jumping(*shift)
-    ghost = fog(gain, speed, half_width)
-    scan.counts = lambda view, light: ghost(view + 17, light)  # in the field from view 33 on at the latest
-    assert 50 in [flag.frame for flag in of_motion(scan)]
 
 
 SPOTLESS = [check for check in CHECKS if check.name != "pixels"]  # these scans have previews and no pixels
@@ -94,23 +72,9 @@ def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, dow
     assert "`beamline recon --calibrate shifts`" in flags[0].advice
 
 
-@pytest.mark.parametrize("direction", [(0.6, 0.0), (0.0, 0.6)])
-def test_the_other_direction_stays_small(direction: tuple[float, float]) -> None:
-    (flag,) = (flag for flag in shaking(*direction) if flag.check == "motion")
-    told = [float(size) for size in re.findall(r"stand ([\d.]+) px across and ([\d.]+) px down", flag.advice)[0]]
-    assert min(told) < 0.15 < 0.4 < max(told)
-
-
 @pytest.mark.parametrize(("seed", "step", "creep"), [(0, 0.004, 0.0), (2, 0.03, -0.1)])
 def test_a_sample_that_turns_and_creeps_does_not_shake(seed: int, step: float, creep: float) -> None:
     assert not [flag for flag in shaking(0, 0, seed=seed, creep=creep, step=step) if "shakes" in flag.advice]
-
-
-def test_a_jump_is_no_shake() -> None:
-    scan = Blobs(150, step=0.01)
-    scan.depth = lambda view, image: scan.line_integrals(view, (0.0, 1.0 if view > 80 else 0.0))
-    flags = [flag for flag in scan.flags([MotionCheck()], step=0.01) if flag.check == "motion"]
-    assert [flag.level for flag in flags] == [Level.ALARM]
 
 
 def test_a_shake_that_begins_later_is_told_once() -> None:

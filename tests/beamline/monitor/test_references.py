@@ -148,12 +148,6 @@ def test_a_group_that_lost_the_beam_is_judged_by_the_others() -> None:
     assert rules(darks(), good, third) == ["beam_lost"]
 
 
-def test_limits_are_what_they_say() -> None:
-    assert rules(darks(), flats(flickering(frames(5, PHOTONS, 2))), limits=ReferenceLimits(uneven=0.3)) == []
-    lit = darks(0.25 * PHOTONS), flats(frames(5, PHOTONS, 2))
-    assert rules(*lit, limits=ReferenceLimits(light_in_darks=0.5)) == []
-
-
 @given(st.integers(0, 65535))
 def test_a_detector_saturates_at_the_end_of_its_bits(count: int) -> None:
     scale = full_scale(count)

@@ -62,11 +62,3 @@ def test_a_band_in_views_that_follow_one_another_again_is_an_alarm(fake: Any) ->
     black(frames[FIRST + 66])
     found = [flag.frame for flag in fake.flags(frames, step=STEP) if flag.check == "bands"]
     assert found == [FIRST + 30, FIRST + 66]
-
-
-def test_the_usual_step_is_that_of_a_pass() -> None:
-    interlaced = np.concatenate([np.arange(i, 180, 4.0) for i in range(4)])
-    assert (usual_step(interlaced), usual_step(-interlaced)) == (4.0, -4.0)
-    golden = np.arange(200) * 180 / 1.618033988749895 % 180
-    for angles in (golden, np.zeros(5), np.zeros(1), np.full(4, np.nan)):
-        assert np.isnan(usual_step(angles))

@@ -1,7 +1,6 @@
 """What checks could not look at is said, with the number of views; a whole scan of even steps has nothing of it."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 from beamline.monitor import watch
@@ -37,11 +36,3 @@ def test_views_at_uneven_angles_and_too_few_of_them_were_not_compared(fake: Any)
     (text,) = said(fake.references() + jumps)
     assert text.startswith("gain, motion, floater, ghost, dips of beam in 7 of 7 views (no four views")
     assert "in 1 of 1 views" in said(fake.references() + fake.views(1))[0]
-
-
-def test_only_the_first_frame_of_a_view_is_compared_with_the_views_before(fake: Any) -> None:
-    views = fake.views(10)
-    repeated = fake.references() + [replace(view, index=view.index + i) for view in views for i in range(3)]
-    step = views[1].angle - views[0].angle
-    assert said(repeated, step=step, frames_per_view=3) == ()
-    assert "gain, motion, floater, ghost, dips of beam" in said(repeated, step=step)[0]

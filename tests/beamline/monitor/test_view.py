@@ -51,32 +51,9 @@ def test_places_without_light_are_left_out_and_the_edges_are_those_of_the_light(
     assert seen.edges == pytest.approx((DEPTH[0, 22], DEPTH[0, 277]), abs=0.02)
 
 
-def test_a_cell_with_a_hot_pixel_says_nothing_where_light_is_scarce() -> None:
-    dark = DARK.copy()
-    dark[8, 100] = 900.0
-    for light, weight in ((1000.0, 0.0), (30_000.0, 1.0)):
-        grid = grid_of(SHAPE, 8, dark, dark + light)
-        seen = view_of(dark + light * np.exp(-DEPTH).astype(np.float32), grid, 0, 0.0, 1.0)
-        assert seen.weight[4, 50] == pytest.approx(weight * np.exp(-seen.depth[4, 50]))
-        assert seen.depth[4, 50] == pytest.approx(seen.depth[5, 50], abs=1e-3)
-
-
-def test_a_region_is_in_pixels_and_within_the_frame() -> None:
-    assert GRID.cell == 16
-    assert GRID.region(2.0, 10.0, 3.0, 5.0) == (16, 64, 128, 208)
-    assert GRID.region(0.0, 149.0, 9.0, 9.0) == (0, 80, 2320, 2400)
-
-
 @pytest.mark.parametrize("light", [0.02, 0.4, 1.0, 1.3])
 def test_light_left_is_the_beams_whatever_the_sample_does(light: float) -> None:
     last = view_of(counts(DEPTH), GRID, 0, 0.0, 1.0)
     assert light_left(view_of(counts(DEPTH, light), GRID, 1, 0.1, 1.0), last, GRID) == pytest.approx(light, rel=0.01)
     turned = view_of(counts(DEPTH[:, ::-1], light), GRID, 1, 0.1, 1.0)
     assert light_left(turned, last, GRID) > light
-
-
-def test_before_any_view_the_flats_are_the_light() -> None:
-    thick = view_of(counts(DEPTH + 1.5), GRID, 0, 0.0, 1.0)
-    assert light_left(thick, None, GRID) == 1.0
-    assert light_left(view_of(counts(DEPTH, 0.01), GRID, 0, 0.0, 1.0), None, GRID) < 0.05
-    assert light_left(thick, None, grid_of(SHAPE, 8, DARK, None)) == 1.0

@@ -20,13 +20,6 @@ def test_a_clean_scan_raises_no_flag(fake: Any) -> None:
     assert fake.flags(frames) == []
 
 
-def test_a_clean_scan_in_jumping_order_raises_no_flag(fake: Any) -> None:
-    frames = fake.references()
-    for i in range(120):
-        frames += [replace(frame, trigger=i) for frame in fake.views(1, first=i * 77 % 360)]
-    assert fake.flags(frames, period=None) == []
-
-
 @pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_flats_with_an_exposure_of_their_own_are_no_change_of_the_beam(fake: Any, factor: float) -> None:
     def flats() -> list[Frame]:
@@ -51,14 +44,6 @@ def test_checks_compare_with_the_mean_of_the_latest_group_of_references(fake: An
             mean = np.mean([digest(frame.counts, 65535, 4).preview for frame in frames], axis=0)
             found = state.context.dark if kind is FrameKind.DARK else state.context.flat
             np.testing.assert_allclose(found, mean, rtol=1e-5)
-
-
-def test_a_frame_may_have_several_flags(fake: Any) -> None:
-    frames = fake.references() + fake.views(12)
-    frames[-1].counts[:] = 200
-    frames[-1].counts[30] = 65535
-    checks = {flag.check for flag in fake.flags(frames)}
-    assert {"lost", "saturation"} <= checks
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Values of a run: what its log says, event by event."""
 
-import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,12 +12,10 @@ from beamline.core.events import (
     FrameFlagged,
     FrameStored,
     RunStarted,
-    ScanDone,
     StateEntered,
     Warned,
 )
 from beamline.core.flag import Flag, Level
-from beamline.core.run_result import RunResult
 from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
@@ -36,11 +33,6 @@ def _stamped(*events: Event) -> StampedValues:
 
 def _after(*events: Event) -> RunValues:
     return _stamped(*events).values
-
-
-def test_names_are_unique_and_said() -> None:
-    named = [each.metadata["name"] for each in fields(RunValues)]
-    assert len(set(named)) == len(named) and all(each.metadata["about"] for each in fields(RunValues))
 
 
 def test_every_kind_of_event_sets_its_values() -> None:
@@ -70,19 +62,7 @@ def test_flags_are_counted_by_check_until_another_run_begins() -> None:
     assert _after(STARTED, *flags, STARTED).flag_names == ()
 
 
-def test_the_end_leaves_no_rate() -> None:
-    done = ScanDone(RunResult(Path("a"), 20, [], {}, 0, 0, 0, [], 60.0, 1000, None, "complete"))
-    now = _after(STARTED, FRAME, done)
-    assert math.isnan(now.rate) and now.time_left == 0
-
-
 SEEN = {"frames": 15, "status": "running", "free": 3e9, "age_s": 0.5, "newest": 1234.5, "next": ""}
-
-
-def test_the_file_says_what_is_stored() -> None:
-    now = _stamped(STARTED, Warned("the beam is low")).with_file(SEEN, 12.5, 1300.0).values
-    assert (now.stored, now.percent, now.angle, now.free, now.age) == (15, 75.0, 12.5, 3.0, 0.5)
-    assert now.message == "the beam is low"
 
 
 def test_each_value_has_the_time_of_what_set_it() -> None:
@@ -93,12 +73,6 @@ def test_each_value_has_the_time_of_what_set_it() -> None:
         "angle": 1234.5, "free": 1300.0, "beam": BEGAN,
     }  # fmt: skip
     assert {name: now.stamp(name).time for name in expected} == expected
-
-
-def test_a_frame_with_the_same_rate_is_a_newer_value() -> None:
-    once, twice = _stamped(STARTED, FRAME), _stamped(STARTED, FRAME, FRAME)
-    assert once.values == twice.values
-    assert (once.stamp("rate").time, twice.stamp("rate").time) == (1001.0, 1002.0)
 
 
 @pytest.mark.parametrize(
@@ -119,11 +93,6 @@ def test_a_frame_with_the_same_rate_is_a_newer_value() -> None:
 )
 def test_severities(event: Event, name: str, severity: Severity) -> None:
     assert _stamped(STARTED, event).stamp(name).severity is severity
-
-
-@pytest.mark.parametrize("name", ["planned", "rate", "beam", "residual", "free"])
-def test_a_value_that_is_not_known_is_invalid(name: str) -> None:
-    assert StampedValues(RunValues(), BEGAN).stamp(name) == Stamp(BEGAN, Severity.INVALID, "not known")
 
 
 def test_a_scan_that_died_is_an_alarm_and_says_what_can_be_done() -> None:

@@ -10,14 +10,12 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.page.recording import Recording
 from beamline.page.shown_scan import ShownScan
 from beamline.page.tiles import TileRegion
-from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -111,13 +109,3 @@ def test_a_growing_file_shows_each_frame_as_it_is_committed(tmp_path: Path) -> N
         assert len(recording.columns(3)["kind"]) == len(frames) - 3
         assert recording.progress().status == "running"
         recording.close()
-
-
-def test_a_frame_that_is_not_there_is_refused(recording: Recording) -> None:
-    with pytest.raises(DataError, match="Frame 999 is"):
-        recording.picture(999, WHOLE, corrected=True)
-
-
-def test_a_scan_that_has_no_file_yet_is_not_ready(tmp_path: Path) -> None:
-    with pytest.raises(NotReadyError):
-        Recording(tmp_path / "scan.h5")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.page.tiles import MOST, TileRegion, bin_mean, pack
+from beamline.page.tiles import TileRegion, bin_mean, pack
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 4), st.integers(1, 4))
@@ -29,19 +29,8 @@ def test_packed_values_come_back_to_half_a_step(rng: np.random.Generator) -> Non
     assert packed.numbers[others].max() == 65534
 
 
-@pytest.mark.parametrize("value", [0.0, 7.5, np.nan])
-def test_a_picture_of_one_value_is_packed(value: float) -> None:
-    packed = pack(np.full((2, 2), value, np.float32))
-    assert np.isfinite([packed.offset, packed.scale]).all()
-
-
 @given(*[st.integers(0, 10**9)] * 4)
 def test_any_region_has_a_pixel_inside_the_picture(a: int, b: int, c: int, d: int) -> None:
     inside = TileRegion(a, b, c, d).inside((7, 5))
     assert 0 <= inside.first_row < inside.last_row <= 7
     assert 0 <= inside.first_col < inside.last_col <= 5
-
-
-def test_no_tile_is_larger_than_a_screen() -> None:
-    whole = TileRegion(0, 2304, 0, 4096)
-    assert bin_mean(np.zeros((2304, 4096)), (whole.binning(),) * 2).shape == (576, MOST)

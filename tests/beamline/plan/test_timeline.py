@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from beamline.plan import plan as angles
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.timeline import block_seconds, describe, move_seconds, passes, taxi_angle, work_out
+from beamline.plan.timeline import block_seconds, move_seconds, passes, taxi_angle, work_out
 from drivers.base.errors import DeviceRefused
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits
@@ -263,17 +263,6 @@ def test_a_plan_is_refused_where_its_pulses_would_run_together(
         assert not (close or uneven)
 
 
-def test_advice_for_pulses_that_would_run_together_works_when_followed() -> None:
-    """500 counts at 30 000 counts/s are 16.7 ms; at 25 deg/s they are 20."""
-    stage = replace(STAGE, pulse_spacing=0.02)
-    (violation,) = worked(stage=stage).violations
-    assert "500 counts of the stage apart, its trigger output needs 600: 0.02 s at its full speed of 30°/s" in violation
-    most = float(re.search(r"max_speed_deg_s <= ([\d.]+)", violation)[1])  # type: ignore[index]
-    assert most == 25
-    assert worked(stage=replace(stage, max_speed=most * DEG)).violations == ()
-    assert worked(stage=replace(stage, max_speed=(most + 0.1) * DEG)).violations != ()
-
-
 def test_no_trigger_output_and_no_room() -> None:
     (violation,) = worked(stage=replace(STAGE, trigger_output=False)).violations
     assert "no trigger output" in violation
@@ -329,49 +318,3 @@ def test_skew_is_remarked_and_a_quiet_plan_has_no_remark() -> None:
     slow = replace(CAMERA, row_period=86.4e-6, shape=(2304, 252))
     assert any("rolling shutter skews" in remark for remark in worked(camera=slow).remarks)
     assert worked(replace(PLAN, angles=angles.fixed(400))).remarks == ()
-
-
-def test_blur_is_how_far_an_edge_point_moves() -> None:
-    """Against the geometry: a point at the farther edge of the detector, turned by speed x exposure."""
-    timeline = worked(axis_col=100.0)
-    block = timeline.blocks[2]
-    turned = block.speed * PLAN.exposure
-    edge = 252 - 0.5 - 100.0
-    assert timeline.blur_px == pytest.approx(edge * math.sin(turned), rel=1e-4)
-
-
-def test_interlaced_passes_return_at_full_speed() -> None:
-    one, two = (worked(replace(PLAN, angles=angles.interlaced(360, n))) for n in (1, 2))
-    views = two.blocks[2]
-    assert len(views.trains) == 2
-    assert views.speed == pytest.approx(10 * DEG)
-    (a, b), (c, d) = [(flown.start, flown.end) for flown in passes(views)]
-    back = move_seconds(c - b, STAGE.max_speed, STAGE.acceleration)
-    pure = sum(move_seconds(x - y, views.speed, STAGE.acceleration) for x, y in ((a, b), (c, d)))
-    assert back > 6
-    to_start = move_seconds(a, STAGE.max_speed, STAGE.acceleration)
-    assert block_seconds(views, STAGE, CAMERA, 0.1) == pytest.approx(pure + back + to_start + 0.0506)
-    assert two.duration > one.duration
-
-
-def test_describe_says_everything() -> None:
-    timeline = worked(free_bytes=5 * 10**9)
-    text = "\n".join(describe(PLAN, timeline, STAGE, CAMERA, free_bytes=5 * 10**9))
-    for part in (
-        "30-389",
-        "0.5° = 500 counts of 0.001°",
-        "5°/s",
-        "0.5° before the first and after the last trigger",
-        "0.55 px",
-        "144 x 252 px",
-        "410 frames of 72.6 kB and previews = 33.5 MB; 5 GB free",
-        "0:00:4",
-        "remark",
-    ):
-        assert part in text, part
-    assert "VIOLATION" not in text
-    broken = replace(PLAN, angles=angles.golden(100), scheme="golden")
-    text = "\n".join(describe(broken, worked(broken), STAGE, CAMERA))
-    assert "VIOLATION the views are not equally spaced" in text
-    step = replace(PLAN, mode=Mode.STEP)
-    assert "0.1 s to settle" in "\n".join(describe(step, worked(step), STAGE, CAMERA))

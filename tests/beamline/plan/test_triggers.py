@@ -87,12 +87,6 @@ def test_serpentine_and_text_files_fly_too() -> None:
     assert flight.interval == 167
 
 
-def test_whole_steps_do_not_drift() -> None:
-    flight = plan_flight(angles.fixed(1800), stage())
-    assert (flight.interval, flight.trains[0].end) == (100, 179_900)
-    assert flight.drift < 1e-12
-
-
 @given(views=st.integers(3, 60), seed=st.integers(0, 999))
 def test_random_views_cannot_fly(views: int, seed: int) -> None:
     theta = angles.random(views, rng=np.random.default_rng(seed))

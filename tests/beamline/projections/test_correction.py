@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
-from recon.prep.correct import Correction, merge_and_empty
+from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
@@ -29,32 +26,6 @@ PLAIN = Selection(steps=(Air("none"),))
 
 def correction_of(source: Any, selection: Selection, warn: Callable[[str], object] = pytest.fail) -> ScanCorrection:
     return ScanCorrection(source, selection, warn)
-
-
-def test_only_what_was_asked_for_is_read() -> None:
-    source = counted(SCAN.counts(), SCAN.angles)
-    correction_of(source, replace(PLAIN, views="first:5", rows=(1, 3), axis_col=20.7)).at_once(np.arange(2, 7))
-    assert max(len(frames) for frames, rows in source.was_read if rows == 4) == 1  # whole frames, to judge references
-    assert [frames for frames, rows in source.was_read if min(frames) >= 2 and rows == 2] == [[2, 3, 4, 5, 6]]
-
-
-def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[int, int]] = []
-    after = dict[str, int]()  # how many were told when a step had ended
-
-    def noted(step: str, work: Callable[..., Any]) -> Callable[..., Any]:
-        def done(*arguments: Any) -> Any:
-            found = work(*arguments)
-            after[step] = told[-1][0] if told else 0
-            return found
-
-        return done
-
-    correction = correction_of(counted(SCAN.counts(), SCAN.angles), Selection())
-    monkeypatch.setattr(module, "read_binned", noted("reading", read_binned))
-    monkeypatch.setattr(Correction, "transmission", noted("dividing", Correction.transmission))
-    correction.at_once(np.arange(2, 47), progress=lambda n, of: told.append((n, of)))
-    assert after == {"reading": 15, "dividing": 30} and told == sorted(told) and told[-1] == (45, 45)
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
@@ -103,16 +74,6 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     else:
         assert said == []
     np.testing.assert_allclose(np.exp(-found.data).mean(axis=(1, 2)), truth, rtol=3e-3)  # 5 sigma of 1600 pixels
-
-
-def test_line_integrals_need_no_neighbour() -> None:
-    source = ArraySource(SCAN.counts().astype(np.float32), [0] * 45, SCAN.angles)
-    source.quantity = "line_integrals"
-    correction = correction_of(source, Selection())
-    parts = [correction.feed(np.arange(0, 20), last=False), correction.feed(np.arange(20, 45), last=False)]
-    assert correction.feed(np.arange(0), last=True) is None and not correction.outdated
-    whole = merge_and_empty([part for part in parts if part is not None])
-    np.testing.assert_array_equal(whole.data, correction.at_once(np.arange(45)).data)
 
 
 def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:

@@ -14,9 +14,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
-from drivers.base.frame import FrameKind
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -70,11 +68,3 @@ def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple
     with pytest.raises(DataError, match=f"all {kind} are damaged"):
         prepare(path, SELECTION)
     assert prepare(path, IGNORE)[0].projections.view_ids.size == 45
-
-
-def test_rows_count_on_behind_references_that_were_given(tmp_path: Path) -> None:
-    darks, flats = np.full((3, *SCAN.shape), 100, np.uint16), np.full((2, *SCAN.shape), 20100, np.uint16)
-    with open_scan(SourceOptions(scan(tmp_path, 9), darks=darks, flats=flats)) as source:
-        assert source.checksummed and not source.damaged
-        source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION))
-        assert source.damaged == {9 + 5}

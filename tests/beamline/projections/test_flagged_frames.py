@@ -52,18 +52,6 @@ def test_the_worst_of_each_kind_come_first(most: int, rows: list[int]) -> None:
     assert worst.image.shape == (2, 200) and worst.extent == (6, 600)
 
 
-def test_a_view_that_was_taken_again_names_the_new_one() -> None:
-    scan = source()
-    scan.replaces = np.where(np.arange(30) == 25, 11, -1)  # type: ignore[assignment]
-    titles = [frame.title for frame in worst_frames(scan, flags(), 1)]  # type: ignore[arg-type]
-    assert titles == ["frame 11, replaced by 25, 11.0°"]
-
-
-def test_nothing_is_shown_where_nothing_is_flagged() -> None:
-    empty = FrameFlags.of_marks([mark_of(())] * 30)
-    assert (reasons(empty), worst_frames(source(), empty)) == ([], [])  # type: ignore[arg-type]
-
-
 def test_means_of_darks_and_flats_and_how_the_beam_changed() -> None:
     frames = np.repeat([10, 12, 110, 112, 60, 60, 70], 6 * 600).reshape(7, 6, 600)
     scan = ArraySource(frames.astype(np.uint16), [2, 2, 1, 1, 0, 0, 1], np.zeros(7))

@@ -13,18 +13,14 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamline.cli.main import main
-from beamline.config.load import config_folder
 from beamline.core.events import Event, Warned
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
-from beamline.projections.replay import context_of, judged_flags, replay
+from beamline.projections.replay import context_of, replay
 from beamline.scan.recorder import Consequences, Recorder
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
@@ -160,28 +156,3 @@ def test_a_run_and_its_file_have_the_same_flags(
             preview = file["entry/digest/preview"]
             assert preview.attrs["bin"] == preview_bin
             assert preview.shape[1:] == (-(-rows // preview_bin), -(-cols // preview_bin))
-
-
-def test_the_many_flags_of_the_troubled_scan_do_not_depend_on_the_preview(tmp_path: Path) -> None:
-    """Otherwise the test above compares nothing with nothing."""
-    found, *others = (record(Troubled((40, 160), 60, 3), tmp_path / f"{side}.h5", side, ()) for side in (8, 4, 32))
-    checks = {flag.check for flag in found}
-    assert len(checks) >= 5 and {"saturation", "stuck"} <= checks
-    assert others == [found, found]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preview_bin", "roi", "views"), [(8, "[1080, 1968, 144, 160]", 240), (16, "[1080, 1948, 100, 200]", 180)]
-)
-def test_a_simulated_scan_and_its_file_have_the_same_flags(
-    tmp_path: Path, preview_bin: int, roi: str, views: int
-) -> None:
-    said = [f"storage.folder={tmp_path}", f"storage.preview_bin={preview_bin}", f"devices.camera.roi={roi}"]
-    said += ["simulation.clock=virtual", "recon.live=false", f"scan.angles.views={views}"]
-    words = ["scan", str(config_folder() / "simulated.yaml"), "--json"]
-    ran = CliRunner().invoke(main, words + [word for one in said for word in ("--set", one)])
-    assert ran.exit_code == 0, ran.output
-    (path,) = tmp_path.rglob("scan.h5")
-    with open_scan(path) as source:
-        assert_equal(judged_flags(source), source.flags)

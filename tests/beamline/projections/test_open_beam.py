@@ -87,15 +87,6 @@ def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
     assert found.photons.variance == pytest.approx(READOUT**2 / of, rel=0.2)
 
 
-def test_batches_give_what_one_pass_gives() -> None:
-    whole = correction_of(scan(20), Preparation(noise="counts")).at_once(np.arange(30, 40))
-    fed = correction_of(scan(20), Preparation(noise="counts"))
-    parts = [fed.feed(np.arange(30, 34), last=False), fed.feed(np.arange(34, 40), last=True)]
-    for name in ("data", "weights"):
-        together = np.concatenate([getattr(part, name) for part in parts])
-        np.testing.assert_array_equal(together, getattr(whole, name))
-
-
 def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
     prepared, _ = prepare(scan(20), PLAIN.with_steps(Preparation(noise="counts")))
     held = hold_out(prepared, 9, advice="")

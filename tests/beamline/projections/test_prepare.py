@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse
 from recon.base.views import spread_views
-from recon.prep.align import AxisError, AxisEstimate
+from recon.prep.align import AxisEstimate
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
@@ -144,11 +143,6 @@ def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     assert told == []
 
 
-def test_darks_of_another_exposure_are_told() -> None:
-    _, (warning,) = prepare(exposed([0.1], dark=0.025), GIVEN)
-    assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warning
-
-
 def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None:
     counts = SCAN.counts().astype(np.float32)
     counts[[3, 30]] = np.nan
@@ -196,12 +190,6 @@ def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
         prepare(path, Selection(), quantity=quantity)
 
 
-def test_empty_field_is_refused(tmp_path: Path) -> None:
-    path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": np.full(_SHAPE, DARK + BEAM, np.uint16)})
-    with pytest.raises(DataError):
-        prepare(path, Selection(axis_col=20.0))
-
-
 def _estimate(value: float, confident: bool) -> AxisEstimate:
     return AxisEstimate(value, np.arange(3.0), np.arange(3.0), confident, "pair")
 
@@ -224,13 +212,6 @@ def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatc
     prepared, warnings = prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
     assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.2)
     assert not any("axis" in text for text in warnings)
-
-
-def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    at_the_edge = Mock(side_effect=AxisError("the best axis, column 0, is at the edge"))
-    monkeypatch.setattr(axis_module, "find_axis", at_the_edge)
-    with pytest.raises(DataError, match=r"at the edge.*--axis COLUMN"):
-        prepare(counted(SCAN.counts(), SCAN.angles), FOUND)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError
 from beamline.projections.prepared import PreparedProjections, hold_out, with_held_out
 from beamline.projections.selection import Selection
 from tests.beamline.array_source import counted
@@ -53,12 +52,6 @@ def test_no_more_than_the_most_are_held_out_and_neither_the_first_nor_the_last()
     held = hold_out(_prepared("all"), 2, most=4, advice="").held_out
     assert held is not None
     np.testing.assert_allclose(np.degrees(held[1].angles), [18, 66, 108, 156])
-
-
-def test_two_views_leave_none() -> None:
-    prepared = _prepared("all", np.array([0.0, 1.5]))
-    with pytest.raises(ConfigError, match="--early-stop"):
-        _every_tenth(prepared)
 
 
 def test_one_set_for_the_reconstructor() -> None:

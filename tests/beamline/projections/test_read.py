@@ -15,15 +15,6 @@ from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 
 
-def test_reading_is_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = np.arange(7 * 2 * 3, dtype=np.uint16).reshape(7, 2, 3)
-    source = ArraySource(data, [0] * 7, np.zeros(7))
-    monkeypatch.setattr("beamline.projections.read.BATCH_BYTES", 3 * 2 * 3 * 2)
-    got = read_binned(source, np.array([6, 0, 5, 1, 2]), slice(0, 2), 1)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(got, data[[6, 0, 5, 1, 2]])
-    assert [len(frames) for frames, _ in source.was_read] == [3, 2]
-
-
 @pytest.mark.parametrize("binning", [1, 2])
 def test_rows_of_all_frames_are_read_where_the_pieces_of_a_frame_are_too_many_to_hold(
     monkeypatch: pytest.MonkeyPatch, binning: int

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.rings.rings import Rings
-from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
-from beamline.projections.selection import Selection
+from beamline.projections.registry import all_steps, recorded, registered, steps_of
 from beamline.projections.step import StepDone, key_of, options_of
 
 
@@ -29,13 +26,6 @@ def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
         steps_of(values | {"noise": "log", "gain": 2.0})
 
 
-def test_a_selection_takes_one_step_of_a_kind() -> None:
-    selection = Selection(steps=(Rings("sort"),)).with_steps(Air("none"), Rings("vo"))
-    assert selection.steps == (Air("none"), Rings("vo"))
-    assert (selection.step(Rings).way, selection.step(Phase)) == ("vo", Phase())
-    assert [step.name for step in in_order(selection)] == [step.name for step in all_steps()]
-
-
 def test_the_file_records_what_a_step_says_or_its_options() -> None:
     steps = [Preparation("ignore", noise="counts", gain=2.0), Rings("vo")]
     done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
@@ -50,10 +40,3 @@ def test_the_file_records_what_a_step_says_or_its_options() -> None:
         "rings_removed": "none seen",
     }
     assert recorded(steps, done) == expected
-
-
-@pytest.mark.parametrize(
-    ("model", "parts"), [("auto", ("auto", "auto")), ("3,4", ((3, 4), "none")), ("surface:2", ("auto", 2))]
-)
-def test_air_by_its_columns_and_its_surface(model: str, parts: object) -> None:
-    assert (Air(model).columns, Air(model).surface) == parts

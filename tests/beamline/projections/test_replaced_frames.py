@@ -10,12 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.selection import Selection
 from beamline.storage.rules.references import reference_groups
 from drivers.base.frame import FrameKind
-from tests.beamline.projections.replaced import AXIS, BEAM, VIEWS, Blocks, decibels, line_integrals
+from tests.beamline.projections.replaced import BEAM, VIEWS, Blocks, decibels, line_integrals
 from tests.slow_cases import others_slow
 
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
@@ -103,14 +100,6 @@ def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine
     assert found > clean(2, 3) - 0.5
 
 
-def test_a_group_of_flats_alone_with_the_sample_beside_its_place_is_refused() -> None:
-    """It reaches the edge of the field, so that its mass is not known: but no beam doubles within a scan."""
-    blocks = Blocks(1, 3)
-    blocks.of(FLAT)[0][:] = _flats_through(blocks, "displaced")
-    with pytest.raises(DataError, match=r"absorbs least is 2.* times as bright as the flats"):
-        decibels(blocks.source())
-
-
 def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """The views outshine them in places, and hold no more matter elsewhere."""
     blocks = Blocks(1, 3)
@@ -145,21 +134,6 @@ def test_darks_and_flats_swapped_are_refused() -> None:
     dark[:], flat[:] = flat.copy(), dark.copy()
     with pytest.raises(DataError, match="flats 3-5:"):
         decibels(blocks.source())
-
-
-def test_half_the_current_at_one_group_of_flats_does_no_harm() -> None:
-    blocks = Blocks(2, 3)
-    blocks.of(FLAT)[1][:] = blocks.of(FLAT)[1] / 2 + 50
-    assert decibels(blocks.source())[0] > clean(2, 3) - 0.5
-
-
-def test_accepted_references_are_used_as_they_were_taken() -> None:
-    blocks = Blocks(1, 3)
-    blocks.of(DARK)[0][0] += BEAM
-    selection = Selection(axis_col=AXIS, steps=(Preparation(references="accept"),))
-    correction = ScanCorrection(blocks.source(), selection, pytest.fail)  # type: ignore[arg-type]
-    assert correction._beam is not None
-    np.testing.assert_allclose(correction._beam.references.dark.mean(), 100 + BEAM / 3, rtol=0.01)
 
 
 @pytest.mark.parametrize("scale", [0.05, 1.0])

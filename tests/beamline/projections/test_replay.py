@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from beamline.projections.replay import by_kind, context_of, counts_of, judged_f
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import Frame
 from tests.beamline.array_source import ArraySource
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
@@ -174,18 +173,6 @@ def test_flags_are_gathered_by_check_and_level() -> None:
     ]  # fmt: skip
     assert found[1].worst.frame == 4
     assert counts_of(found) == {"a": {"alarm": 1, "warn": 5}, "b": {"warn": 1}, "c": {"info": 1}}
-
-
-def test_stopping_ends_it_between_frames() -> None:
-    source = ArraySource(np.full((9, 4, 40), BEAM, np.uint16), [0] * 9, np.zeros(9))
-    stop = threading.Event()
-    seen = []
-    for judged in replay(source, should_stop=stop.is_set):  # type: ignore[arg-type]
-        seen.append(judged.row)
-        if judged.row == 3:
-            stop.set()
-    assert seen == [0, 1, 2, 3]
-    assert judged.kind == FrameKind.PROJECTION
 
 
 class Fails(SaturationCheck):

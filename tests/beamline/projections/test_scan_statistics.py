@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections import scan_statistics
 from beamline.projections.scan_statistics import (
     PERCENT,
     LightAsked,
@@ -18,7 +17,6 @@ from beamline.projections.scan_statistics import (
     table,
 )
 from beamline.storage.readers.open import SourceOptions, open_scan
-from drivers.base.frame import FrameKind
 from recon.prep.matter import absorbed_dose
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -43,13 +41,6 @@ def test_counts_are_described_exactly_by_kind(tmp_path: Path) -> None:
     assert said[-1] == (2 * len(frames), 2 * len(frames))
     assert histograms(found).startswith(b"\x89PNG")
     assert [row[0] for row in table(found)] == ["kind", "dark", "flat", "projection"]
-
-
-def test_few_frames_stand_for_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scan_statistics, "FRAMES", 3)
-    with open_scan(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})) as source:
-        views = statistics_of(source, lambda n, of: None)[-1]
-    assert (views.kind, views.frames, views.of) == (FrameKind.PROJECTION, 3, SCAN.angles.size)
 
 
 def test_real_numbers_keep_their_range_and_those_that_are_none_are_counted(

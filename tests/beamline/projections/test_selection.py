@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -38,8 +36,3 @@ def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: 
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
     with open_scan(path) as source, pytest.raises(ConfigError, match=said):
         prepare_projections(source, selection, pytest.fail)
-
-
-def test_a_pair_from_a_list_or_an_array_is_the_same_pair() -> None:
-    pair: Any = np.array([40, 44])
-    assert Selection(rows=pair) == Selection(rows=pair.tolist()) == Selection(rows=(40, 44))

@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.open import SourceOptions
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange, write_nxtomo
 
@@ -75,20 +75,6 @@ def test_light_and_the_other_sign_are_never_taken_as_line_integrals(
     path = stack(tmp_path / "t.tif", factor * np.exp(-LINES) if factor else -LINES, dtype)
     with pytest.raises(DataError, match=told):
         lines(path, quantity="line_integrals")
-
-
-def test_line_integrals_are_never_taken_as_transmission(tmp_path: Path) -> None:
-    path, shape = stack(tmp_path / "p.tif", LINES), (1, *SCAN.shape)
-    np.testing.assert_array_equal(lines(path, quantity="line_integrals"), LINES.astype(np.float32))
-    for facts in ({"quantity": "transmission"}, {"darks": np.zeros(shape), "flats": np.ones(shape)}):
-        with pytest.raises(DataError, match=r"0 at the edges.*--quantity"):
-            lines(path, **facts)
-
-
-def test_references_beside_it_are_refused(tmp_path: Path) -> None:
-    path = stack(tmp_path / "t.tif", np.exp(-LINES))
-    with pytest.raises(DataError, match="--darks and --flats"):
-        open_scan(SourceOptions(path, quantity="transmission", flats=np.ones((1, *SCAN.shape))))
 
 
 @pytest.mark.parametrize("kind", ["exchange", "nxtomo"])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from beamline.projections.consistency import cut_sentence
-from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
@@ -95,11 +94,6 @@ def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: fl
     assert share is not None
     assert int(share[1]) == pytest.approx(100 * more / mean, rel=0.05)
     assert "No exposure is stated" in line
-
-
-def test_columns_that_are_said_to_be_air_are_air() -> None:
-    found, _ = prepare(scan(90.0), SELECTION.with_steps(Air("columns")))
-    assert min(found.projections.air_columns) > 0
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.prepared_views import prepare
-from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, decibels, line_integrals
+from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 
 FIRST = 6  # row of the first view, behind three darks and three flats
@@ -43,19 +42,6 @@ def test_a_volume_is_that_of_the_other_views(unlit: list[int], value: float | No
     np.testing.assert_allclose(found.geometry.angles, ANGLES[lit])
     assert sum("have no light" in line for line in told) == 1
     np.testing.assert_allclose(found.projections.data, line_integrals()[lit], atol=0.12)
-
-
-def test_few_of_them_cost_little() -> None:
-    """And five in a row no more than their wedge of 20 degrees."""
-    right = decibels(scan([], 0.0))[0]
-    for unlit, cost in (([7], 0.5), ([0, 20, 44], 0.5), (list(range(40, 45)), 3)):
-        assert decibels(scan(unlit, 0.0))[0] > right - cost
-
-
-def test_a_gap_is_told_and_flags_that_are_ignored_change_nothing() -> None:
-    _, told = prepare(scan(list(range(10, 18)), None), SELECTION.with_steps(Preparation("ignore")))
-    (line,) = (line for line in told if "no light" in line)
-    assert "8 views of 45 (frames 16-23) have no light" in line and "leave 36° without a view" in line
 
 
 def test_more_than_half_of_the_views_are_refused() -> None:

@@ -15,9 +15,7 @@ from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
-from beamline.storage.readers.base import read_known
 from beamline.storage.readers.open import SourceOptions
-from drivers.base.frame import FrameKind
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
@@ -98,14 +96,3 @@ def test_a_scan_whose_frames_all_cannot_be_read_is_refused_with_the_reason(tmp_p
     scan: SourceOptions = write(tmp_path, list(range(6, len(FRAMES))))  # type: ignore[operator]
     with scan.open() as source, pytest.raises(DataError, match=r"Frame \d+ of .*cannot be read"):
         prepare(source, SELECTION)
-
-
-def test_what_is_read_of_them(tmp_path: Path) -> None:
-    with nxtomo(tmp_path, [7]).open() as source:
-        with pytest.raises(DataError, match="cannot be read"):
-            source.read([6, 7])
-        found = read_known(source, [8, 7, 6], slice(1, 3))
-        np.testing.assert_array_equal(found[[0, 2]], FRAMES[[8, 6], 1:3])
-        assert not found[1].any() and list(source.unreadable) == [7]
-        kinds = [frame.kind for frame in source.frames()]
-        assert kinds[7] is FrameKind.INVALID and kinds[8] is FrameKind.PROJECTION

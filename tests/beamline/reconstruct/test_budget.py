@@ -123,27 +123,6 @@ def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     assert len(warned) == 1
 
 
-def test_a_fit_with_much_time_ends_with_its_plan(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """More steps than were best on other scans follow the noise."""
-    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
-    monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))
-    monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
-    done = _spend(prepared, 60.0, SteppedClock(100.0, 0.1), methods=(R2(),))
-    assert done.history[-1].step == 7 and done.seconds < 30
-
-
-@pytest.mark.slow
-def test_the_shortest_fit_is_said_to_be_late_too(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _as_fast_as(monkeypatch, 20.0, 60, 3.0, 9.0)
-    warned: list[str] = []
-    _spend(_cone(prepared, 3.0), 0.001, SteppedClock(100.0, 0.01), warned)
-    assert len(warned) == 1 and "the cheapest choice, r2, binned" in warned[0]
-
-
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e2), st.floats(1e-3, 1e2), st.integers(1, 64))
 def test_a_choice_takes_no_more_than_its_time_where_any_does(
     seconds: float, fbp: float, step: float, largest: int
@@ -279,15 +258,6 @@ def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections)
     assert psnr(truth, done.volume.data) > direct + 1
     same_rays = _spend(_cone(prepared, 2 * np.pi, 2.0), 8.0, SteppedClock(100.0, 0.01))
     assert done.history[-1].residual == pytest.approx(same_rays.history[-1].residual, rel=1e-3)
-
-
-def test_a_cone_is_placed_as_its_parallel_likeness_is(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
-    both = (prepared, _cone(prepared, 2 * np.pi))
-    counts = [_spend(views, 3.0, SteppedClock(100.0, 0.01)).settings["gaussians_at_start"] for views in both]
-    assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
 
 
 @pytest.mark.parametrize("views", ["parallel", "of a cone", "that lean"])

@@ -70,21 +70,6 @@ def test_every_change_is_told_by_its_name(prepared: PreparedProjections, name: s
     assert [said.split(" ")[0] for said in found] == [name]
 
 
-def test_fewer_views_are_told_by_number(prepared: PreparedProjections) -> None:
-    few = replace(
-        prepared,
-        projections=replace(prepared.projections, data=prepared.projections.data[:20]),
-        geometry=prepared.geometry.select(slice(20)),
-    )
-    found = differences(origin_of(few, SETTINGS, OTHERS), origin_of(prepared, SETTINGS, OTHERS))
-    assert "n_views (20, 30 in the file)" in found
-
-
-def test_views_held_out_do_not_matter(prepared: PreparedProjections) -> None:
-    spoilt = replace(prepared, held_out=(np.zeros((1, 2, 40), np.float32), prepared.geometry.select([0])))
-    assert not differences(origin_of(spoilt, SETTINGS, OTHERS), origin_of(prepared, SETTINGS, OTHERS))
-
-
 def _state(**changes: Any) -> dict[str, Any]:
     """Of a fit of five Gaussians that has begun."""
     model = Gaussians.from_physical(np.zeros((5, 3)), np.ones((5, 3)), np.ones(5), density_unit=1.0)

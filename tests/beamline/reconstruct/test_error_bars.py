@@ -102,21 +102,6 @@ def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: py
     assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters
 
 
-@pytest.mark.slow
-def test_a_choice_of_methods_may_have_it(folder: Path) -> None:
-    """Ten of the 45 views are too few for trials, so that the last candidate is taken, with its own error bars."""
-    found = deviation(*FBP[:4], "-m", "auto", "--views", "fixed:10", "--rows", "24:28")
-    assert np.isfinite(found).all() and np.median(found) > 0
-
-
-def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
-    def needed(*options: str) -> str:
-        return next(line for line in beamline(*options, "--dry-run").stdout.splitlines() if line.startswith("memory"))
-
-    alone = tuple(option for option in FBP if option != "--uncertainty")
-    assert needed(*FBP) != needed(*alone)
-
-
 @pytest.mark.parametrize(
     ("options", "why"),
     [
@@ -134,10 +119,3 @@ def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options
     assert result.exit_code == 2, result.output
     assert why in " ".join(result.stderr.split())
     assert left(folder) == {"scan.h5"}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("real_pictures")
-def test_the_report_draws_it(folder: Path) -> None:
-    assert beamline("recon", "scan.h5", "--uncertainty", "-m", "fbp", "-o", "out.h5").exit_code == 0
-    assert "Error bars" in Path("out.html").read_text(encoding="utf-8")

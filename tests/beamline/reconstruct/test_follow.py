@@ -6,9 +6,6 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import UTC, datetime
-from multiprocessing import get_context
-from multiprocessing.synchronize import Event as MpEvent
 from pathlib import Path
 
 import h5py
@@ -18,14 +15,12 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.sinks import Warnings
-from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
 from beamline.reconstruct.live_fit import FollowState, ScanFollower
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame
 from recon.assess.metrics import psnr
@@ -42,8 +37,6 @@ from tests.beamline.reconstruct.growing_scan import (
     RHYTHM,
     SCAN,
     ScanClock,
-    StandingClock,
-    alarms,
     close,
     options,
     schedule,
@@ -151,15 +144,6 @@ def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: P
     assert read_reconstruction(tmp_path / "recon.h5").parameters["n_views"] == 30
 
 
-def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(12))
-    selection = Selection("every:2", axis_col=SCAN.axis_col)
-    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), [].append, clock)
-    n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
-    assert n_views in (14, 15)  # of 30, one of them or of the others with an alarm
-
-
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
@@ -185,36 +169,6 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert not (tmp_path / "recon.snapshot.h5").exists()  # the volume is there
 
 
-def _write_and_wait(path: Path, frames: list[Frame], written: MpEvent, close: MpEvent) -> None:
-    writer = NXtomoWriter(path, ScanInfo(sample="two cylinders"), frames[0].counts.shape, clock=StandingClock())
-    for frame in frames:
-        writer.append(frame, digest(frame.counts), [])
-    written.set()
-    close.wait(60)
-    writer.close("complete")
-
-
-@pytest.mark.slow  # a process starts
-def test_the_report_has_the_facts_of_the_closed_file(tmp_path: Path) -> None:
-    """A writer of another process writes texts anew when it closes the file, which the follower has open."""
-    spawn = get_context("spawn")
-    written, close = spawn.Event(), spawn.Event()
-    arguments = (tmp_path / "scan.h5", frames_of(INTERLACED), written, close)
-    writer = spawn.Process(target=_write_and_wait, args=arguments)
-    writer.start()
-    assert written.wait(60)
-
-    def look(event: Event) -> None:
-        if event.event == "snapshot" and not close.is_set():
-            close.set()
-            writer.join(60)
-
-    target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
-    reconstruct_file(options(tmp_path, target=target), look, ScanClock())
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert f"end_time</th><td>{datetime.fromtimestamp(EPOCH, UTC).isoformat(timespec='milliseconds')}</td>" in page
-
-
 def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     golden = np.pi * (np.arange(60) * (5**0.5 - 1) / 2 % 1)
     scan = replace(SCAN, angles=golden)
@@ -234,16 +188,6 @@ def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert 24 < enough["n_views"] < 60 == enough["planned"]
     assert enough["high"] <= 0.2 and enough["low"] <= enough["mean"] <= enough["high"]
     assert asked[0][0] >= 24 and asked[-1][0] == enough["n_views"]
-
-
-@pytest.mark.slow
-def test_where_the_plan_is_not_known_no_views_are_enough(tmp_path: Path) -> None:
-    clock, events = ScanClock(), list[Event]()
-    scan = replace(INTERLACED, angles=np.radians(np.arange(0, 180, 3.0))[np.argsort(np.arange(60) * 0.618 % 1)])
-    schedule(clock, tmp_path / "scan.h5", frames_of(scan))
-    reconstruct_file(options(tmp_path, enough=Goal(psnr_loss=9.0)), events.append, clock)
-    assert sum("planned views" in str(e.data.get("message")) for e in events) == 1
-    assert "enough" not in [event.event for event in events]
 
 
 FRAMES = frames_of(INTERLACED)
@@ -312,16 +256,6 @@ def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch:
     assert h5py.is_hdf5(tmp_path / "recon.h5")
 
 
-@pytest.mark.slow
-def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(replace(INTERLACED, shape=(4, 40))))
-    selection = Selection(rows=(1, 3), binning=2, axis_col=SCAN.axis_col)
-    reconstruct_file(options(tmp_path, selection=selection), lambda event: None, clock)
-    grid = read_reconstruction(tmp_path / "recon.h5").volume.grid
-    assert grid.shape == (1, 20, 20) and grid.voxel_size == pytest.approx(1.0)
-
-
 def _follower(folder: Path, clock: ScanClock, frames: list[Frame]) -> tuple[ScanFollower, list[Event]]:
     """Of a file that takes a frame a second, without an axis."""
     events: list[Event] = []
@@ -369,12 +303,3 @@ def test_a_method_that_needs_all_views_waits_for_the_end(tmp_path: Path) -> None
     record = reconstruct_file(wanted, events.append, clock)
     assert record.method == "fbp" and record.parameters["n_views"] == SCAN.angles.size
     assert [e.data["state"] for e in events if e.event == "state"][:2] == ["waiting", "waiting"]  # for it, for its end
-
-
-def test_a_method_that_needs_all_views_tells_of_a_scan_that_died(tmp_path: Path) -> None:
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), status=None)
-    with pytest.raises(DataError, match=r"is not finished; it has 34 frames"):
-        reconstruct_file(options(tmp_path, method=Fbp()), lambda event: None, clock)
-    assert not (tmp_path / "recon.h5").exists()
-    close(clock)

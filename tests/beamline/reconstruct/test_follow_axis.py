@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection
 from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.prep.align import AxisEstimate
-from tests.beamline.array_source import scan_of
 from tests.beamline.reconstruct.growing_scan import BRIEF, FIT, INTERLACED, SCAN, ScanClock, options, schedule
-from tests.beamline.scans import TwoCylinders, frames_of
+from tests.beamline.scans import frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -83,32 +81,3 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
     assert 50 in looks and looks[-1] == 100 and search.col == 20.7
     assert len(set(told)) == 1 and "--axis COLUMN" in told[0] and "optics.axis_col" in told[0]
-
-
-def test_slits_beside_the_sample_do_not_hide_the_axis() -> None:
-    """Ratios of noise behind them, far from the middle, moved the centre of mass: half a turn was needed."""
-    scan = TwoCylinders(angles=np.radians(np.arange(0, 60, 1.0)), shape=(4, 80), axis_col=41.3)
-    rng, lit = np.random.default_rng(1), (np.arange(80) > 17) & (np.arange(80) < 64)
-    dark, flat = (rng.normal(mean, 2, (6, 4, 80)) for mean in (100, 20_100 * lit + 100 * ~lit))
-    views = np.where(lit, 100 + 20_000 * np.exp(-scan.line_integrals()), 100)
-    source: Any = scan_of(dark, flat, rng.normal(views, 10 * lit + 2), scan.angles)
-    search = followed_views.AxisSearch(source, Selection(), pytest.fail)  # type: ignore[arg-type]
-    for n in range(1, 61):
-        correction = ScanCorrection(source, Selection(), lambda sentence: None)
-        search.look(correction, np.arange(12, 12 + n), False)
-    assert search.col == pytest.approx(41.3, abs=0.5)
-
-
-@pytest.mark.slow
-def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    unclear = AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair")
-    monkeypatch.setattr("beamline.projections.axis.find_axis", lambda data, angles: unclear)
-    monkeypatch.setattr("beamline.projections.axis.axis_by_views", lambda data, geometry, lit: unclear)
-    clock, events = ScanClock(), list[Event]()
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
-    (started,) = [event.data for event in events if event.event == "recon_started"]
-    assert started["n_views"] == 30
-    assert any(e.event == "warning" and "not a clear optimum" in e.data["message"] for e in events)

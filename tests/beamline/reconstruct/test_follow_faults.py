@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from multiprocessing.synchronize import Event as ProcessEvent
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
@@ -24,12 +22,11 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import Frame
 from recon.assess.metrics import psnr
 from tests.beamline.reconstruct.growing_scan import (
     FIT,
     INTERLACED,
-    RHYTHM,
     SCAN,
     ScanClock,
     StandingClock,
@@ -72,14 +69,6 @@ def _spoiled(frames: list[Frame], bad: set[int]) -> list[Frame]:
     return [replace(f, counts=f.counts // 40) if f.index in bad else f for f in frames]
 
 
-@pytest.mark.slow
-def test_half_of_the_views_with_an_alarm(tmp_path: Path) -> None:
-    frames, bad = frames_of(INTERLACED), set(range(4, 34, 2))
-    good = _numbered([frame for frame in frames if frame.index not in bad])
-    undisturbed = _followed(tmp_path / "good.h5", good, 0.2, {}, [])
-    assert _followed(tmp_path / "half.h5", _spoiled(frames, bad), 0.1, alarms(*bad), []) > undisturbed - ALLOWED
-
-
 def test_views_that_are_flagged_after_the_model_has_learnt_them(tmp_path: Path) -> None:
     frames, bad = frames_of(INTERLACED), set(range(18, 23))
     good = _numbered([frame for frame in frames if frame.index not in bad])
@@ -119,48 +108,3 @@ def test_a_writer_that_is_killed_leaves_views_as_good_as_those_of_a_scan_that_wa
     assert recovered > stopped - ALLOWED
     frames = read_reconstruction(tmp_path / "recovered_recon.h5").parameters["view_frames"]
     np.testing.assert_array_equal(frames, np.arange(4, 24))  # type: ignore[arg-type]
-
-
-class StepClock(ScanClock):
-    """Counts looks, so that the last round has its steps on any machine; waits for a file in another process."""
-
-    def sleep(self, seconds: float) -> None:
-        time.sleep(0.02)
-
-
-def _follow_for_real(path: Path) -> None:
-    numba.set_num_threads(1)
-    patient = replace(_options(path), follow=replace(RHYTHM, patience=1e4))
-    reconstruct_file(patient, lambda event: None, StepClock())
-
-
-@pytest.mark.slow
-def test_a_follower_that_is_killed_and_started_again(tmp_path: Path) -> None:
-    spawn, path, frames = multiprocessing.get_context("spawn"), tmp_path / "scan.h5", frames_of(INTERLACED)
-    writer = NXtomoWriter(path, INFO, INTERLACED.shape, clock=SystemClock())
-    snapshot = tmp_path / "scan_recon.snapshot.h5"
-    follower = spawn.Process(target=_follow_for_real, args=(path,))
-    follower.start()
-    for frame in frames[:20]:
-        writer.append(frame, digest(frame.counts))
-    for _ in range(1200):
-        if snapshot.exists():
-            break
-        time.sleep(0.1)
-    assert snapshot.exists() and follower.is_alive()
-    follower.kill()
-    follower.join(60)
-    assert not (tmp_path / "scan_recon.h5").exists()
-    again = spawn.Process(target=_follow_for_real, args=(path,))
-    again.start()
-    for frame in frames[20:]:
-        writer.append(frame, digest(frame.counts))
-        time.sleep(0.1)
-    writer.close("complete")
-    again.join(180)
-    assert again.exitcode == 0
-    volume = read_reconstruction(tmp_path / "scan_recon.h5").volume
-    path.rename(tmp_path / "undisturbed.h5")
-    undisturbed = _quality(tmp_path / "undisturbed.h5", StepClock())
-    assert psnr(SCAN.truth(volume.grid), volume.data) > undisturbed - ALLOWED
-    assert sum(frame.kind is FrameKind.PROJECTION for frame in frames) == 30

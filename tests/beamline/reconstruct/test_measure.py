@@ -128,25 +128,6 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
     assert measure(wrong, prepared, None)["residual"] == pytest.approx(whole, rel=1e-5)
 
 
-def test_bands_lie_where_the_matter_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few rows of a large detector show a sample: a residual is of these, at its ends as well."""
-    monkeypatch.setattr(module, "RESIDUAL_RAYS", 4 * 16 * 24)
-    ball = _ball((200, 24, 24))
-    thin = Volume(np.where(np.isin(np.arange(200), (0, 1, 63, 199))[:, None, None], ball.data[100], 0), ball.grid)
-    wrong = Volume(0.8 * thin.data, ball.grid)
-    prepared = _prepared(thin)
-    views, seen = _views_and_as_seen(prepared, thin.grid)
-    expected = np.linalg.norm(seen - 0.8 * views) / np.linalg.norm(views)
-    assert expected == pytest.approx(0.2, abs=0.01)
-    assert measure(wrong, prepared, None)["residual"] == pytest.approx(expected, rel=1e-5)
-
-
-def test_a_volume_without_two_regions_has_no_snr() -> None:
-    flat = Volume(np.ones((4, 8, 8), np.float32), Grid((4, 8, 8)))
-    assert regions(flat, 0) is None
-    assert contrast_by(None, flat) == {}
-
-
 def test_a_constant_truth_is_refused() -> None:
     for value in (1.0, np.nan):
         with pytest.raises(ConfigError, match="nothing to compare"):

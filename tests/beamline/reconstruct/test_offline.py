@@ -16,7 +16,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct import budget, checkpoints, job
+from beamline.reconstruct import checkpoints
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -26,9 +26,7 @@ from beamline.storage.writers.recon_file import ReconRecord, read_checkpoint, re
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
 from recon.base.volume import Grid
-from recon.forecast import Pace
 from recon.methods import build, by_name
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
@@ -128,29 +126,6 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
         assert said in page
     # Slices, profile, differences, quality, projection, sinogram, darks and flats; the axis was given.
     assert page.count("data:image/png;base64,") == 7
-
-
-@pytest.mark.parametrize(
-    "changes", [{"method": R2(steps=3, start="tv", fit=FitSettings(loss="l2"))}, {"method": R2(), "budget": 1.0}]
-)
-def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]
-) -> None:
-    asked: list[dict[str, object]] = []
-
-    def compiled(method: R2 | None = None, geometry: object = None, **others: object) -> None:
-        asked.append({"method": method or R2(), "geometry": geometry})
-
-    monkeypatch.setattr(job, "warm_up", compiled)
-    monkeypatch.setattr(budget, "paces_of", lambda *_: {"r2": Pace(0.3, 0.01, 0)})
-    selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
-    _made(_options(tmp_path, selection=selection, **changes))
-    assert len(asked) == 1
-    geometry = asked[0].pop("geometry")
-    assert isinstance(geometry, Geometry) and geometry.n_views == 20 and geometry.detector_shape == (2, 40)
-    compiled_for, wanted = asked[0]["method"], changes["method"]
-    assert isinstance(compiled_for, R2) and isinstance(wanted, R2)
-    assert (compiled_for.start, compiled_for.fit) == (wanted.start, wanted.fit)
 
 
 def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
@@ -315,14 +290,6 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.parameters["n_views"] == 41
     assert np.isfinite(record.history["held_out"][-1])
-
-
-def test_loss_kernel_and_start_are_those_that_were_asked_for_and_kept(tmp_path: Path) -> None:
-    method = replace(R2_FIT, start="tv", fit=FitSettings(loss="poisson", kernel=Kernel.COMPACT))
-    record = _made(_options(tmp_path, **{**FIT, "method": method}))
-    kept = {name: record.parameters[name] for name in ("loss", "kernel", "start", "device")}
-    assert kept == {"loss": "poisson", "kernel": Kernel.COMPACT.value, "start": "tv", "device": "cpu"}
-    assert record.metrics["residual"] < 0.2
 
 
 @pytest.mark.parametrize("method", ["cgls", "os-sirt-tv"])

@@ -34,9 +34,3 @@ def test_a_fit_taken_up_again_is_as_fast_as_it_is_now(first: int) -> None:
 def test_a_time_tells_the_end_where_no_steps_are_planned() -> None:
     told = _told([(1, 1.0), (50, 4.0), (900, 50.0)], 0, seconds=30.0)
     assert [data["eta_s"] for data in told] == [30.0, 27.0, 0.0]
-
-
-def test_a_fit_that_begins_anew_is_timed_anew() -> None:
-    told = _told([(1, 1.0), (101, 2.0), (1, 10.0), (11, 11.0)], 0)
-    assert [data["per_s"] for data in told] == [None, pytest.approx(100), None, pytest.approx(10)]
-    assert told[-1]["eta_s"] is None

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import recon
 from beamline.core.events import Event
@@ -17,7 +16,6 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.record import write_result
 from beamline.reconstruct.scan_facts import ReportContext, facts_of
-from beamline.report import figures
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -66,16 +64,3 @@ def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(
     done, _ = _written(made, (prepared, scan[1]), tmp_path / "out.h5")
     assert ("fbp" in done) is compared
     assert not compared or done["fbp"]["residual"] < 0.3
-
-
-def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
-    for geometry in (
-        Geometry.parallel([0.0, 1.0], (6, 40), pixel_pitch=0.5, axis_col=18.0),
-        Geometry.cone([0.0, 1.0], (6, 40), 5.0, 100.0, 1000.0, axis_col=18.0),
-    ):
-        figures.projection(np.random.default_rng(0).random((2, 6, 40), np.float32), geometry, 0, "mm")
-    flat, cone = (figure.axes[0].get_images()[0].get_extent() for figure in drawn)
-    np.testing.assert_allclose(cone, flat)
-    np.testing.assert_allclose(flat, [-18.5 * 0.5, 21.5 * 0.5, 1.5, -1.5])  # z downwards

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from beamline.projections import prepare
-from beamline.reconstruct.region import Region
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -116,15 +115,3 @@ def test_beyond_the_width_is_refused_before(
     result = beamline("recon", "scan.h5", "-m", "fbp", "-o", "out.h5", "--roi", *options.split())
     assert result.exit_code == 2 and said in result.stderr, result.output
     assert left(folder) == {"scan.h5"}
-
-
-def test_a_wide_field_has_regions_beyond_the_detector(folder: Path) -> None:
-    """Its volume is as wide as a full turn sees: 77 voxels of 48 columns."""
-    assert volume("-m", "fbp", "--axis", "9", "--roi", "38:60,10:40,50:77", "-o", "out.h5").volume.data.shape[2] == 27
-
-
-def test_a_region_says_what_it_was_parsed_from() -> None:
-    assert str(Region.parse("3:5,0:7,10:11")) == "3:5,0:7,10:11"
-    for wrong in ("", "3:5,0:7,10:11,", "3:5,0:7,11:10", "a:b,0:1,0:1", "-1:5,0:7,1:2", "3:5,0:7,10:11x"):
-        with pytest.raises(ValueError, match="whole numbers"):
-            Region.parse(wrong)

@@ -85,11 +85,6 @@ def test_a_model_of_needles_is_told(width: float, told: bool, rng: np.random.Gen
     assert any("100% of the mass of the model is in Gaussians thinner than a pixel" in each for each in said) is told
 
 
-def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> None:
-    said = odd(warnings_of(*_made(rng, dict.fromkeys(range(0, 40, 6), 0.5), "sirt")))
-    assert said.count("frame ") == 5 and "; and 2 more" in said
-
-
 def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_where_all_are_like_the_volume(
     rng: np.random.Generator,
 ) -> None:
@@ -123,14 +118,6 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
     said = not_begun_warning(replace(made, volume=volume), left, uniform)
     assert (said == "") is begun
     assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
-
-
-def test_views_of_one_column_say_nothing_of_a_volume() -> None:
-    data, geometry = np.ones((8, 3, 1), np.float32), Geometry.parallel(np.linspace(0, 3, 8), (3, 1))
-    volume = Volume(np.ones((3, 1, 1), np.float32), Grid.matching(geometry))
-    found = residuals_along_rows(volume, prepared_views(data, geometry))
-    assert found == (0, 0)
-    assert not_begun_warning(Reconstruction(volume, {}, method="sirt", seconds=1.0), *found) == ""
 
 
 def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None:

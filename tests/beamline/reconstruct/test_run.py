@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,7 +16,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.reconstruct.run import fit_within, warnings_told
+from beamline.reconstruct.run import fit_within
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
@@ -62,14 +61,6 @@ def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> Non
     assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
 
 
-def test_warnings_of_python_are_told_as_sentences() -> None:
-    said: list[str] = []
-    before = warnings.showwarning
-    with warnings_told(said.append):
-        warnings.warn("the fit starts from coarse views", stacklevel=1)
-    assert said == ["the fit starts from coarse views"] and warnings.showwarning is before
-
-
 def _told(
     folder: Path, method: R2, clock: SteppedClock | SystemClock, stop: Callable[[], bool] = lambda: False
 ) -> tuple[list[Event], list[str]]:
@@ -98,12 +89,6 @@ def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_
     assert "FBP for comparison" not in phases and "fbp" not in events[-1].data
     remark = next(text for text in said[fit:] if text.startswith("Left out, as the seconds"))
     assert remark in (tmp_path / "out.html").read_text()
-
-
-def test_a_call_with_seconds_enough_leaves_nothing_out(tmp_path: Path) -> None:
-    events, phases = _told(tmp_path, R2(seconds=1e4, steps=5, finish=0, gaussians=50), SystemClock())
-    assert "FBP for comparison" in phases
-    assert not [event for event in events if "Left out" in str(event.data.get("message"))]
 
 
 def test_who_stops_a_fit_waits_for_no_comparison(tmp_path: Path) -> None:

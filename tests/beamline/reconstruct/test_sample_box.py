@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import box_around_sample
 from tests.beamline.array_source import ArraySource, scan_of
@@ -56,10 +55,3 @@ def test_of_a_sample_beyond_the_field_all_is_made(rows: slice) -> None:
     region = box_around_sample(scan(cylinders((0, 0, 70.0, 0.01, rows))), PLAIN)
     assert region.z == (0, ROWS) and region.y == region.x and region.x[0] == 0 and region.x[1] >= COLS
     assert "goes on beyond the field at the left and the right" in region.reason
-
-
-def test_what_has_no_box_is_refused() -> None:
-    with pytest.raises(DataError, match="finds no matter"):
-        box_around_sample(scan(cylinders()), PLAIN)
-    with pytest.raises(ConfigError, match="is a cone"):
-        box_around_sample(scan(cylinders((0, 0, 8.0, 0.1, slice(4, 9))), cone=(100.0, 200.0)), PLAIN)

@@ -8,21 +8,16 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from weakref import WeakSet
 
 import numpy as np
 import pytest
 
-from beamline.projections.selection import Selection
 from beamline.reconstruct import estimate
-from beamline.reconstruct import memory as module
-from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import _as_they_come
-from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from recon.forecast import Forecast
@@ -194,26 +189,8 @@ def test_no_more_slabs_wait_to_be_written_than_are_made_at_a_time() -> None:
         list(_as_they_come(lambda n: 1 / n, [1, 0], 1))
 
 
-def test_no_thread_outlives_the_slabs() -> None:
-    """It would hold the partial volume and its lock, which the next step needs."""
-    before = set(threading.enumerate())
-    for _ in range(20):
-        list(_as_they_come(lambda n: n, range(8), 8))
-        assert not set(threading.enumerate()) - before
-
-
 @dataclass(eq=False)
 class Made:
     """A slab."""
 
     n: int
-
-
-def test_processes_on_this_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "free_memory", lambda: 10**9)
-    options = ReconOptions(SourceOptions(Path("scan.h5")), OutputPaths(Path("out.h5"), None), Selection())
-    alone = module.memory_of(options)
-    assert alone == module.SHARE * 10**9
-    assert module.memory_of(replace(options, cluster="local:4")) == round(alone / 5)
-    assert module.memory_of(replace(options, cluster="tcp://host:8786")) == alone
-    assert module.memory_of(replace(options, cluster="local:4", memory=7)) == 7

@@ -9,15 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.reconstruct import estimate
-from beamline.reconstruct.memory import ReconMemory
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.base.geometry import Geometry
-from recon.base.volume import Grid
-from recon.voxels.direct import Fbp
-from recon.voxels.methods import OsSirtTv
 from tests.beamline.cli.small_scan import beamline, left
-from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
+from tests.beamline.scans import TwoCylinders, write_exchange
 
 
 @pytest.fixture
@@ -66,16 +60,6 @@ def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
     assert parts.metrics["residual"] == pytest.approx(whole.metrics["residual"], rel=1e-6)
     assert parts.parameters["replaced_fraction"] == pytest.approx(whole.parameters["replaced_fraction"])
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
-
-
-@pytest.mark.slow
-def test_flags_and_line_integrals_as_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    scan = TwoCylinders(shape=(150, 40))
-    write_flagged(Path("scan.h5"), frames_of(scan), {7: "warning", 9: "alarm"})
-    np.testing.assert_array_equal(volume("--memory", "3M", "-o", "a.h5"), volume("--memory", "1G", "-o", "b.h5"))
-    a, b = (read_reconstruction(Path(name)).parameters for name in ("a.h5", "b.h5"))
-    np.testing.assert_array_equal(a["view_weights"], b["view_weights"])
 
 
 @pytest.mark.slow
@@ -154,16 +138,6 @@ def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
     assert result.exit_code == 2 and "such as 8G" in result.stderr
 
 
-def test_what_is_needed_grows_with_the_scan() -> None:
-    views = Geometry.parallel(np.linspace(0, np.pi, 1800, endpoint=False), (2048, 2048))
-    full = ReconMemory(Fbp(), views, 2 * 1800 * 2048**2, False)
-    assert full.line_integrals == 1800 * 2048**2 * 4 and full.volume == 2048**3 * 4
-    assert 60e9 < full.at_once < 90e9
-    assert full.least < 4e9 and full.slab(full.height(8_000_000_000)) < 8e9
-    tv = ReconMemory(OsSirtTv(), views, 2 * 1800 * 2048**2, False)
-    assert 64 <= tv.height(32_000_000_000) < 256 and tv.slab(tv.height(32_000_000_000)) < 32e9
-
-
 @pytest.mark.usefixtures("tall")
 def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) -> None:
     few = ("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--memory", "16M", "--dry-run")
@@ -175,48 +149,3 @@ def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) ->
     assert data["output"] == 4 * 200 * 48**2 and data["scratch"] == 4 * 60 * 200 * 48 + 2 * data["output"]
     assert data["seconds"] > 0
     assert left(tmp_path) == {"scan.h5"}
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("tall")
-def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Views of 200 rows; the later half stands 100 rows higher."""
-    Path("poses.csv").write_text("view,shift_row_px\n" + "".join(f"{n},{100 * (n >= 30)}\n" for n in range(60)))
-    seen = list[tuple[Geometry, Grid]]()
-    monkeypatch.setattr(estimate, "forecast", lambda method, geometry, grid, now: seen.append((geometry, grid)))
-    dry = ("recon", "scan.h5", "-m", "sirt", "--dry-run", "-o", "out.h5")
-    stepped = beamline(*dry, "--poses", "poses.csv")
-    assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1][1].shape[0] == 300, stepped.output
-    assert beamline(*dry, "--exposure-arc", "4:2").exit_code == 0
-    assert seen[-1][0].width.arc == pytest.approx(np.radians(4)) and seen[-1][0].skew != 0
-
-
-@pytest.mark.slow
-def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gaussians are placed in matter; the views of a slab without any may even be below zero on average."""
-    monkeypatch.chdir(tmp_path)
-    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(96, 32), axis_col=15.7)
-    counts = scan.counts()
-    counts[:, 40:] = 20110
-    write_exchange(Path("scan.h5"), scan, {"data": counts, "data_white": np.full((2, 96, 32), 20100, np.uint16)})
-    options = ("recon", "scan.h5", "-m", "r2", "--steps", "10", "--gaussians", "900", "--air", "none", "--no-report")
-    result = beamline(*options, "--memory", "7M", "-o", "out.h5")
-    assert result.exit_code == 0 and "by fista-tv" in result.stderr, result.output
-    volume = read_reconstruction(Path("out.h5")).volume.data
-    assert np.abs(volume[70:]).max() < 0.02 * volume.max()
-
-
-@pytest.mark.parametrize(
-    ("to", "wedge"), [(120.0, "60° of rays are in no view, those at 28 to 88° from x"), (180.0, "")]
-)
-def test_a_report_shows_the_wedge_that_no_view_sees(
-    to: float, wedge: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    scan = TwoCylinders(angles=np.radians(np.arange(0, to, 4.0)), shape=(8, 48), axis_col=23.7)
-    write_exchange(Path("scan.h5"), scan, {"data": scan.counts(), "data_white": np.full((2, 8, 48), 20100, np.uint16)})
-    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "out.h5").exit_code == 0
-    page = next(Path().glob("*.html")).read_text()
-    assert ("Missing wedge" in page) == bool(wedge) and wedge in page

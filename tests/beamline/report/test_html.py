@@ -8,14 +8,11 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
-from jinja2 import UndefinedError
 from matplotlib.figure import Figure
 
 from beamline.core.errors import DataError
 from beamline.report import figures
-from beamline.report.history import quality_against_time
-from beamline.report.html import Picture, Report, render, to_html, write_report
-from beamline.report.metrics import METRICS, formatted
+from beamline.report.html import Picture, Report, to_html, write_report
 from beamline.report.sheets import reference_sheet
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -92,25 +89,6 @@ def test_remarks_are_counted_and_listed() -> None:
     assert "No remarks" in "".join(parsed_page(to_html(_report())).text)
 
 
-def test_a_fact_that_marks_no_frame_is_no_flag() -> None:
-    """The table beside it says how many frames the monitor flagged: none."""
-    fact = "Info (field, frame 24): The sample goes on beyond the left edge of the field"
-    said = "".join(parsed_page(to_html(_report(flags=[fact], scan={"flagged by the monitor": "none"}))).text)
-    assert "1 remark of the monitor and the reconstruction" in said and fact in said
-    assert "1 flag" not in said and "none" in said
-
-
-def test_a_template_without_one_of_its_values_is_no_page() -> None:
-    with pytest.raises(UndefinedError, match="report"):
-        render("report.html", title="t", summary="s", scan={}, rows=[])
-
-
-def test_every_metric_formats() -> None:
-    for name, metric in METRICS.items():
-        assert formatted(name, 1.0).endswith(metric.unit)
-    assert formatted("snr", -np.inf) == "undefined"
-
-
 def test_report_is_whole_and_never_overwrites(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_report(path, _report())
@@ -176,31 +154,6 @@ def test_y_and_z_run_downwards_in_slices_and_views(monkeypatch: pytest.MonkeyPat
         assert (panel.images[0].origin, top < bottom) == ("upper", True)
 
 
-def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) -> None:
-    data = np.zeros((3, 30, 40), np.float32)
-    data[:, :, 20:] = 1
-    grid = Grid(data.shape, 0.5)
-    both = {
-        "sharp": Volume(data, grid),
-        "noise": Volume(data + rng.normal(0, 0.1, data.shape).astype(np.float32), grid),
-    }
-    assert _pixels(figures.profile_and_values(both, "mm")).ndim == 3
-    for shape in ((1, 1, 5), (2, 8, 8)):
-        assert _pixels(
-            figures.profile_and_values({"v": Volume(np.zeros(shape, np.float32), Grid(shape, 1.0))}, "px")
-        ).ndim
-
-
-@pytest.mark.parametrize(("shape", "n"), [((1, 64, 64), 1), ((2, 8, 300), 3), ((40, 20, 20), 3)])
-def test_slices_of_any_shape(shape: tuple[int, int, int], n: int, rng: np.random.Generator) -> None:
-    """A voxel is a pixel or more, where the picture has room for it, and a picture is not huge."""
-    volumes = {f"v{i}": Volume(rng.random(shape, dtype=np.float32), Grid(shape, 0.1)) for i in range(n)}
-    pixels = _pixels(figures.orthogonal_slices(volumes, "mm"))
-    assert shape[2] * n < pixels.shape[1] < 2600
-    if n > 1:
-        assert _pixels(figures.differences(volumes, "mm")).shape[1] > shape[2] * (n - 1)
-
-
 def test_differences_are_from_the_first_in_one_scale_about_zero(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
     monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
@@ -218,18 +171,3 @@ def test_the_sheet_of_darks_and_flats(rng: np.random.Generator) -> None:
     images = {title: rng.random((20, 30), dtype=np.float32) for title in ("dark", "flats", "last flats / first")}
     assert _pixels(reference_sheet(images, (200, 300))).ndim == 3
     assert _pixels(reference_sheet({"dark": images["dark"][:1]}, (2, 300))).ndim == 3
-
-
-def test_projection_and_sinogram(rng: np.random.Generator) -> None:
-    geometry = Geometry.parallel([2.0, 0.0, 1.0], (2, 30), pixel_pitch=0.1, axis_col=20.0)
-    data = rng.random((3, 2, 30), dtype=np.float32)
-    assert _pixels(figures.projection(data, geometry, 0, "mm")).ndim == 3
-    assert _pixels(figures.sinogram(data, geometry, 1)).ndim == 3
-
-
-def test_curves() -> None:
-    columns = np.linspace(10, 20, 11)
-    assert _pixels(figures.axis_curve(columns, (columns - 14) ** 2, 14.0, False)).ndim == 3
-    seconds = np.arange(5.0)
-    history = {"seconds": seconds, "loss": 1 / (1 + seconds), "residual": np.full(5, np.nan), "n_views": seconds}
-    assert _pixels(quality_against_time(history)).ndim == 3

@@ -1,7 +1,6 @@
 """The picture of a growing volume: where things are in it, and that the difference is in units of the noise."""
 
 import io
-import time
 
 import matplotlib.image
 import numpy as np
@@ -56,16 +55,3 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
     difference = panel(shown(volume, view, render), 2, 256, 256)[..., 0].mean(axis=1)
     assert difference[10:100].mean() > 0.8  # brighter than the fit by about five times the noise, and not all white
     assert difference[150:250].mean() == pytest.approx(0.5, abs=0.05)  # noise alone
-
-
-@pytest.mark.bench
-def test_the_time_that_it_takes_beside_a_fit(rng: np.random.Generator) -> None:
-    grid = Grid((256, 256, 256), 0.01)
-    volume, view = Volume(rng.random(grid.shape, np.float32), grid), rng.random((256, 256), np.float32)
-    seconds = []
-    for _ in range(5):
-        before = time.process_time()
-        live_picture(volume_rows(volume, view, 0.9 * view, "180 views so far", "mm"))
-        seconds.append(time.process_time() - before)
-    print(f"{np.median(seconds):.2f} CPU s a picture of 256³ voxels")
-    assert np.median(seconds) < 0.3

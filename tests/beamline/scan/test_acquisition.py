@@ -108,16 +108,6 @@ def test_step_lost_frames_are_named_and_the_scan_goes_on(lost: set[int]) -> None
     assert_safe(instrument, home=not runs_of_three)
 
 
-def test_where_the_start_is_too_vague_the_error_says_how_far_the_angles_may_be_off() -> None:
-    """Pulses every 23 ms, and the first one expected to within 46 ms: an ignored first trigger cannot be told apart."""
-    instrument = FakeInstrument(Faults(ignored={5}))
-    instrument.stage.limits = replace(instrument.stage.limits, acceleration=np.radians(60).item())
-    run = Run(instrument, instrument.timeline(n=140, speed=55))
-    assert isinstance(run.error, LedgerError)
-    assert "1 of 140 projections are missing" in str(run.error)
-    assert "may all be wrong by up to 1 steps" in str(run.error)
-
-
 def test_frames_that_no_trigger_made_become_invalid_rows() -> None:
     instrument = FakeInstrument(Faults(extra_after={9, 16}))
     run = Run(instrument, instrument.timeline(n=12))

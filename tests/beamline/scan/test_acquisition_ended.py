@@ -1,8 +1,5 @@
 """A scan that is stopped, aborted or cut short by a device: what was exposed keeps its angles, and it ends up safe."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 
 from beamline.core.errors import InstrumentError, ScanStopped
@@ -14,18 +11,6 @@ from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraSettings, TriggerSource
 from tests.beamline.acquired import Run, assert_safe
 from tests.beamline.fakes import COUNT, HOME, FakeInstrument, Faults, assert_true
-
-
-@pytest.mark.parametrize("abort", [False, True])
-def test_a_scan_cut_short_says_that_its_first_frame_came_a_trigger_late(abort: bool) -> None:
-    """The start is vague, and nothing but that frame's time tells that the first trigger was ignored."""
-    stop = StopRequest()
-    wish = stop.abort if abort else stop.stop
-    instrument = FakeInstrument(Faults(ignored={5}), at={40: wish})
-    instrument.stage.limits = replace(instrument.stage.limits, acceleration=np.radians(60).item())
-    run = Run(instrument, instrument.timeline(n=140, speed=55), stop)
-    assert type(run.error) is (ScanAborted if abort else ScanStopped)
-    assert "may all be wrong by up to 1 steps" in str(run.error)
 
 
 @pytest.mark.parametrize("mode", [Mode.FLY, Mode.STEP])

@@ -122,14 +122,6 @@ def test_a_scan_paused_at_any_times_is_the_one_that_was_not(times: list[float], 
     assert_safe(paused.instrument)
 
 
-def test_the_states_of_a_scan_that_is_paused_in_flats_and_in_views() -> None:
-    paused = Paused()
-    paused.instrument.at = dict.fromkeys((3, 8), paused.pause.pause)
-    assert paused.run(12).error is None
-    darks, flats, taxi, views, waits = State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING, State.PAUSED
-    assert paused.states == [darks, flats, waits, flats, taxi, views, waits, taxi, views]
-
-
 @pytest.mark.parametrize(("mode", "passes"), [(Mode.FLY, 1), (Mode.FLY, 4), (Mode.STEP, 1)])
 @pytest.mark.parametrize("number", [1, 3, 4, 8, 11, 16])
 def test_frames_since_the_last_beam_are_taken_again_in_their_place(mode: Mode, passes: int, number: int) -> None:

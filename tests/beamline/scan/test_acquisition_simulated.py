@@ -8,12 +8,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.stop import StopRequest
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan
 from beamline.plan.timeline import work_out
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import Frame
 from drivers.base.protocols import CameraSettings, Devices, TriggerSource
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
@@ -117,18 +117,4 @@ def test_a_camera_that_is_silent_at_the_end_of_a_pass_has_its_missing_frames_nam
         assert acquisition.missing == sorted(last)
         assert isinstance(error, LedgerError)
     assert not instrument.shutter.is_open()
-    instrument.stage.close()
-
-
-@pytest.mark.parametrize("after", [1, 12])
-def test_a_stop_while_turning_keeps_the_angles_of_the_frames_on_their_way(after: int) -> None:
-    instrument = FaultyInstrument(set(), set(), set())
-    acquisition, frames, error = instrument.scan(StopRequest(), stop_after=after)
-    assert isinstance(error, ScanStopped)
-    assert after < len(frames) < N
-    assert [frame.trigger for frame in frames] == list(range(len(frames)))
-    assert all(frame.kind is FrameKind.PROJECTION for frame in frames)
-    instrument.assert_true_angles(frames)
-    assert acquisition.missing == []
-    assert instrument.stage.position() == 0.0
     instrument.stage.close()

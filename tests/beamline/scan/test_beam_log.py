@@ -64,13 +64,6 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
     assert "after 1 failed reading." in warnings[3]
 
 
-def test_no_monitor_is_no_thread() -> None:
-    before = threading.active_count()
-    with BeamLog(None, 1.0, lambda event: pytest.fail(event.event)) as log:
-        assert threading.active_count() == before
-    assert log.readings == ()
-
-
 CHOSEN = "devices.beam_monitor={kind: electrometer, port: 'sim://electrometer', unit: nA, period_s: 0.001}"
 
 
@@ -112,9 +105,3 @@ def test_a_monitor_that_hangs_holds_up_no_scan(tmp_path: Path, monkeypatch: pyte
     assert [event.data["status"] for event in events if event.event == "scan_done"] == ["complete"]
     with h5py.File(path) as file:
         assert set(file[f"{BEAM}/value"][()]) <= {7.0}
-
-
-def test_a_scan_without_a_monitor_has_no_place_for_it(tmp_path: Path) -> None:
-    path = run_scan(small(), tmp_path, instrument=FakeInstrument().connected()).path
-    with h5py.File(path) as file:
-        assert BEAM not in file

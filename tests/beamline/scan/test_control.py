@@ -11,7 +11,7 @@ from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.core.files import create_part, create_run_folder
-from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
 from beamline.storage.run_record import RecordFile, RunRecord
@@ -43,32 +43,6 @@ def test_a_run_is_paused_resumed_and_complete(tmp_path: Path) -> None:
     ran.assert_good_file(19, "complete")
     assert not (ran.folder / "control").exists()
     assert state_of(ran.folder) is State.DONE
-
-
-@pytest.mark.parametrize(
-    ("verb", "error", "end", "code"),
-    [("stop", ScanStopped, State.STOPPED, 4), ("abort", ScanAborted, State.ABORTED, 130)],
-)
-@pytest.mark.parametrize("paused", [False, True])
-def test_a_run_is_ended_also_while_it_is_paused_and_leaves_a_readable_file(
-    tmp_path: Path, verb: str, error: type[ScanStopped], end: State, code: int, paused: bool
-) -> None:
-    def ask() -> None:
-        (run,) = tmp_path.iterdir()
-        asked(run, Verb.PAUSE if paused else Verb(verb))
-
-    def wish(event: Event) -> None:
-        if event.data.get("state") == State.PAUSED:
-            (run,) = tmp_path.iterdir()
-            (run / "control" / verb).touch()
-
-    ran = Ran(tmp_path, FakeInstrument(at={8: ask}), heard=wish)
-    assert type(ran.error) is error
-    assert ran.states[-2:] == [State.FINISHING, end] and (State.PAUSED in ran.states) is paused
-    n = ran.of("scan_done")[0].data["n_frames"]
-    assert 9 <= n < 19 and ran.of("failed")[0].data["exit_code"] == code
-    ran.assert_good_file(n, "stopped")
-    ran.assert_safe()
 
 
 def test_only_the_owner_may_ask_and_nothing_is_left(tmp_path: Path) -> None:

@@ -183,8 +183,3 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
     (line,) = ended.stderr.strip().splitlines()
     assert said in line
     assert not (tmp_path / "runs").exists()
-
-
-def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None:
-    ended = beamline("scan", config, "-o", tmp_path / "runs", "--documents", tmp_path / "d.jsonl")
-    assert ended.exit_code == 2 and "leave it out with scan.energies" in ended.stderr

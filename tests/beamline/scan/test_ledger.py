@@ -245,11 +245,6 @@ def test_spans_name_each_index_once(indices: set[int]) -> None:
     assert named == sorted(indices)
 
 
-def test_spans_of_many_groups_end_with_the_number() -> None:
-    assert spans([3, 7, 8, 9, 12]) == "3, 7-9, 12"
-    assert spans(range(0, 40, 2), limit=3) == "0, 2, 4, ... (20 in all)"
-
-
 @pytest.mark.parametrize(("n", "period"), [(0, 1.0), (3, 0.0), (3, float("nan"))])
 def test_a_train_without_triggers_or_period_is_refused(n: int, period: float) -> None:
     with pytest.raises(ValueError, match=r"angle|period"):

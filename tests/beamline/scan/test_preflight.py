@@ -1,6 +1,5 @@
 """Dry run: the figures of the shipped scans, what it refuses, and what it does not load or touch."""
 
-import json
 import shutil
 import subprocess
 import sys
@@ -8,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import h5py
-import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
@@ -87,17 +84,6 @@ def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None
     assert not (tmp_path / "runs").exists()
     assert ran.instrument.log == []
     assert ran.events == []
-
-
-def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
-    """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
-    ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
-    assert ran.result.flags == {}
-    with h5py.File(ran.result.path) as file:
-        times = file["entry/frame_log/time"][5:11]
-        assert file["entry/record/period"][()] == pytest.approx(3000)
-        assert json.loads(file["entry/record/plan"][()])["period_s"] == 2200
-    np.testing.assert_allclose(np.diff(times), 3000, atol=1e-3)
 
 
 @pytest.mark.parametrize("preview_bin", [1, 3])

@@ -2,7 +2,6 @@
 
 import re
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -101,23 +100,6 @@ def test_a_failure_reaches_whoever_waits_for_room_and_nothing_is_written_after_i
     assert writer.rows == list(range(at))
 
 
-def test_a_frame_is_digested_while_the_one_before_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    second, together = threading.Event(), list[bool]()
-
-    def spy(counts: np.ndarray, *rest: object) -> tuple[FrameDigest, FrameDigest]:
-        if counts[0, 0] == 1:
-            second.set()
-        return real(counts, *rest)
-
-    real = module.digests
-    monkeypatch.setattr(module, "digests", spy)
-    recorder = record(writer := Writer(lambda row: together.append(second.wait(30)) if row == 0 else None))
-    recorder.put(frame(0))
-    recorder.put(frame(1))
-    recorder.finish()
-    assert together == [True] and writer.rows == [0, 1]
-
-
 def test_frames_before_one_that_cannot_be_digested_are_written() -> None:
     slow = threading.Event()
     recorder = record(writer := Writer(lambda row: slow.wait(30) if row == 0 else None))
@@ -143,14 +125,6 @@ def test_a_frame_that_comes_alone_is_flushed_at_once_and_others_when_none_waits(
     recorder.wait()
     assert writer.flushed[-1] == 9
     recorder.finish()
-
-
-def test_the_time_of_writes_that_wait_is_the_disks() -> None:
-    recorder = record(Writer(lambda row: time.sleep(0.02)))
-    for row in range(10):
-        recorder.put(frame(row))
-    recorder.finish()
-    assert recorder._work.writing > 0.1 and recorder._work.checking > 0
 
 
 def hanging(monkeypatch: pytest.MonkeyPatch, hang: Callable[[], object]) -> None:

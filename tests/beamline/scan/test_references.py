@@ -5,17 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.config.load import config_folder, load
-from beamline.config.monitor import reference_limits
-from beamline.core.errors import ConfigError, ReferencesError
+from beamline.config.load import config_folder
+from beamline.core.errors import ReferencesError
 from beamline.core.events import Event
 from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
-from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection
 from beamline.scan.control import State
 from beamline.scan.references import ReferenceLog
 from beamline.scan.run import run_scan
@@ -24,7 +19,7 @@ from drivers.base.frame import Frame, FrameKind
 from tests.beamline import fakes
 from tests.beamline.ball_scan import shipped
 from tests.beamline.fakes import FakeInstrument, Faults
-from tests.beamline.ran import SMALL, Ran
+from tests.beamline.ran import Ran
 
 
 @pytest.mark.parametrize(
@@ -78,36 +73,6 @@ def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypat
     (fault,) = ran.result.reference_faults
     assert fault.startswith("The flats 3-4: they have 9.09% of the light of the views (limit 50%)")
     assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
-
-
-def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> None:
-    """Its flats are saturated everywhere with 95 ms: the electrolyte would read 0.14 instead of 0.48 1/mm."""
-    words = [
-        "scan.exposure_s=0.095", "scan.period_s=0.1", "simulation.clock=virtual", "scan.darks.count=3",
-        "scan.flats={count: 3, at: start}", "devices.camera.roi=[1140, 1968, 24, 160]",
-    ]  # fmt: skip
-    events: list[Event] = []
-    with pytest.raises(ReferencesError, match=r"flats 3-5: 100\.00%"):
-        run_scan(load(config_folder() / "demo.yaml", words, {}), tmp_path, [events.append])
-    (folder,) = tmp_path.iterdir()
-    found = {(finding.severity, finding.rule) for finding in validate(folder / "scan.h5")}
-    assert ("error", "bad-references") in found
-    with open_scan(folder / "scan.h5") as source:
-        assert not (source.image_key == FrameKind.PROJECTION).any()
-
-
-def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
-    path = config_folder() / "demo.yaml"
-    assert reference_limits(load(path, (), {}).references) == ReferenceLimits()
-    assert reference_limits(load(path, ["references.light_in_darks=0.5"], {}).references) == ReferenceLimits(
-        light_in_darks=0.5
-    )
-    for word, message in (
-        ("references.light_in_darks=2", r"references\.light_in_darks is 2; expected a number > 0 and < 1"),
-        ("references.on_fault=go", r"references\.on_fault is 'go'.*expected stop \| log"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            load(path, [word], {})
 
 
 def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
@@ -174,30 +139,3 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
     assert len(told) == 1 and told[0] < views[0]
     found = float(events[told[0]].data["message"].split("has ")[1].split(" photons")[0])
     assert found == pytest.approx(14.5, rel=0.1)
-
-
-def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:
-    """A cylinder about the axis, Beer-Lambert without effects: 2 mu sqrt(r^2 - u^2) in each column, from every side."""
-    radius, attenuation, pitch = 0.05, 5.0, 4e-3
-    overrides = [
-        *SMALL,
-        "scan.mode=step",
-        "scan.flats.exposure_s=0.005",
-        "devices.camera.roi=[1148, 2028, 8, 40]",
-        f"optics.pixel_size_um={pitch * 1e3}",
-        "simulation.clock=virtual",
-        "simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.05, height: 9.0,"
-        " attenuation: 5.0}]}, beam: {photons_per_s: 3.0e+5}}",
-    ]
-    result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
-    assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
-    with open_scan(result.path) as source:
-        selection = Selection(axis_col=19.5, steps=(Air("none"), Preparation("ignore")))
-        said: list[str] = []
-        prepared = prepare_projections(source, selection, said.append)
-        assert len(said) == 1 and said[0].startswith("--flags ignore")
-        assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
-    u = (np.arange(40) - 19.5) * pitch
-    expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))
-    # 14 000 counts in a flat of 5 ms, rounded to a half: 4e-5 of its light.
-    np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError
-from beamline.core.files import JOINED, parts_of
+from beamline.core.files import parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
@@ -31,7 +31,6 @@ from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.interrupted import whole_scan
-from beamline.storage.parts import joined_file_of
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.replacements import overlaid
 from beamline.storage.writer_lock import WriterLock
@@ -352,23 +351,6 @@ def test_a_part_counts_by_its_file_where_its_events_were_lost(run: Path) -> None
     assert [done.path.parent.name for done in recover_run(run)[0]] == [run.name, "part-2", run.name]
 
 
-def test_only_a_file_that_is_drawn_from_is_a_part(tmp_path: Path) -> None:
-    first, other = tmp_path / "scan.h5", tmp_path / "other.h5"
-    for path in (first, other):
-        with h5py.File(path, "x") as file:
-            file[layout.DATA] = np.zeros((2, 4, 4), np.uint16)
-    assert joined_file_of(first) is None
-    (tmp_path / JOINED).write_bytes(b"no HDF5")
-    assert joined_file_of(first) is None
-    (tmp_path / JOINED).unlink()
-    with h5py.File(tmp_path / JOINED, "x") as file:
-        virtual = h5py.VirtualLayout((2, 4, 4), "u2")
-        virtual[:] = h5py.VirtualSource("scan.h5", layout.DATA, (2, 4, 4))
-        file.create_virtual_dataset(layout.DATA, virtual)
-    assert joined_file_of(first) == (tmp_path / JOINED, 1)
-    assert joined_file_of(other) is None and joined_file_of(tmp_path / JOINED) is None
-
-
 def test_the_volume_of_all_parts_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = _stopped(tmp_path, monkeypatch, at=8, abort=False)
     (run / "recon.h5").write_text("of some views")
@@ -386,15 +368,3 @@ def test_the_volume_of_all_parts_is_that_of_the_run(tmp_path: Path, monkeypatch:
     assert (run / "recon.before-part-2.h5").read_text() == "of some views"
     assert (run / "report.before-part-2.html").read_text() == "of some views"
     assert [path.relative_to(run) for path in run.rglob("recon.h5")] == [Path("recon.h5")]
-
-
-def test_the_volume_made_afterwards_is_that_of_the_run_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = _stopped(tmp_path, monkeypatch, at=8, abort=False)
-    asked: list[tuple[Path, Path]] = []
-
-    def afterwards(scan: Path, output: Path) -> list[str]:
-        asked.append((scan, output))
-        return [sys.executable, "-c", ""]
-
-    _go_on(run, afterwards=afterwards)
-    assert asked == [(run / "joined.h5", run / "recon.h5")]

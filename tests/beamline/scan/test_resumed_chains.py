@@ -18,7 +18,7 @@ from beamline.core.errors import BeamlineError, DataError
 from beamline.core.files import JOINED, parts_of
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import describe, validate
+from beamline.features.files.validate import validate
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage import parts
@@ -214,12 +214,6 @@ def killed_while_joined(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return chain.run
 
 
-@pytest.fixture
-def stale(killed_while_joined: Path, tmp_path: Path) -> Path:
-    """The joined file of two parts of three; the kill came while the last was joined."""
-    return shutil.copytree(killed_while_joined, tmp_path / "run") / JOINED
-
-
 @pytest.fixture(scope="module")
 def recovered_once(killed_while_joined: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = shutil.copytree(killed_while_joined, tmp_path_factory.mktemp("recovered") / "run")
@@ -237,40 +231,6 @@ def recovered(recovered_once: Path, tmp_path: Path) -> Path:
 def _beamline(*words: str | Path) -> tuple[int, str]:
     said = CliRunner().invoke(main, [str(word) for word in words])
     return said.exit_code, said.output
-
-
-@pytest.mark.slow
-def test_every_command_refuses_a_joined_file_that_lacks_a_part(stale: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.h5"
-    for words in (
-        ["info", stale],
-        ["validate", stale],
-        ["recon", stale, "-m", "fbp", "-o", out],
-        ["recon", stale, "-m", "fbp", "--dry-run"],
-        ["monitor", stale],
-        ["ingest", stale, out],
-        ["study", "fixed-views", stale, "-o", tmp_path / "study"],
-    ):
-        code, said = _beamline(*words)
-        assert (code, "recover" in said, "part-3" in said) == (5, True, True), (words, said)
-        assert not out.exists()
-    code, said = _beamline("scan", "--resume", stale.parent, "--dry-run")
-    assert code == 2 and "does not have those of its 3 parts" in said
-    for part in (stale.parent / "scan.h5", stale.parent / "part-3" / "scan.h5"):
-        assert [line for line in describe(part)["findings"] if "no file has the frames of all" in line]
-    assert _beamline("recover", stale)[0] == 0
-    _assert_whole(stale)
-    assert _beamline("recover", stale.parent)[1].count("in order") == 4
-
-
-@pytest.mark.slow
-def test_processes_of_their_own_refuse_it_too(stale: Path, tmp_path: Path) -> None:
-    recipe = tmp_path / "recipe.yaml"
-    recipe.write_text("method: fbp\n")
-    code, said = _beamline("tradeoff", stale, "-o", tmp_path / "tradeoff")
-    assert (code, "part-3" in said) == (5, True)
-    code, said = _beamline("batch", stale, "--config", recipe, "-o", tmp_path / "batch")
-    assert code != 0 and "part-3" in (tmp_path / "batch" / "batch.csv").read_text() + said
 
 
 def _fewer_frames(run: Path) -> None:

@@ -13,10 +13,8 @@ from beamline.core.stop import ScanStopped, StopRequest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
-from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
-from tests.beamline.ball_scan import shipped
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
 
@@ -120,13 +118,6 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
         assert flags.alarmed[left].all()
 
 
-def test_a_stop_before_the_last_view_takes_nothing_again(tmp_path: Path) -> None:
-    stop = StopRequest()
-    instrument = FakeInstrument(Faults(repeats={8}), at={12: stop.stop})
-    ran = Ran(tmp_path, instrument, *WORDS, stop=stop)
-    assert type(ran.error) is ScanStopped and retakes(ran) == 0
-
-
 def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={8, 10}, lost={FIRST + N})), *WORDS)
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
@@ -149,29 +140,3 @@ def test_a_view_that_gave_no_frame_is_taken_again_under_its_trigger(tmp_path: Pa
     with h5py.File(ran.result.path) as file:
         assert (file["entry/frame_log/trigger"][again], file["entry/frame_log/replaces"][again]) == (3, -1)
     assert [finding for finding in validate(ran.result.path) if finding.severity != "info"] == []
-
-
-SCENE = """simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.02, height: 1,
-attenuation: 9.0, centre: [0.06, 0, 0]}]}, beam: {photons_per_s: 1.0e+5}, effects: [motion_blur,
-{kind: lost_beam, views: [6, 9], share: 0.02}, dark_current, read_noise, offset]}"""
-
-
-def test_a_lost_beam_on_the_simulated_instrument(tmp_path: Path) -> None:
-    """What is taken again is what a scan without the fault has at this place, but for noise."""
-    words = [
-        *WORDS, "scan.mode=fly", "simulation.clock=virtual", "recon.live=false", "scan.exposure_s=0.05",
-        "scan.period_s=0.5", "devices.stage.low_deg=-20", "devices.camera.roi=[1144, 2016, 16, 64]",
-        SCENE,
-    ]  # fmt: skip
-    result = run_scan(shipped("simulated", *words), tmp_path)
-    assert (result.retaken, result.alarmed_frames) == (3, 0)
-    good = SCENE.replace("views: [6, 9]", "views: [900, 901]")
-    clean = run_scan(shipped("simulated", *words, good), tmp_path / "clean")
-    with open_scan(result.path) as source, open_scan(clean.path) as other:
-        for row in np.flatnonzero(source.replaces >= 0):
-            there = source.replaces[row]
-            views = (source.read([row]), other.read([there]), other.read([there - 1]), other.read([there + 1]))
-            new, same, before, after = (view[0].astype(np.float64).mean(axis=0) for view in views)
-            apart = [float(np.abs(new - view).mean()) for view in (same, before, after)]
-            assert apart[0] < 0.5 * min(apart[1:])
-            assert source.angles[row] == pytest.approx(other.angles[there], abs=2e-5)

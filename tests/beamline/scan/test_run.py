@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 import h5py
@@ -16,18 +15,15 @@ import pytest
 from beamline.config.load import load
 from beamline.core.errors import DataError
 from beamline.core.events import Event
-from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
 from beamline.scan import run as run_module
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
-from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
-from drivers.base.frame import Frame, FrameKind
-from drivers.frame_memory import FrameMemory
+from drivers.base.frame import Frame
 from tests.beamline import fakes
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import Ran, small
@@ -87,15 +83,6 @@ def test_missing_frames_are_named_after_everything_else_was_taken(tmp_path: Path
     assert ran.of("failed")[0].data["exit_code"] == 5
     assert ran.states[-1] == State.FAILED
     assert [event.data["check"] for event in ran.of("flag")] == ["timing", "timing"]  # and it was said at once
-
-
-def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:
-    stop = StopRequest()
-    stop.stop()
-    ran = Ran(tmp_path / "runs", FakeInstrument(), stop=stop)
-    assert type(ran.error) is ScanAborted
-    assert not (tmp_path / "runs").exists()
-    assert ran.instrument.log == []
 
 
 def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
@@ -195,73 +182,6 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
         run_scan(small(), tmp_path, [events.append])
     done = [event.data for event in events if event.event == "scan_done"]
     assert [(data["status"], data["n_frames"]) for data in done] == [("complete", 19)]
-
-
-def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
-    words = ("devices.stage.low_deg=-30", "scan.period_s=0.3", "simulation.clock=virtual", "scan.exposure_s=0.05")
-    result = run_scan(small("scan.angles.views=30", *words), tmp_path)
-    assert (result.n_frames, result.missing) == (37, ())
-    assert result.flags == {"zingers": {"info": 1}}  # a fact; noise, hot pixels and a drifting profile are no findings
-    with open_scan(result.path) as source:
-        views = source.image_key == FrameKind.PROJECTION
-        np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
-        flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
-        assert flats > darks + 1000
-
-
-def test_memory_for_the_frames_is_ready_before_the_first_one(tmp_path: Path) -> None:
-    asked: list[tuple[int, tuple[int, int]]] = []
-
-    class Memory(FrameMemory):
-        def prepare(self, n: int, shape: tuple[int, int]) -> None:
-            asked.append((n, shape))
-            if len(asked) == 2:
-                raise MemoryError
-
-    said = []
-    for run in ("ready", "no memory"):
-        instrument, events = FakeInstrument(), list[Event]()
-        with_memory = replace(instrument.connected(), frame_memory=Memory())
-        run_scan(small(), tmp_path / run, [events.append], instrument=with_memory)
-        names = [event.event for event in events]
-        message = events[names.index("run_started") + 1]
-        assert message.data["state"] is State.PREPARING
-        said.append(message.data["message"])
-    assert asked == [(19, (8, 12))] * 2  # all frames of so short a scan
-    assert said == [
-        "Memory for 19 frames, 3.65 kB, is ready",
-        "Memory for 19 frames, 3.65 kB, cannot be had before they come",
-    ]
-
-
-def test_two_scans_in_one_process_carry_their_own_metadata(tmp_path: Path) -> None:
-    """Name, description, start, plan, configuration, times and events of each; nothing of the other."""
-    instrument, results, told = FakeInstrument(), [], list[list[Event]]()
-    for name, views in (("anode", 12), ("cathode", 9)):
-        instrument.clock.sleep(5000.0)
-        events: list[Event] = []
-        config = small(f"sample.name={name}", f"sample.description=An {name}.", f"scan.angles.views={views}")
-        results.append(run_scan(config, tmp_path, [events.append], instrument=instrument.connected()))
-        told.append(events)
-    starts = []
-    for result, events, name, views in zip(results, told, ("anode", "cathode"), (12, 9), strict=True):
-        assert result.path.parent.name.endswith(f"_{name}")
-        with h5py.File(result.path) as file:
-            assert file["entry/sample/name"].asstr()[()] == name
-            assert file["entry/title"].asstr()[()] == f"An {name}."
-            assert len(json.loads(file["entry/record/plan"][()])["angles_deg"]) == views
-            assert f"name: {name}\n" in file["entry/record/config"].asstr()[()]
-            start = datetime.fromisoformat(file["entry/start_time"].asstr()[()]).timestamp()
-            end = datetime.fromisoformat(file["entry/end_time"].asstr()[()]).timestamp()
-            times = file["entry/frame_log/time"][()]
-            assert start <= times.min() <= times.max() <= end + 1e-3
-            starts.append((start, end))
-        assert f"name: {name}\n" in (result.path.parent / "config.resolved.yaml").read_text()
-        (begun,) = (event for event in events if event.event == "run_started")
-        assert (begun.data["sample"], begun.data["path"]) == (name, result.path)
-        lines = (result.path.parent / "events.jsonl").read_text(encoding="utf-8").splitlines()
-        assert [json.loads(line)["event"] for line in lines] == [event.event for event in events]
-    assert starts[1][0] > starts[0][1] + 4000
 
 
 def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

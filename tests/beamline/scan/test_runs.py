@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import sys
 import time
 from contextlib import ExitStack
@@ -20,9 +19,8 @@ from beamline.scan.resume import NoFrame, open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
 from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
-from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran, killed, small
+from tests.beamline.ran import Ran, small
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
@@ -60,12 +58,6 @@ def test_a_whole_run(tmp_path: Path) -> None:
     )
     assert found.bytes == sum(file.stat().st_size for file in run.rglob("*") if file.is_file())
     assert abs(found.time - time.time()) < 100  # the fake's clock stands at another time
-
-
-def test_a_run_that_ended_early_has_its_frames_and_a_reason(tmp_path: Path) -> None:
-    stopped, aborted = (describe(_run(tmp_path / str(abort), 8, abort=abort)) for abort in (False, True))
-    assert (stopped.state, aborted.state) == ("stopped", "aborted")
-    assert 0 < (aborted.frames or 0) <= (stopped.frames or 0) < FRAMES == stopped.planned
 
 
 def test_a_run_whose_process_was_killed_has_died_with_the_frames_of_its_file(tmp_path: Path) -> None:
@@ -122,18 +114,6 @@ def test_a_run_of_an_earlier_version_has_the_state_of_its_file(
     (run / "state.json").unlink()
     earlier = describe(run)
     assert (earlier.state, earlier.frames, earlier.sample) == (state, now.frames, "battery")
-
-
-def test_a_run_of_an_earlier_version_whose_file_is_not_closed_is_not_said_to_have_died(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with killed(monkeypatch):
-        run = _run(tmp_path, 9)
-    (run / "state.json").unlink()
-    lock = WriterLock(run / "scan.h5")
-    assert describe(run).state == "not known" and describe(run).next_step.startswith("Its scan still runs")
-    lock.release()
-    assert describe(run).state == "not known" and describe(run).next_step.startswith("Its scan has died")
 
 
 FIT = """
@@ -238,20 +218,3 @@ def test_on_a_disk_without_locks_no_run_is_said_to_have_died(tmp_path: Path, mon
     assert (describe(tmp_path / "a").state, describe(tmp_path / "a").frames) == (State.ACQUIRING, 3)
     file.close()
     assert describe(tmp_path / "a").state == State.FAILED
-
-
-@pytest.mark.bench
-def test_five_hundred_runs_take_less_than_two_seconds(tmp_path: Path) -> None:
-    """A tenth of them have died."""
-    run = _run(tmp_path / "one", 9)
-    record = read_record(run)
-    assert record is not None
-    for i in range(500):
-        one = tmp_path / "runs" / f"2026-01-02T03-{i // 60:02}-{i % 60:02}_a"
-        _part(one, replace(record, state=State.ACQUIRING, over=False) if i % 10 == 0 else record)
-        os.link(run / "scan.h5", one / "scan.h5") if hasattr(os, "link") else shutil.copy(run / "scan.h5", one)
-    began_at = time.process_time()
-    found = [describe(each) for each in runs_in(tmp_path / "runs")]
-    assert time.process_time() - began_at < 2
-    assert {each.state for each in found} == {"aborted", "died"}
-    assert len({each.frames for each in found}) == 1

@@ -21,11 +21,9 @@ from beamline.scan import recorder as recorder_module
 from beamline.scan.control import State
 from beamline.scan.supervision import (
     AlarmReaction,
-    BacklogGuard,
     BeamGuard,
     BeamLimits,
     SpaceGuard,
-    Workload,
 )
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -37,27 +35,6 @@ from tests.beamline.ran import Ran
 
 def flags(level: Level | None) -> tuple[Flag, ...]:
     return () if level is None else (Flag("beam", level, 0, 1.0, 0.5, "Look at the beam."),)
-
-
-@pytest.mark.parametrize(
-    ("work", "behind"),
-    [
-        (Workload(checking=1.0, writing=9.0), "disk"),
-        (Workload(checking=9.0, writing=1.0), "processor"),  # large frames
-        (Workload(), "processor"),
-    ],
-)
-def test_a_scan_that_pauses_says_whether_its_frames_wait_for_the_disk_or_the_processor(
-    work: Workload, behind: str
-) -> None:
-    pause = PauseRequest()
-    guard = BacklogGuard(8, pause, work)
-    guard(5)
-    assert not pause.reason
-    guard(6)
-    assert f"the {behind} is behind, 6 of at most 8 frames wait" in pause.reason
-    guard(2)
-    assert not pause.reason
 
 
 A, W, N = Level.ALARM, Level.WARN, None

@@ -17,7 +17,7 @@ from beamline.features.files.validate import describe
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest
-from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, mark_of, read_legend
+from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, read_legend
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame, FrameKind
@@ -86,16 +86,6 @@ def test_scores_and_regions_stand_beside_the_bits(path: Path, tmp_path: Path) ->
         assert file["entry/frame_log/frame_valid"][()].tolist() == [1, 1, 0, 1]
         pixels = file["entry/instrument/detector/data"][()]
     assert len(np.unique(pixels, axis=0)) == 1  # the raw frames are untouched
-
-
-def test_marks_become_flags_and_flags_marks() -> None:
-    found = [[Flag("mass", Level.ALARM, 0, 2.0, 1.0, "", (0, 1, 2, 3)), Flag("beam", Level.WARN, 0, 3.0, 1.0, "")], []]
-    flags = FrameFlags.of_marks([mark_of(each) for each in found])
-    assert [flags.mark(i).bits for i in range(2)] == [bitmask(each) for each in found]
-    later = FrameFlags(flags.bits, (FlagBit("of a later version", 0), *flags.legend[1:]), flags.scores, flags.regions)
-    assert later.mark(0).bits == bitmask(found[0][:1])
-    np.testing.assert_array_equal(later.mark(0).regions, mark_of(found[0][:1]).regions)
-    assert FrameFlags.of_marks([]).counts() == {}
 
 
 def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_memory(tmp_path: Path) -> None:

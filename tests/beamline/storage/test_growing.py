@@ -38,39 +38,6 @@ def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: Stepp
     writer.close()
 
 
-def follow_to_the_end(path: Path, opened: Event, result: multiprocessing.SimpleQueue[list[int]]) -> None:
-    """In another process: read what comes until the writer has finished."""
-    seen: list[int] = []
-    sums: list[int] = []
-    with open_scan(path, follow=True) as source:
-        opened.set()
-        while True:
-            finished = source.finished  # asked first: whatever is committed then is all there will be
-            n = source.refresh()
-            sums += [int(source.read([i]).sum()) for i in range(len(sums), n)]
-            seen.append(n)
-            if finished:
-                result.put([*sums, len(sums)])
-                return
-
-
-def test_a_follower_in_another_process_gets_every_frame(
-    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
-) -> None:
-    spawn = multiprocessing.get_context("spawn")
-    opened, result = spawn.Event(), spawn.SimpleQueue()
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    follower = spawn.Process(target=follow_to_the_end, args=(tmp_path / "s.h5", opened, result))
-    follower.start()
-    assert opened.wait(60)
-    append(writer, *frames)
-    writer.close()
-    assert writer.remarks == []
-    assert result.get() == [*(int(frame.counts.sum()) for frame in frames), len(frames)]
-    follower.join(60)
-    assert follower.exitcode == 0
-
-
 def write_and_wait(path: Path, written: Event) -> None:
     """In another process: seven frames, the last two not flushed, then wait to be killed."""
     writer = NXtomoWriter(path, INFO, SHAPE, clock=SystemClock(), flush_every=5)

@@ -110,14 +110,6 @@ def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path, mo
     assert scan_file(run) == run / "joined.h5"
 
 
-def test_of_a_whole_run_nothing_is_said_and_its_folder_is_its_scan(ended: Path) -> None:
-    assert scan_file(ended) == ended / "scan.h5" and next_step(ended / "scan.h5") == ""
-    for command in ("info", "validate", "monitor"):
-        of_run, of_file = beamline(command, ended), beamline(command, ended / "scan.h5")
-        assert (of_run.exit_code, of_run.stdout) == (of_file.exit_code, of_file.stdout)
-        assert str(ended / "scan.h5") in of_run.output and "--resume" not in of_run.output
-
-
 def test_the_folder_of_a_run_is_its_volume(ended: Path) -> None:
     with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes one"):
         volume_file(ended)

@@ -14,7 +14,7 @@ import pytest
 from beamline.config.load import config_folder
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.writer_lock import WITHOUT, no_locks
+from beamline.storage.writer_lock import WITHOUT
 from tests import faulty_disk
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import SMALL, Ran
@@ -145,8 +145,3 @@ def test_all_of_it_in_one_process(shim: Path, finished: Path, tmp_path: Path) ->
     assert "has no file locks (errno 37)" in first and "(errno 95)" in second and WITHOUT in first
     assert "is held by another program" in third and WITHOUT in third
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_ordinary_disk_has_locks(tmp_path: Path) -> None:
-    assert no_locks(tmp_path) == "" and list(tmp_path.iterdir()) == []
-    assert no_locks(tmp_path / "nowhere") == ""

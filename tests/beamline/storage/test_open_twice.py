@@ -10,7 +10,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
 
 from beamline import api
 from beamline.monitor.digest import digest
@@ -64,14 +63,6 @@ def test_followed_twice_and_looked_at_while_another_program_writes(tmp_path: Pat
         assert is_as_written(one, N)
 
 
-def test_an_ended_scan_open_twice(tmp_path: Path) -> None:
-    path = tmp_path / "scan.h5"
-    with writer(path):
-        pass
-    with open_scan(path) as one, open_scan(path, follow=True) as two:
-        assert all(is_as_written(source, N) for source in (one, two, one))
-
-
 def test_read_in_the_program_that_writes_it(tmp_path: Path) -> None:
     """Also beyond its end: what the reader gives back changes nothing in the file."""
     path = tmp_path / "scan.h5"
@@ -98,10 +89,3 @@ def test_a_file_open_by_h5py_itself_keeps_its_frames_and_gets_no_view(tmp_path: 
     assert "open by h5py" in writing.remarks[0]
     with open_scan(path) as source:
         assert is_as_written(source, N)
-
-
-@pytest.mark.parametrize("follow", [True, False])
-def test_a_file_that_is_being_made(tmp_path: Path, follow: bool) -> None:
-    path = tmp_path / "scan.h5"
-    with h5py.File(path, "x", libver="v110"), pytest.raises(api.DataError, match="by this program"):
-        open_scan(path, follow=follow)

@@ -19,7 +19,6 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover
 from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.scans import seal
 
 Write = Callable[[list[Frame]], Path]
 ROW = 8
@@ -67,13 +66,3 @@ def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: li
     _flip(path, layout.TRIGGER, ROW, 1)
     with open_scan(path) as source:
         assert source.altered == {ROW}
-
-
-def test_rows_that_replace_each_other_in_a_circle_are_refused(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file[layout.REPLACES][ROW] = ROW
-        seal(file)  # as if it had been written so
-        with pytest.raises(ValueError, match="row 8 claims"):
-            views_in(file)
-    with open_scan(path) as source, pytest.raises(DataError, match="can be replaced"):
-        _ = source.replaces

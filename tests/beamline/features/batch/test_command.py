@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -14,9 +13,9 @@ import psutil
 import pytest
 
 from beamline.core.process import ProcessEnd
-from beamline.core.text import csv_text, safe_name
-from beamline.features.batch import batch, command
-from beamline.features.batch.batch import COMMAND, BatchOptions, BatchRow, names_of, run_batch
+from beamline.core.text import csv_text
+from beamline.features.batch import batch
+from beamline.features.batch.batch import COMMAND, BatchOptions, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -154,20 +153,6 @@ def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_ke
     assert Path("out/scan/recon.h5").is_file()
 
 
-@pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="names are text there")
-@pytest.mark.usefixtures("in_this_process")
-def test_a_scan_whose_name_is_no_text_fails_with_the_reason_before_it_is_read(folder: Path) -> None:
-    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
-    named = Path(os.fsdecode(b"s\xe9.h5"))
-    named.write_bytes((folder / "scan.h5").read_bytes())
-    for call in range(2):  # the second one knows its row
-        result = beamline("batch", "s*.h5", "--config", "recipe.yaml", "-o", "out")
-        assert result.exit_code == 5 and "1 of 2 scans failed" in result.stderr and "defect" not in result.output, call
-        rows = batch._read(Path("out"))
-        assert [row.state for row in rows] == ["done", "failed"] and rows[1].scan == str(named.resolve())
-        assert "bytes that are not UTF-8" in rows[1].message
-
-
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     ("recipe", "sentence"),
@@ -198,33 +183,6 @@ def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sen
 )  # fmt: skip
 def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> None:
     assert names_of([Path(path) for path in paths]) == names
-
-
-def test_rows_of_an_earlier_call_keep_their_names() -> None:
-    known = [BatchRow("scan", "/x/run1/scan.h5", "done")]
-    rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
-    assert [row.name for row in rows] == ["scan", "run2_scan"]
-    assert command.batch.name == "batch"
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_names_that_mean_something_else_are_only_names(folder: Path) -> None:
-    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
-    hostile = ("..h5", "batch.csv.h5", "recipe.yaml.h5", "=1+1.h5", "[", "\x1b[2J.h5", f"{'x' * 246}.h5")
-    Path("in/[").mkdir(parents=True)
-    for name in hostile:
-        Path("in", name if name != "[" else "[/b].h5").write_bytes((folder / "scan.h5").read_bytes())
-    Path("in/circle.h5").symlink_to("circle.h5")
-    os.mkfifo("in/pipe.h5")
-    for _ in range(2):
-        result = beamline("batch", "in/*.h5", "in/[[]/*.h5", "--config", "recipe.yaml", "-o", "out")
-        assert result.exit_code == 5 and "2 of 9 scans failed" in result.output, result.output
-        assert "\x1b" not in result.output
-    table = _table(folder / "out")
-    assert {"unnamed", "batch.csv_2", "recipe.yaml_2", "1+1", "b]", "_[2J", "x" * 120} < table.keys()
-    assert all(name == safe_name(name) for name in table)
-    made = {name for name, row in table.items() if row["state"] == "done"}
-    assert left(folder / "out") == {"batch.csv", "recipe.yaml", *made}
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -266,22 +224,6 @@ def test_a_table_of_names_that_are_not_of_this_program_is_refused_and_nothing_is
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-@pytest.mark.usefixtures("in_this_process")
-def test_a_folder_that_somebody_put_in_the_place_of_a_result_fails_this_scan_alone(folder: Path) -> None:
-    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
-    write_exchange(folder / "second.h5", SCAN)
-    given = ("batch", "scan.h5", "second.h5", "--config", "recipe.yaml", "-o", "out")
-    assert beamline(*given).exit_code == 0
-    Path("out/batch.csv").unlink()
-    (folder / "out" / "scan" / "recon.h5").rename("moved.h5")
-    Path("out/batch.csv").write_text("name,scan,state\n")
-    assert beamline(*given).exit_code == 5
-    table = _table(folder / "out")
-    assert (table["scan"]["state"], table["second"]["state"]) == ("failed", "done")
-    assert "exists and results are never overwritten" in table["scan"]["message"]
-    assert left(folder / "out" / "scan") == {"report.html"}
-
-
 def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_at_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -302,22 +244,3 @@ def test_a_killed_batch_leaves_no_reconstruction_behind_and_can_be_called_again_
     assert beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out").exit_code == 0
     assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
     assert children and not psutil.wait_procs(children, 30)[1]
-
-
-@pytest.mark.parametrize(
-    ("table", "sentence"),
-    [
-        (b"\xef\xbb\xbfname,scan,state\na,a.h5,broken\n", "row 1, state"),
-        (b"\xff\xfe\0", "expected a first line with name and scan"),
-        (b"sample,date\n", "expected a first line with name and scan, not ['sample', 'date']"),
-    ],
-)
-def test_a_table_that_somebody_changed_is_refused_with_the_place(folder: Path, table: bytes, sentence: str) -> None:
-    Path("recipe.yaml").write_text("method: fbp\n")
-    Path("out").mkdir()
-    Path("out/recipe.yaml").write_text("method: fbp\n")
-    Path("out/batch.csv").write_bytes(table)
-    result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
-    assert result.exit_code == 5
-    assert sentence in result.stderr
-    assert Path("out/batch.csv").read_bytes() == table

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import threading
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from beamline.config.load import Config, config_folder, load
-from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, VolumeDone
+from beamline.core.errors import DataError
+from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.features.demo.command import run_demo
-from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import read_reconstruction
-from tests.beamline.cli.small_scan import beamline
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -95,48 +89,3 @@ def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
         run_demo(_small("scan.angles.views=4", "scan.period_s=2"), here / "runs", [], StopRequest(), "beamline demo")
     (folder,) = (here / "runs").iterdir()
     assert (folder / "scan.h5").is_file()
-
-
-def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from beamline.instrument.connect import connect
-
-    def without_truth(config: Config) -> object:
-        return replace(connect(config), simulated=None)
-
-    monkeypatch.setattr("beamline.instrument.connect.connect", without_truth)
-    with pytest.raises(ConfigError, match="simulated devices"):
-        run_demo(_small(), here / "runs", [], StopRequest(), "beamline demo")
-    assert list(here.iterdir()) == []
-
-
-def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is handed to the demonstration, and what is printed at its end."""
-    asked: list[tuple[Config, Path | None]] = []
-
-    def fake(config: Config, runs: Path | None, sinks: list, stop: StopRequest, command: str) -> None:
-        asked.append((config, runs))
-        assert threading.current_thread() is threading.main_thread()
-        record = replace(
-            bare_record(here, np.zeros((2, 3, 4), np.float32)),
-            parameters={"method": "r2", "axis_col": 17.0, "n_views": 9},
-            metrics={"psnr": 30.0},
-            compared={"psnr": 25.0},
-            output=Path("runs/x/recon.h5"),
-            report=Path("runs/x/report.html"),
-            elapsed=1.0,
-        )
-        done = VolumeDone(record, time=0.0)
-        for sink in sinks:
-            sink(done)
-
-    monkeypatch.setattr("beamline.features.demo.command.run_demo", fake)
-    result = beamline("demo", "-o", "elsewhere", "--seconds", 7)
-    assert result.exit_code == 0, result.output
-    assert asked[0][0].recon.seconds == 7.0
-    assert asked[0][0].sample.name == "demo-battery"
-    assert asked[0][1] == Path("elsewhere")
-    assert "folder    runs/x" in result.stdout
-    assert "30.00 dB      25.00 dB" in result.stdout
-    result = beamline("demo", "--json")
-    assert json.loads(result.stdout.splitlines()[-1])["event"] == "done"
-    assert len(result.stdout.splitlines()) == 1

@@ -72,12 +72,6 @@ def test_the_instrument_s_configuration_away_from_the_instrument(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_ring_no_larger_than_its_frames_call_for() -> None:
-    small = ("--set", "devices.camera.roi=[0, 0, 128, 128]", "--set", "scan.angles.views=100")
-    found = {check["name"]: check for check in events(run(INSTRUMENT, "--json", *small))[:-1]}
-    assert found["memory"]["values"]["ring_bytes"] == 101 * 128 * 128 * 2  # type: ignore[index]
-
-
 def test_without_a_configuration() -> None:
     result = run()
     assert result.exit_code == 0, (

@@ -15,7 +15,6 @@ from beamline.config.devices import DcamOrca
 from beamline.features.doctor import devices
 from beamline.features.doctor.check import Grade
 from beamline.features.doctor.devices import port, ports
-from drivers.dcam import abi
 from drivers.dcam import session as preflights
 from drivers.serial.line import SerialPort
 from tests.drivers.dcam.fake import World, build
@@ -76,20 +75,11 @@ def test_without_libusb_it_cannot_be_checked(monkeypatch: pytest.MonkeyPatch, co
     assert "libusb" in check.advice
 
 
-def test_a_speed_that_is_not_told_cannot_be_checked() -> None:
-    assert devices.link(CAMERA, Bus(Descriptor(speed=None))).verdict is Grade.CANNOT_CHECK
-
-
 def test_no_library(tmp_path: Path) -> None:
     absent = DcamOrca(kind="dcam", library=str(tmp_path / "libdcamapi.so"))
     check = devices.library(absent)
     assert check.verdict is Grade.FAILED
     assert "cannot be loaded" in check.observed and "runtime" in check.advice
-
-
-def test_no_library_on_a_computer_without_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(abi, "installed_library", lambda _: "libno-such-dcamapi.so")
-    assert devices.library(None).verdict is Grade.WARNING
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a library that every Linux has")
@@ -173,13 +163,3 @@ def test_a_network_port_is_connected_to_and_hears_nothing() -> None:
     check = port("stage port", url, ())
     assert check.verdict is Grade.FAILED
     assert "accepts no connection" in check.observed and "only one connection" in check.advice
-
-
-@pytest.mark.parametrize("url", ["socket://host", "socket://host:none", "socket://:7777"])
-def test_addresses_that_are_none(url: str) -> None:
-    assert port("stage port", url, ()).verdict is Grade.FAILED
-
-
-def test_simulated_and_other_ports() -> None:
-    assert port("stage port", "sim://pm16c", ()).verdict is Grade.NOT_APPLICABLE
-    assert port("stage port", "rfc2217://host:1", ()).verdict is Grade.CANNOT_CHECK

@@ -6,7 +6,6 @@ import errno
 import io
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -120,33 +119,6 @@ def test_a_real_folder_is_left_as_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "scan.h5").read_bytes() == b"precious"
 
 
-def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    def opens(folder: Path) -> IO[bytes]:
-        """A named file, so that leaving it would show."""
-        return tempfile.NamedTemporaryFile(dir=folder, buffering=0)
-
-    class Interrupted(VirtualClock):
-        def now(self) -> float:
-            assert list(tmp_path.iterdir()) != [] or self.looks == 0
-            self.looks += 1
-            if self.looks > 1:
-                raise KeyboardInterrupt
-            return super().now()
-
-        looks = 0
-
-    with pytest.raises(KeyboardInterrupt):
-        disk.measure(tmp_path, Interrupted(), opens, most=10**9)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_file_has_no_name_or_leaves_with_its_handle(tmp_path: Path) -> None:
-    file = disk.temporary(tmp_path)
-    file.write(b"x")
-    file.close()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_disk_that_fills_up_or_refuses(synced: list[int], room: object, tmp_path: Path) -> None:
     clock = VirtualClock()
     check = disk.speed(tmp_path, None, clock, lambda folder: Slow(clock, GB, fails_at=20 * MB))
@@ -185,7 +157,3 @@ def test_memory(free: int | None, verdict: Grade) -> None:
     check = memory(free, need(100 * MB))  # 1 GB of waiting frames and 2 GB of ring
     assert check.verdict is verdict
     assert "1 GB for frames that wait for the disk and 2 GB for the camera's ring" in check.expected
-
-
-def test_memory_without_a_plan() -> None:
-    assert memory(GB, None).verdict is Grade.OK

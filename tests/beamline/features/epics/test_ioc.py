@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.epics.ioc import SHOWN, RunServer
+from beamline.features.epics.ioc import RunServer
 from tests.beamline.features.run_folder import FAILED, STARTED, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
 
@@ -93,14 +93,6 @@ def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> N
     assert alarm["Beam"][0] == 3
     for name in ("Beam", "Heartbeat", "DiskFree"):
         assert begin <= alarm[name][1] <= time.time()
-
-
-def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path) -> None:
-    begin = time.time()
-    with _served(tmp_path, control=True) as (_, client):
-        named = [each.metadata["name"] for each in SHOWN]
-        for name in [*named, "Heartbeat", "PauseScan", "ResumeScan", "StopScan", "AbortScan"]:
-            assert begin <= client.get(f"T:{name}").timestamp <= time.time()
 
 
 def test_a_monitor_gets_each_frame_with_its_time(tmp_path: Path) -> None:

@@ -116,18 +116,3 @@ def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None
     (folder / "empty").mkdir()
     assert "empty is a folder without TIFF slices" in beamline("export", "empty", "-o", "w.npy").stderr
     assert "none does not exist" in beamline("export", "none", "-o", "w.npy").stderr
-
-
-def test_what_is_no_volume_is_refused(volume: Path) -> None:
-    assert beamline("export", "v.h5", "-o", "g.tif", "--bits", "16", "--window", "0:1").exit_code == 0
-    (volume / "empty").mkdir()
-    before = left(volume)
-    for name, said in (
-        ("g.tif", "grey values"),
-        ("scan.h5", "is a scan"),
-        ("empty", "is a folder"),
-        ("none.h5", "does not exist"),
-    ):
-        result = beamline("export", name, "-o", "out.nrrd")
-        assert (result.exit_code, said in result.stderr) == (5, True), result.output
-    assert left(volume) == before

@@ -43,16 +43,6 @@ def folder(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    "command", ["segment loop.h5", "export scan.h5 -o loop.h5", "simulate plain --frames 2 --out loop.h5"]
-)
-def test_a_link_that_leads_to_itself_is_a_file_that_is_not_there(folder: Path, command: str) -> None:
-    (folder / "loop.h5").symlink_to("loop.h5")
-    result = beamline(*command.split())
-    assert result.exit_code in (2, 5) and "loop.h5" in result.stderr, result.output
-    assert (folder / "loop.h5").is_symlink()
-
-
 def test_info_for_people(folder: Path) -> None:
     result = beamline("info", "scan.h5")
     assert result.exit_code == 0, result.output
@@ -66,28 +56,12 @@ def test_info_for_people(folder: Path) -> None:
     assert said["sample"] == "two cylinders"
 
 
-def test_info_takes_a_line_for_each_fact_of_a_volume(folder: Path) -> None:
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
-    lines = beamline("info", "v.h5").stdout.splitlines()
-    assert [line.split(maxsplit=1)[1] for line in lines if line.startswith("recipe ")] == ["method: fbp; axis: 19.5"]
-
-
 def test_info_for_machines(folder: Path) -> None:
     result = beamline("info", "exchange.h5", "--json")
     (line,) = result.stdout.splitlines()
     said = json.loads(line)
     assert (said["event"], said["quantity"], said["pixel_size_mm"]) == ("done", "counts", 0.5)
     assert said["kinds"] == {"projection": 18, "flat": 2, "dark": 2}
-
-
-def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
-    with h5py.File("exchange.h5", "r+") as file:
-        file.attrs["quantity"] = "NOT what we call it"
-    lines = beamline("info", "exchange.h5").stdout.splitlines()
-    assert [" ".join(line.split()) for line in lines if line.startswith("quantity")] == [
-        "quantity counts",
-        "quantity (of the file) NOT what we call it",
-    ]
 
 
 def test_info_takes_what_the_caller_says(folder: Path) -> None:
@@ -111,17 +85,6 @@ def test_info_tells_of_fringes(folder: Path, square: float) -> None:
     assert ("phase fringes" in beamline("info", "can.h5").stdout) == bool(square)
 
 
-def test_info_tells_of_the_fringes_of_a_tooth(shared_data: Path) -> None:
-    """Of which recon tells, too: both look at as many views. A third of these are not certain of them."""
-    assert "phase fringes" in beamline("info", str(shared_data / "aps2bm_tooth_181x2x640.h5")).stdout
-
-
-def test_validate_passes_what_we_write(folder: Path) -> None:
-    result = beamline("validate", "scan.h5")
-    assert result.exit_code == 0, result.output
-    assert result.stdout.splitlines() == ["scan.h5: 0 errors, 0 warnings"]
-
-
 def test_validate_names_each_fault(folder: Path) -> None:
     with h5py.File("scan.h5", "r+") as file:
         file["entry/sample/rotation_angle"][7] = np.nan
@@ -134,14 +97,6 @@ def test_validate_names_each_fault(folder: Path) -> None:
     assert [event["event"] for event in events][-1] == "done"
     assert events[-1]["error"] == 1
     assert events[0]["rule"] == "angles"
-
-
-def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
-    for name in ("diad_k11-18014.nxs", "esrf_bm05_nxtomo_20x16x16.nx"):
-        result = beamline("info", str(shared_data / "fixtures" / name))
-        assert result.exit_code == 0, result.output
-        assert "reconstructable" in result.stdout
-    assert "there is no beam in them" in result.stdout
 
 
 def _stack(folder: Path) -> Path:
@@ -164,13 +119,6 @@ def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
         assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
         np.testing.assert_allclose(source.angles, SCAN.angles)
         np.testing.assert_array_equal(source.read([0, 17]), SCAN.line_integrals().astype(np.float32)[[0, 17]])
-
-
-def test_ingest_for_machines(folder: Path) -> None:
-    _stack(folder)
-    result = beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
-    said = json.loads(result.stdout.splitlines()[-1])
-    assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
 
 
 def test_ingest_says_how_far_it_is(folder: Path) -> None:
@@ -217,48 +165,6 @@ def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...],
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def _bare(folder: Path) -> None:
-    """stack.tif: five pages without angles; long.txt: nine angles for them."""
-    tifffile.imwrite(folder / "stack.tif", np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6))
-    (folder / "long.txt").write_text("0\n0\n0\n10\n20\n30\n40\n40\n40\n")
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ((), "--angles FILE (degrees, one a line)"),
-        (("--angles", "long.txt"), "--angle-rows A:B"),
-        (("--angles", "long.txt"), "--angle-rows 2:7 takes the 5 neighbours"),
-        (("--angles", "long.txt", "--angle-rows", "5"), "--angle-rows 5 is not of the form A:B"),
-        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 is out of range: the file has 9 angles"),
-        (("--angle-rows", "1:6"), "--angle-rows 1:6 needs angles to choose from: give --angles FILE."),
-        (("--angles", "none.txt"), "The angles in none.txt cannot be read (No such file or directory)."),
-        (("--flats", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
-        (("--darks", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
-    ],
-)
-@pytest.mark.parametrize("command", ["info", "validate", "ingest", "recon"])
-def test_messages_speak_of_options_as_they_are_typed(
-    folder: Path, command: str, options: tuple[str, ...], said: str
-) -> None:
-    _bare(folder)
-    result = beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
-    assert result.exit_code == (0 if command == "info" and not options else 5)
-    assert said in result.output
-    assert "angle_rows" not in result.output
-    assert "Errno" not in result.output
-
-
-@pytest.mark.parametrize("command", ["info", "validate"])
-def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
-    _bare(folder)
-    said = beamline(command, "stack.tif").stdout
-    assert "say --quantity counts, --quantity transmission or --quantity line-integrals." in said
-    said = beamline(command, "stack.tif", "--quantity", "counts").stdout
-    assert "Counts without flats: give --flats FILE (or a folder). If the frames were divided" in said
-    assert "Counts without darks: give --darks FILE (or a folder). If the frames were divided" in said
-
-
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     good = beamline("validate", "scan.h5", "--deep")
     assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
@@ -269,38 +175,6 @@ def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
     events = [json.loads(line) for line in beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
     assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
-
-
-def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) -> None:
-    with h5py.File("scan.h5", "r+") as file:
-        file["entry/title"][()] = "a\x1b]0;owned\x07\x1b[2J"
-    for command in ("info", "validate"):
-        output = beamline(command, "scan.h5").output
-        assert "\x1b" not in output and "\x07" not in output
-    assert "a\\x1b]0;owned" in beamline("info", "scan.h5").stdout
-
-
-@pytest.mark.parametrize("command", ["info", "validate", "monitor"])
-def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command: str) -> None:
-    data = (folder / "scan.h5").read_bytes()
-    parts = data.split(b"EAIB")  # where HDF5 keeps the places of chunks
-    (folder / "scan.h5").write_bytes(b"EAIB".join([parts[0], *(part[:8] + b"?" + part[9:] for part in parts[1:])]))
-    result = beamline(command, "scan.h5")
-    assert result.exit_code == 5, result.output
-    assert len(parts) > 1 and "damaged" in result.output
-
-
-@pytest.mark.parametrize("entry", ["entry", "entry0000"])  # where volumes are, and other scans
-def test_a_group_that_cannot_be_listed_is_called_damaged(tmp_path: Path, entry: str) -> None:
-    path = tmp_path / f"{'x' * 250}.h5"  # longer than a name beside it can be
-    with h5py.File(path, "w") as file:
-        file[f"{entry}/definition"] = "NXtomo"
-        file[f"{entry}/instrument/detector/data"] = np.ones((3, 4, 5), np.uint16)
-    *above, instrument, detector = path.read_bytes().split(b"SNOD")  # where HDF5 keeps the names in a group
-    path.write_bytes(b"SNOD".join([*above[:-1], above[-1] + b"?NOD" + instrument, detector]))
-    for command in ("info", "validate"):
-        result = beamline(command, path)
-        assert result.exit_code == 5 and "damaged" in result.output, result.output
 
 
 def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -17,7 +16,7 @@ from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.rows import Rows
-from drivers.base.frame import Frame, FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.cli.small_scan import left
 
 SHAPE = (24, 32)
@@ -85,16 +84,6 @@ def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.
     assert told == {"stuck-frames", "constant-darks"}  # flats and darks are of one number
 
 
-def test_a_scan_of_ours_can_be_ingested_again(
-    write: Callable[[list[Frame]], Path], frames: list[Frame], tmp_path: Path
-) -> None:
-    ingest(write(frames), tmp_path / "again.h5")
-    with open_scan(tmp_path / "again.h5") as source:
-        np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames])
-        assert source.image_key.tolist() == [int(frame.kind) for frame in frames]
-        assert source.axis_col == 7.25
-
-
 @pytest.mark.parametrize(
     ("raised", "seen"), [(OSError(28, "No space left"), DataError), (KeyboardInterrupt(), KeyboardInterrupt)]
 )
@@ -126,21 +115,6 @@ def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
     why = "No space left on device"
     assert str(error.value) == f"{out} could not be written ({why}). Check the disk; nothing is left of it."
     assert left(tmp_path) == {"lab.tif"}
-
-
-def test_a_cut_input_leaves_nothing(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    tif = stack[0]
-    tif.write_bytes(tif.read_bytes()[: tif.stat().st_size // 2])
-    with pytest.raises(DataError):
-        ingest(SourceOptions(tif, angles=ANGLES), tmp_path / "out.h5")
-    assert left(tmp_path) == {"lab.tif"}
-
-
-def test_nothing_is_overwritten(stack: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    (tmp_path / "out.h5").write_text("precious")
-    with pytest.raises(DataError, match="exists"):
-        ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5")
-    assert (tmp_path / "out.h5").read_text() == "precious"
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError, DataError
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.features.page.serve import open_port
 from beamline.monitor.check import Level
 from beamline.page.recording import Recording
-from beamline.page.run_files import EventLog, watched
 from beamline.scan.control import verbs_taken
 from beamline.storage.run_record import RunRecord, write_record
 from beamline.storage.volumes.base import bare_record
@@ -121,17 +119,6 @@ def test_a_frame_comes_as_numbers(page: Served) -> None:
     np.testing.assert_allclose(values, SCAN.counts()[6], atol=0.51 * float(str(head["scale"])))
 
 
-def test_what_many_ask_for_at_once_is_read_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[int] = []
-    picture, columns = Recording.picture, Recording.columns
-    monkeypatch.setattr(Recording, "picture", lambda *said, **more: (read.append(said[1]), picture(*said, **more))[1])
-    monkeypatch.setattr(Recording, "columns", lambda *said: (read.append(said[1]), columns(*said))[1])
-    with served(run) as page, ThreadPoolExecutor(8) as clients:
-        asked = ["/api/frame/20?corrected=0", "/api/columns?first=7"] * 8
-        answers = {body for _, _, body in clients.map(page.ask, asked)}
-    assert (len(answers), sorted(read)) == (2, [7, 20])
-
-
 @pytest.mark.parametrize("query", ["region=x", "region=1,2", "region=-1,2,3,4", "region=9999999999,1,1,1"])
 def test_an_invalid_region_means_the_whole_frame(page: Served, query: str) -> None:
     assert tile(page.ask(f"/api/frame/10?{query}")[2])[0]["region"] == [0, 4, 0, 40]
@@ -191,30 +178,9 @@ def test_a_server_ends_without_a_word_while_a_page_is_open(run: Path, capfd: pyt
     assert capfd.readouterr().err == ""
 
 
-def test_a_half_written_event_waits_for_its_end(tmp_path: Path) -> None:
-    log, path = EventLog(tmp_path), tmp_path / "events.jsonl"
-    path.write_text('{"event": "a"}\n{"eve')
-    log.refresh()
-    assert log.lines == ['{"event": "a"}']
-    with path.open("a") as file:
-        file.write('nt": "b"}\nno json\n')
-    log.refresh()
-    assert log.lines == ['{"event": "a"}', '{"event": "b"}']
-
-
-def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no folder of a run"):
-        watched(tmp_path)
-
-
 def test_a_taken_port_gives_way_to_the_next(tmp_path: Path) -> None:
     with open_port("127.0.0.1", 0) as first, open_port("127.0.0.1", first.getsockname()[1]) as second:
         assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + 9
-
-
-def test_an_invalid_address_is_refused() -> None:
-    with pytest.raises(ConfigError, match="expected an IP address"):
-        open_port("somewhere", 0)
 
 
 def test_the_volume_of_a_run_is_shown_once_it_is_there(tmp_path: Path) -> None:

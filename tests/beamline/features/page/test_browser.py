@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,14 +10,12 @@ import numpy as np
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
-from beamline.scan.control import State, state_of
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import write_reconstruction
 from recon.base.volume import VolumeSeries
 from tests.beamline.features.page.chromium import (
     BEAMLINE,
     MARKS,
-    WITHIN,
     Browser,
     browser,
     canvas_has_picture,
@@ -32,33 +28,6 @@ from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 __all__ = ["browser"]
 pytestmark = MARKS
-
-
-def test_a_scan_is_watched_paused_resumed_and_stopped(browser: Browser, tmp_path: Path) -> None:
-    command = [
-        *BEAMLINE, "scan", "configs/simulated.yaml", "--page", "--no-live", "-o",
-        str(tmp_path), "--set", "scan.period_s=0.2", "--set", "scan.angles.views=2000",
-    ]  # fmt: skip
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as scan:
-        assert scan.stderr is not None
-        address = next(found[1] for line in scan.stderr if (found := re.search(r"to control: (\S+)", line)))
-        browser.open(address)
-        assert "token" not in browser.driver.current_url
-        assert "act" not in browser.driver.current_url
-        browser.until(lambda: browser.text("state") == "acquiring", "the views begin")
-        browser.until(lambda: canvas_has_picture(browser, "frame"), "a frame is drawn")
-        browser.until(lambda: canvas_has_picture(browser, "sinogram"), "the sinogram is drawn")
-        browser.click("pause")
-        browser.until(lambda: browser.text("state") == "paused", "the scan pauses")
-        browser.click("resume")
-        browser.until(lambda: browser.text("state") == "acquiring", "the scan goes on")
-        browser.click("stop")
-        run = next(tmp_path.iterdir())
-        browser.until(lambda: state_of(run) in (State.FINISHING, State.STOPPED), "the scan stops")
-        scan.stderr.read()
-        assert scan.wait(WITHIN) == 4
-    assert state_of(run) is State.STOPPED
-    assert all("ERR_" in complaint for complaint in browser.complaints())  # the server has ended
 
 
 def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
@@ -74,17 +43,6 @@ def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
         browser.until(lambda: canvas_has_picture(browser, "frame"), "it is drawn")
         assert not browser.driver.find_element("id", "verbs").is_displayed()
         assert browser.complaints() == []
-
-
-def test_what_a_name_holds_is_text(browser: Browser, tmp_path: Path) -> None:
-    evil = "<img src=x onerror=window.evil=1>"
-    events = f'{{"event": "warning", "time": 1.0, "message": "{evil}"}}\n'
-    (tmp_path / "events.jsonl").write_text(events, encoding="utf-8")
-    write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
-    with served(tmp_path) as page:
-        browser.open(page.addresses.look)
-        browser.until(lambda: evil in browser.text("log"), "the warning is in the log")
-        assert browser.script("return window.evil === undefined && document.querySelector('#log img') === null")
 
 
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from beamline.features.page import serve as runs
 from beamline.page.run_files import EventLog
 from beamline.storage.run_record import RunRecord, write_record
 from tests.beamline.cli.small_scan import beamline
@@ -57,16 +56,6 @@ def test_each_run_has_its_page(tmp_path: Path) -> None:
             assert tile(page.ask(f"{root}/api/frame/10?corrected=0")[2])[1].shape == SCAN.shape
 
 
-def test_runs_beyond_those_that_stay_open_are_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runs, "OPEN_RUNS", 1)
-    for day in (1, 2):
-        made(tmp_path, day, "s")
-    with listed(tmp_path) as page:
-        for _ in range(2):
-            for row in rows(page):
-                assert page.ask(f"/run/{row['number']}/api/facts")[0] == 200
-
-
 def test_a_page_of_a_run_has_the_same_rules(tmp_path: Path) -> None:
     made(tmp_path, 1, "s")
     with listed(tmp_path) as page:
@@ -80,11 +69,6 @@ def test_a_page_of_a_run_has_the_same_rules(tmp_path: Path) -> None:
         assert page.ask(f"{root}/api/verb/stop", "POST", headers={"Origin": f"http://{page.host}"})[0] == 403
         for path in ("/run/7/api/facts", "/run/../api/facts/", "/run/x/", f"/run/%2e%2e/{tmp_path.name}/"):
             assert page.ask(path)[0] == 404
-
-
-def test_a_folder_without_runs_has_an_empty_table(tmp_path: Path) -> None:
-    with listed(tmp_path) as page:
-        assert rows(page) == []
 
 
 SECRET = b"-----BEGIN PRIVATE KEY-----"

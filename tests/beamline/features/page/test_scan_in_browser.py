@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tests.beamline.features.page.chromium import BEAMLINE, MARKS, Browser, browser, canvas_has_picture, page_of
-from tests.beamline.features.page.test_shown_scan import FORMATS
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 __all__ = ["browser"]
 pytestmark = MARKS
 REDRAWN_MS = 300.0
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_scan_is_looked_at(browser: Browser, tmp_path: Path, name: str) -> None:
-    path, facts = FORMATS[name](tmp_path)
-    options = [word for fact, value in facts.items() for word in (f"--{fact.replace('_', '-')}", str(value))]
-    with page_of([*BEAMLINE, "view", str(path), *options, "--port", "0"], r"(http\S+)") as (_, address):
-        browser.open(address)
-        for picture in ("slice00", "slice01", "mean", "pair", "fbp"):
-            if picture != "pair" or "half a turn apart" not in browser.text("pair-name"):
-                browser.until(partial(canvas_has_picture, browser, picture), f"{picture} is drawn")
-        assert "column 20." in browser.text("axis-said")
-        assert browser.driver.find_elements("css selector", "#angles canvas")
-        assert browser.complaints() == []
 
 
 def test_the_slice_follows_the_axis(browser: Browser, tmp_path: Path) -> None:

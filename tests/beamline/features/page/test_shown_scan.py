@@ -1,8 +1,6 @@
 """A scan of any format on the page: what its stack, means and slices by FBP hold."""
 
-import json
 import math
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -131,29 +129,3 @@ def test_what_cannot_be_shown_is_a_sentence(shown: ShownScan, tmp_path: Path) ->
     tifffile.imwrite(tmp_path / "scan.tif", SCAN.counts(), photometric="minisblack")
     with closing(ShownScan(open_scan(tmp_path / "scan.tif"))) as scan, pytest.raises(DataError, match="--angles FILE"):
         scan.axis(0)
-
-
-def test_a_zip_of_tiffs_without_angles_is_shown_as_a_scan(tmp_path: Path) -> None:
-    folder = tmp_path / "views"
-    folder.mkdir()
-    for n, image in enumerate(SCAN.counts()):
-        tifffile.imwrite(folder / f"view_{n:03}.tif", image)
-    packed = Path(shutil.make_archive(str(tmp_path / "views"), "zip", folder))
-    source = _scan(packed, {})
-    assert source is not None
-    with closing(ShownScan(source)) as scan:
-        assert "angles not known" in scan.facts()["said"]
-
-
-@pytest.mark.parametrize("what", ["flats as dark as darks", "angles without end"])
-def test_what_cannot_be_corrected_is_a_sentence(tmp_path: Path, what: str) -> None:
-    path = write_exchange(tmp_path / "scan.h5", SCAN)
-    with h5py.File(path, "r+") as file:
-        if what == "angles without end":
-            file["exchange/theta"][...] = np.inf
-        else:
-            file["exchange/data_white"][...] = file["exchange/data_dark"][:1]
-    with closing(ShownScan(open_scan(path))) as scan:
-        json.dumps([scan.facts(), scan.stack.facts()], allow_nan=False)
-        with pytest.raises(DataError, match=r"no angles|no beam in the flats"):
-            scan.axis(1)

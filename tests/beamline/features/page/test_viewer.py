@@ -14,7 +14,6 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.storage.volumes.base import Pixels, bare_record
 from beamline.storage.volumes.files import write_volume
-from recon.base.greys import grey_windows
 from tests.beamline.features.page.served import Served, viewed
 from tests.beamline.features.page.test_app import tile
 
@@ -98,25 +97,6 @@ def test_a_large_volume_is_binned_across_y_and_x_alone(files: tuple[Path, Path, 
     volume.close()
 
 
-def test_before_it_is_read_whole_the_nearest_slices_stand_for_others(
-    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(volume_file, "FIRST_READ_BYTES", 0)
-    volume = ShownVolume(files[0])
-    expected = {1: [0] * 6, 2: [0, 0, 0, 4, 4, 4], 3: [0, 0, 2, 2, 4, 4]}  # slices read: those that are shown
-    for n, shown in expected.items():
-        tile = volume.cut(2, 7, ALL)
-        assert tile.ready == pytest.approx(n / 6)
-        np.testing.assert_array_equal(tile.values, RAMP[shown, :, 7])
-        np.testing.assert_array_equal(volume.cut(0, 5, ALL).values, RAMP[5])
-        assert volume.read_more()
-    while volume.read_more():
-        pass
-    np.testing.assert_array_equal(volume.cut(2, 7, ALL).values, RAMP[:, :, 7])
-    volume.close()
-    assert not volume.read_more()
-
-
 def test_the_page_of_a_volume_reads_the_rest_by_itself(
     files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,59 +175,6 @@ def test_an_array_of_a_file_with_several_is_shown_by_its_name(tmp_path: Path) ->
     np.testing.assert_array_equal(volume.cut(0, 2, ALL).values, 3 * RAMP[2])
     volume.close()
     assert view_command._named(path) == (tmp_path / "two.npz", None)
-
-
-def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> None:
-    for value in (3.0, np.nan, -65535.0, 3e38):
-        np.save(tmp_path / "v.npy", np.full(SHAPE, value, np.float32))
-        volume = ShownVolume(tmp_path / "v.npy")
-        low, high = volume.facts()["window"]
-        assert low < high
-        assert sum(volume.histogram()["voxels"]) in (0, RAMP.size)
-        volume.close()
-
-
-def test_a_histogram_of_a_range_beyond_float32(tmp_path: Path) -> None:
-    np.save(tmp_path / "v.npy", np.float32([-3e38, 0, 3e38]).repeat(8).reshape(2, 3, 4))
-    volume = ShownVolume(tmp_path / "v.npy")
-    assert sum(volume.histogram()["voxels"]) == 24
-    volume.close()
-
-
-def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "v.npy", np.ones((0, 3, 3), np.float32))
-    with pytest.raises(DataError, match="has no voxels"):
-        ShownVolume(tmp_path / "v.npy")
-    (tmp_path / "v.h5").write_text("no volume")
-    with pytest.raises(DataError):
-        ShownVolume(tmp_path / "v.h5")
-
-
-def _sample_of(*parts: tuple[float, float], noise: float = 0.0, n: int = 40_000) -> np.ndarray:
-    """Values of which these shares have these levels, with noise."""
-    rng = np.random.default_rng(0)
-    values = np.concatenate([np.full(round(share * n), level) for share, level in parts])
-    return (values + noise * rng.standard_normal(values.size)).astype(np.float32)
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-@pytest.mark.parametrize("metal", [0.005, 0.05, 0.15])
-@pytest.mark.parametrize("times", [10.0, 30.0])
-def test_weak_matter_beside_metal_is_not_black_at_first(metal: float, times: float, noise: float) -> None:
-    values = _sample_of((0.6, 0.0), (0.4 - metal, 1.0), (metal, times), noise=noise)
-    low, high = grey_windows(values)["matter"]
-    assert (1.0 - low) / (high - low) > 0.3
-    wide = grey_windows(values)["all"]
-    assert (1.0 - wide[0]) / (wide[1] - wide[0]) < 0.13
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
-@pytest.mark.parametrize("offset", [0.0, 1000.0])
-def test_a_sample_of_one_matter_has_its_whole_range(share: float, noise: float, offset: float) -> None:
-    values = _sample_of((1 - share, offset), (share, offset + 1.0), noise=noise)
-    low, high = grey_windows(values)["matter"]
-    assert low < offset + 0.2 and offset + 0.9 < high < offset + 1.4
 
 
 def test_windows_are_buttons_of_the_page(tmp_path: Path) -> None:

@@ -145,17 +145,6 @@ def test_bad_input_leaves_nothing(here: Path, arguments: tuple[str, ...], code: 
     assert said in result.stderr and left(here) == before
 
 
-def test_a_picture_that_fails_leaves_nothing(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> bytes:
-        raise OSError(28, "No space left on device")
-
-    np.save(here / "can.npy", can())
-    monkeypatch.setattr(segment_run, "picture_of", full)
-    result = beamline("segment", "can.npy", *MARGIN)
-    assert result.exit_code == 5 and "No space left" in result.stderr
-    assert left(here) == {"can.npy"}
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_the_first_line_says_whether_the_table_is_of_use(here: Path) -> None:
     """A pin of metal does not stand for the sample; a square that cuts most bodies gives way to the whole volume."""

@@ -54,14 +54,6 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
         queue_needs(load_queue([tmp_path / "day.csv"], ["scan.period_s=0.001"]), tmp_path).refuse_impossible()
 
 
-def test_a_cell_is_the_text_that_stands_in_it(tmp_path: Path) -> None:
-    lines = "config,sample.name,sample.description", f"{SIMULATED},a,rinsed # 3 times", f'{SIMULATED},b,"x\ny, z"'
-    scans = load_queue([table(tmp_path, *lines)], ())
-    assert [scan.config.sample.description for scan in scans] == ["rinsed # 3 times", "x\ny, z"]
-    with pytest.raises(ConfigError, match=r"line 5: .*'cell #1'; expected text of letters"):
-        load_queue([table(tmp_path, *lines, f"{SIMULATED},cell #1,")], ())
-
-
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
@@ -127,8 +119,3 @@ def test_nothing_begins_after_a_stop_or_with_an_instrument_that_did_not_obey(
     with pytest.raises(QueueError) as raised:
         raise_unless_complete(outcomes)
     assert raised.value.exit_code == {"stop": 4, "interrupt": 130, "unsafe": 5}.get(how, 4)
-
-
-def test_a_table_that_cannot_be_read_hides_no_other_fault(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"(?s)none\.csv cannot be read .*gone\.yaml does not exist"):
-        load_queue([tmp_path / "none.csv", tmp_path / "gone.yaml"], ())

@@ -6,8 +6,6 @@ import json
 import math
 import re
 import signal
-import struct
-import sys
 from pathlib import Path
 
 import h5py
@@ -17,7 +15,7 @@ import pytest
 from beamline.core.installed import shipped_scenes
 from beamline.features.simulate import command as module
 from beamline.features.simulate import write
-from beamline.features.simulate.write import scan_of, write_scan
+from beamline.features.simulate.write import write_scan
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
 from beamline.scenes.scene_file import open_scene
@@ -156,25 +154,6 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
     assert (run.kind, run.first, run.last) == ("black_band", 2, 5)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there SIGTERM cannot be caught")
-def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def asked(*arguments: object) -> None:
-        signal.raise_signal(signal.SIGTERM)
-
-    before = left(folder)
-    monkeypatch.setattr("beamline.scenes.scene_file.write_truth", asked)
-    result = beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
-    assert result.exit_code == 130
-    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
-    assert left(folder) == before
-
-
-def test_with_nothing_to_do_programs_are_told_too(folder: Path) -> None:
-    result = beamline("simulate", "scene.yaml", "--json")
-    assert result.exit_code == 2
-    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
-
-
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = left(folder)
     for arguments, code, words in (
@@ -189,39 +168,11 @@ def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monk
     assert beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
 
 
-@pytest.mark.usefixtures("real_pictures")
-@pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
-def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
-    wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")
-    result = beamline("simulate", "scene.yaml", *wanted)
-    assert result.exit_code == 0, result.output
-    width, height = struct.unpack(">II", Path("p.png").read_bytes()[16:24])
-    assert 100 <= height < 3 * width
-
-
-def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
-    scan = scan_of(open_scene("scene.yaml"), 0, 60, 0.0)
-    # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
-    assert write._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
-    assert write._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
-    assert write._chosen(scan_of(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
-
-
 def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
     result = beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
     assert result.exit_code == 2
     assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
     assert not Path("s.h5").exists()
-
-
-@pytest.mark.parametrize("output", ["--out", "--picture"])
-def test_no_truth_is_left_of_a_scene_that_cannot_be_exposed(folder: Path, output: str) -> None:
-    """The body is at the source in the first view alone, so that the rehearsal of the last one shows nothing."""
-    body = "{kind: ellipsoid, semi_axes: [0.1, 0.1, 0.1], attenuation: 4.0, centre: [0.0, -0.3, 0.0]}"
-    wrong = ("--set", "beam.sod=0.35", "--set", "beam.sdd=1", "--set", f"phantom.solids=[{body}]")
-    result = beamline("simulate", "scene.yaml", "--truth", "t.h5", output, "s.h5", *wrong)
-    assert (result.exit_code, "reaches" in result.stderr) == (2, True), result.stderr
-    assert not Path("t.h5").exists()
 
 
 def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from beamline.features.sweeps import sweep
 from beamline.features.sweeps.command import sweepable
-from beamline.features.sweeps.sweep import SweptSlice, _changes_most, middle_axis, scores_of
-from beamline.features.sweeps.values import MOST, SweptOption, combinations, swept_option
+from beamline.features.sweeps.sweep import SweptSlice, scores_of
+from beamline.features.sweeps.values import swept_option
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import direct
@@ -120,12 +116,6 @@ def test_an_interrupt_keeps_the_slices_that_are_done(
     assert [row["filter"] for row in _table()] == ["hann", "ram-lak"]
 
 
-def test_other_pixels_have_no_score(folder: Path) -> None:
-    result = beamline("sweep", "scan.h5", "bin=1,2")
-    assert result.exit_code == 0 and "No score" in result.stderr
-    assert [row["residual_held_out"] for row in _table()] == ["", ""]
-
-
 def _slice(name: str, image: float, views: PreparedProjections) -> SweptSlice:
     projected = np.full((2, 1, 4), image, np.float32)
     resolution = ViewResolution.of(views.geometry, Grid.matching(views.geometry))
@@ -153,23 +143,6 @@ def test_only_views_that_no_slice_has_learnt_from_count() -> None:
     assert scores_of([_slice("a", 1.5, _views(1.0)), _slice("b", 1.2, _views(1.0, (7, 9)))]) is None
 
 
-def test_views_are_corrected_about_the_middle_axis_where_it_is_swept() -> None:
-    def of(*axes: float | None) -> Iterator[Selection]:
-        return (Selection(axis_col=axis) for axis in axes)
-
-    assert middle_axis([*of(5.0, 3.0, 4.0)]) == 4.0
-    assert middle_axis([*of(5.0, 5.0)]) is None and middle_axis([*of(5.0, None)]) is None
-
-
-def test_the_part_that_changes_most_is_shown() -> None:
-    images = [np.zeros((300, 450), np.float32) for _ in range(2)]
-    images[1][220:240, 400:410] = 1
-    rows, cols = _changes_most(images)
-    assert (rows.stop - rows.start, cols.stop - cols.start) == (200, 200)
-    assert rows.start <= 220 and rows.stop >= 240 and cols.start <= 400 and cols.stop >= 410
-    assert _changes_most([image[:100, :100] for image in images]) == (slice(None), slice(None))
-
-
 LEGAL = ("tv-weight", "rings", "axis")
 
 
@@ -188,15 +161,6 @@ def test_ranges_and_lists(text: str, expected: tuple[str, tuple[str, ...]]) -> N
     assert (option.name, option.values) == expected
 
 
-@given(st.integers(-500, 500), st.integers(1, 60), st.integers(1, MOST - 1))
-def test_a_range_has_each_step_and_both_ends_without_rounding(first: int, step: int, steps: int) -> None:
-    """In hundredths, which binary numbers do not hold."""
-    last = first + steps * step
-    values = swept_option(f"axis={first / 100}:{last / 100}:{step / 100}", LEGAL).values
-    assert [round(100 * float(value)) for value in values] == list(range(first, last + 1, step))
-    assert all(len(value) <= 8 for value in values)
-
-
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -211,18 +175,6 @@ def test_a_range_has_each_step_and_both_ends_without_rounding(first: int, step: 
 def test_nonsense_is_refused(text: str, why: str) -> None:
     with pytest.raises(ValueError, match=why.replace("?", r"\?")):
         swept_option(text, LEGAL)
-
-
-@pytest.mark.parametrize("names", ["", "aa", "abc"])
-def test_other_numbers_of_options_are_refused(names: str) -> None:
-    with pytest.raises(ValueError, match="or two others"):
-        combinations([SweptOption(name, ("1", "2")) for name in names])
-
-
-def test_a_grid_too_large_is_refused() -> None:
-    many = tuple(map(str, range(9)))
-    with pytest.raises(ValueError, match="81 combinations"):
-        combinations([SweptOption("a", many), SweptOption("b", many)])
 
 
 def test_options_of_a_slice_can_be_swept_and_those_of_a_volume_or_a_call_cannot() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import runner, tradeoff
@@ -138,20 +138,6 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
     assert run_tradeoff(options).compared
 
 
-def test_a_disk_that_is_full_later_leaves_the_trials_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: Any
-) -> None:
-    def filling(trial: Trial, *_: object, keep: bool = False) -> Outcome:
-        if trial.views != 27:
-            monkeypatch.setattr(Path, "write_bytes", _full)
-        return _made_up(trial)
-
-    made_up(filling)
-    with pytest.raises(DataError, match=r"tradeoff\.csv"):
-        run_tradeoff(_options(tmp_path))
-    assert [row["status"] for row in _rows(tmp_path / "out")][:2] == ["done", "done"]
-
-
 def test_a_limit_of_time_bounds_reading_and_the_page(
     tmp_path: Path, made_up: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,23 +175,6 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "said"),
-    [
-        ({"folder": Path()}, DataError, "never overwritten"),
-        ({"folder": Path("no/such/folder")}, DataError, "does not exist"),
-        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
-    ],
-)
-def test_what_cannot_be_done_leaves_nothing(
-    tmp_path: Path, changes: dict[str, Any], error: type[Exception], said: str
-) -> None:
-    with pytest.raises(error, match=said):
-        run_tradeoff(_options(tmp_path, **changes))
-    assert left(tmp_path) == {"scan.h5"}
-
-
-@pytest.mark.parametrize(
     ("program", "limit", "status", "said"),
     [
         ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
@@ -223,13 +192,6 @@ def test_what_becomes_of_a_process(
     assert (outcome.seconds == 2.5) is (status == "done")
 
 
-def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = 'import sys; print(\'{"event": "failed", "message": "v: the disk is full"}\'); sys.exit(5)'
-    monkeypatch.setattr(runner, "COMMAND", [sys.executable, "-c", program])
-    with pytest.raises(DataError, match="v:"):
-        run_trial(Trial("method", "fbp", 10), tmp_path, 0)
-
-
 @pytest.mark.slow
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
@@ -242,9 +204,3 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     assert outcome.quality("psnr") > 20
     assert (outcome.peak_bytes is None) != STATUS.is_file()  # Linux
     assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes < (peak_memory() or 0)
-
-
-def test_two_views_leave_none_to_judge_by(tmp_path: Path) -> None:
-    write_exchange(tmp_path / "scan.h5", TwoCylinders(angles=np.radians([0.0, 90.0]), shape=(4, 40)))
-    with pytest.raises(ConfigError, match="--truth"):
-        run_tradeoff(_options(tmp_path))

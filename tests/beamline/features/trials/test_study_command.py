@@ -15,7 +15,6 @@ import pytest
 from beamline.features.trials import runner
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import DATA, VOLUME, TrialData, averaged, dump, load, measured
-from beamline.report.sheets import SliceSheet
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
@@ -132,19 +131,6 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
     done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
     assert done == ["fixed, 90 views", "random, 90 views, draw 1"]
     assert (folder / "out" / "report.html").is_file() and not (folder / "out" / "work").exists()
-
-
-def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
-    volume = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
-    slices = SliceSheet()
-    slices.add("all views", volume)
-    for method in ("r2", "fbp"):
-        for draw in (1, 2):
-            slices.add(f"random, draw {draw}: {method}", volume, "random", method)
-        slices.add(f"fixed: {method}", volume, "", method)
-    for method in ("r2", "fbp"):
-        assert slices.labels(method) == ["all views", f"random, draw 1: {method}", f"fixed: {method}"]
-    assert slices.png(slices.labels("r2")).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

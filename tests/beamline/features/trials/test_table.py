@@ -7,20 +7,16 @@ import io
 import math
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from beamline.core.machine import machine
-from beamline.features.trials import table as table_module
-from beamline.features.trials.table import quality_plot, sentences, text, to_html, write_page, write_table
+from beamline.features.trials.table import sentences, to_html, write_table
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
 from beamline.features.trials.trial import LEAST_GAIN, Outcome, Trial, TrialTable
-from beamline.report.sheets import SliceSheet
 from recon.methods import by_name, names_of_one_volume
 
 
@@ -148,28 +144,6 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
         assert getattr(method, "seconds", seconds) == seconds
 
 
-def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"method 'art' is unknown; legal: r2, "):
-        plan(("fbp", "art"), 60, 1000, "quick")
-    with pytest.raises(ValueError, match=r"'steps' \(r2.* has\)"):
-        Trial("method", "sirt", 60, settings={"steps": 5}).build()
-
-
-def test_labels_say_what_is_not_the_default() -> None:
-    trial = Trial("method", "r2", 60, settings={"steps": 500, "gaussians": 50_000})
-    assert trial.label == "r2, 60 views, 500 steps, 50k Gaussians"
-    changed = {**trial.settings, "fit.ssim_weight": 0.0, "fit.kernel": "gaussian"}
-    assert replace(trial, settings=changed, binning=2).label == (
-        "r2, 60 views, bin 2, 500 steps, 50k Gaussians, no SSIM, gaussian kernel"
-    )
-    assert (
-        replace(trial, settings={**trial.settings, "start": "tv"}).label
-        == "r2, 60 views, 500 steps, 50k Gaussians, start tv"
-    )
-    assert Trial("iterations", "sart", 9, settings={"iterations": 1}).label == "sart, 9 views, 1 iteration"
-    assert Trial("iterations", "sart", 9, settings={"iterations": 30}).label == "sart, 9 views, 30 iterations"
-
-
 def test_quality_is_decibels_either_way() -> None:
     outcome = Outcome(Trial("method", "fbp", 4), "done", 1.0, metrics={"psnr": 30.0, "residual_held_out": 0.1})
     assert outcome.quality("psnr") == 30
@@ -189,17 +163,6 @@ def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
 
 def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
     return Outcome(trial, "done", seconds, memory, {"psnr": psnr, "ssim3d": 0.5})
-
-
-@pytest.mark.parametrize("depth", ["quick", "full"])
-def test_the_table_fits_into_120_columns(depth: Any) -> None:
-    """Also with four-digit numbers of views, and with everything that can be measured."""
-    metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784}
-    trials = plan(names_of_one_volume(), 1801, 200_000, depth)
-    outcomes = [Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4) for trial in trials]
-    said = text(_table(*outcomes))
-    assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
-    assert sum(" 12346 " in row and " 40000 " in row for row in said.splitlines()) == len(outcomes)
 
 
 def test_each_further_decibel_has_its_price() -> None:
@@ -231,22 +194,3 @@ def test_the_page_shows_words_of_others_as_words_and_marks_the_front() -> None:
     assert "a <b>" not in page and "a &lt;b&gt;.h5" in page
     assert f"<strong>{BASE.label}</strong>" in page and f"<strong>{FIT.label}" not in page
     assert "1 of 2 trials" in page
-
-
-def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
-    write_page(tmp_path, _table(Outcome(BASE, "failed")), SliceSheet())
-    assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html"}
-
-
-def test_every_trial_is_a_point_and_the_front_a_line_through_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Figure] = []
-    monkeypatch.setattr(table_module, "png", lambda figure: figures.append(figure) or b"")  # type: ignore[func-returns-value]
-    few = replace(FIT, group="views", views=5)
-    quality_plot(
-        _table(_done(BASE, 1.0, 20.0), _done(few, 20.0, 19.0), _done(FIT, 30.0, 25.0), _done(FIT, 2, math.nan))
-    )
-    by_time, by_memory, by_dose = figures[0].axes
-    fbp, r2, front = (np.asarray(line.get_data()).T.tolist() for line in by_time.lines)
-    assert (fbp, r2, front) == ([[1, 20]], [[20, 19], [30, 25]], [[1, 20], [30, 25]])
-    assert by_time.get_xscale() == "log" and by_memory.get_xscale() == "linear"
-    assert by_dose.get_xlabel() == "dose (frames)"

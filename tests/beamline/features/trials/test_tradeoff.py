@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -48,19 +46,6 @@ def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trial
     assert [t.views for t in quick_trials] == [20, 10]
 
 
-def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> None:
-    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "--full", "--json", "-o", "out")
-    assert result.exit_code == 0, result.output
-    events = [json.loads(line) for line in result.stdout.splitlines()]
-    assert (events[0]["event"], events[-1]["event"]) == ("tradeoff_started", "done")
-    assert events[-1]["output"] == "out"
-    assert events[0]["trials"] == len(quick_trials) > 10
-    assert {"r2", "fbp"} <= {trial.method for trial in quick_trials}
-
-
-SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
-
-
 def test_ctrl_c_is_exit_code_4_with_a_table(
     folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial]
 ) -> None:
@@ -77,17 +62,6 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
     assert "after 2 of" in result.stderr
     assert "fbp, 27 views" in result.stdout and "interrupted" in result.stdout and "not run" in result.stdout
     assert {"tradeoff.csv", "tradeoff.html"} < left(folder / "out")
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
-) -> None:
-    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(number))
-    result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "-o", "out")
-    assert result.exit_code == 130, result.output
-    assert result.stderr.endswith("beamline: interrupted\n") and result.stdout == ""
-    assert left(folder) == {"scan.h5"}
 
 
 @pytest.mark.parametrize(

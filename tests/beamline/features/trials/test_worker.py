@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import worker as module
 from beamline.features.trials.trial import Trial
-from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load, main, on_grid
+from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load, main
 from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
@@ -92,17 +90,6 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
         assert 1e8 < found["peak_bytes"] <= peak_memory()
 
 
-def test_the_memory_is_that_of_the_reconstruction_alone(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is read before the volume is measured."""
-    order, plain, measured = list[str](), module._reconstruct, module.measured
-    monkeypatch.setattr(module, "reset_peak_memory", lambda: order.append("reset"))
-    monkeypatch.setattr(module, "peak_memory", lambda: order.append("peak") or 7)  # type: ignore[func-returns-value]
-    monkeypatch.setattr(module, "measured", lambda *asked: order.append("measured") or measured(*asked))  # type: ignore[func-returns-value]
-    monkeypatch.setattr(module, "_reconstruct", lambda *asked: order.append("volume") or plain(*asked))  # type: ignore[func-returns-value]
-    assert run(Trial("method", "fbp", 27), data, 0)["peak_bytes"] == 7
-    assert order == ["reset", "volume", "peak", "measured"]
-
-
 def test_a_volume_that_is_written_is_the_one_measured(data: TrialData, tmp_path: Path, capsys: Any) -> None:
     assert done(data, tmp_path, Trial("method", "fbp", 27), keep=True) == 0
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
@@ -110,27 +97,6 @@ def test_a_volume_that_is_written_is_the_one_measured(data: TrialData, tmp_path:
     assert data.truth is not None
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_a_disk_that_is_full_is_no_trial_that_failed(data: TrialData, tmp_path: Path, capsys: Any) -> None:
-    (tmp_path / VOLUME).symlink_to("/dev/full")
-    assert done(data, tmp_path, Trial("method", "fbp", 27), keep=True) == DataError.exit_code
-    assert "could not be written (No space left" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{}, {"binning": 2, "fit.loss": "l2"}, {"fit.ssim_weight": 0.0, "fit.loss": "poisson"},
-     {"fit.truncation.sigmas": 2.5, "start": "tv"}],
-)  # fmt: skip
-def test_a_fit_with_each_setting(data: TrialData, change: dict[str, Any]) -> None:
-    binning = change.pop("binning", 1)
-    trial = Trial("method", "r2", 27, binning, {"steps": 120, "gaussians": 150, **change})
-    found = run(trial, data, 0)
-    assert found["metrics"]["psnr"] > 15
-    assert found["gaussians"] >= 100
-    json.dumps(found)
 
 
 def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
@@ -156,40 +122,6 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     own_length = by_name(method).traits.own_length
     assert (0 if own_length else 0.6 * 8) < found["seconds"] < 1.1 * 8
     assert np.isfinite(found["metrics"]["psnr"])
-
-
-def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
-    fine = Geometry.parallel([0.0], (8, 12), pixel_pitch=0.5)
-    coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
-
-    def ramp(on: Grid) -> np.ndarray[Any, np.dtype[np.float32]]:
-        z, y, x = on.coordinates()
-        return (z[:, None, None] + 2 * y[:, None] - 3 * x).astype(np.float32)
-
-    moved = on_grid(Volume(ramp(coarse), coarse), grid)
-    inner = (slice(1, -1),) * 3  # a linear function is interpolated exactly where nothing is beyond the ends
-    np.testing.assert_allclose(moved.data[inner], ramp(grid)[inner], atol=1e-5)
-
-
-def _cone(data: TrialData) -> TrialData:
-    """The same pixels as if they were a cone's."""
-    around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, axis_col=SCAN.axis_col)
-    return replace(data, prepared=replace(data.prepared, geometry=around, held_out=None))
-
-
-def test_views_of_a_cone_come_from_the_whole_turn(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views half a turn apart are not the same ones of a cone."""
-    cone = _cone(data)
-    turn = cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False))
-    around = replace(cone, prepared=replace(cone.prepared, geometry=turn))
-    seen: list[NDArray[np.float64]] = []
-    plain = module._reconstruct
-    monkeypatch.setattr(module, "warm_up", lambda *_: None)
-    monkeypatch.setattr(module, "_reconstruct", lambda *said: seen.append(said[1].geometry.angles) or plain(*said))
-    run(Trial("method", "fbp", 8), around, 0)
-    (angles,) = seen
-    assert angles.size == 8
-    assert np.diff(np.sort(angles), append=angles.min() + 2 * np.pi).max() < 1.6 * 2 * np.pi / 8
 
 
 def test_as_a_process_it_speaks_lines_of_json(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -199,10 +198,6 @@ def test_an_axis_that_leans_is_turned_back_by_what_is_said() -> None:
     assert "not known" in unknown.lines()[1] and "not known" in unknown.lines()[2]
 
 
-def test_the_second_view_stays_within_the_limits() -> None:
-    assert _aligned(_scene(1.0), math.radians(250)).offset == pytest.approx(1.0, abs=0.2)
-
-
 def test_views_without_contrast_are_refused_and_the_instrument_is_safe() -> None:
     instrument = FakeInstrument()
     with pytest.raises(QualityError, match="two views"):
@@ -225,16 +220,6 @@ DEMO = (
     "--set",
     "devices.camera.roi=[1140, 1968, 24, 160]",
 )
-
-
-def test_the_exposure_to_take_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = beamline("tune", *DEMO)
-    assert result.exit_code == 0, result.output
-    names = [line.split()[0] for line in result.stdout.splitlines()]
-    assert names == ["dark", "flat", "saturated", "photons", "view", "noise", "exposure"]
-    assert "scan.exposure_s=0.05" in result.stdout
-    assert list(tmp_path.iterdir()) == []  # nothing is written
 
 
 def test_references_that_would_stop_a_scan_end_with_6() -> None:

@@ -28,14 +28,6 @@ def test_black_rows_are_flagged_with_their_place(fake: Any, n: int, loss: float)
     assert flags[0].region == (20, 20 + max(n, 4), 0, 96)
 
 
-@pytest.mark.parametrize("first", [21, 22, 23])
-def test_a_band_that_covers_its_outer_blocks_by_a_part_is_one(fake: Any, first: int) -> None:
-    frames = fake.references() + fake.views(20)
-    for view in frames[20:25]:
-        black(view, first, 8)
-    assert [f.frame for f in only(fake.flags(frames))] == list(range(20, 25))
-
-
 def test_a_band_that_stays_is_flagged_until_it_is_old_news(fake: Any) -> None:
     frames = fake.references() + fake.views(40)
     for view in frames[20:]:

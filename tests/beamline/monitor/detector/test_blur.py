@@ -95,18 +95,6 @@ def test_a_slow_loss_of_focus_is_said_once_as_a_fact() -> None:
     assert len(facts) == 1 and "drifts" in facts[0].advice and facts[0].frame > 26
 
 
-def test_a_sharp_scan_with_many_or_few_photons_raises_no_flag() -> None:
-    assert scan(blurred(0, 0, 0.0)) == []
-    assert scan(blurred(0, 0, 0.0), photons=40) == []
-
-
-def test_flats_darker_than_the_darks_divide_by_nothing() -> None:
-    lines = np.full((8, 40), 100, np.uint16)
-    flat = (100 - (np.indices((8, 40))[1] % 2) * 3).astype(np.float32)
-    with np.errstate(all="raise"):
-        assert np.isnan(sharpness(lines, lines.astype(np.float32), flat)).all()
-
-
 def fringed(view: int, light: NDArray[np.float64]) -> NDArray[np.float64]:
     return light - laplace(light, mode="nearest")
 

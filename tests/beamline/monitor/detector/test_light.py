@@ -25,11 +25,6 @@ def test_a_step_is_flagged_once_with_its_size(share: float, level: Level) -> Non
     assert flags[0].score == pytest.approx(share, rel=0.05)
 
 
-def test_a_single_dim_view_is_two_steps() -> None:
-    flags = of_gain(Blobs(60, counts=lambda view, light: light * (1 - 0.05 * (view == 30))))
-    assert [(flag.frame, round(flag.score, 2)) for flag in flags] == [(40, -0.05), (41, 0.05)]
-
-
 def drift_and_half_a_percent(view: int, light: np.ndarray) -> np.ndarray:
     return light * np.exp(-view / 500) * (1 + 0.005 * (view >= 40))
 
@@ -67,16 +62,6 @@ def test_every_spot_is_counted_with_its_saturated_pixels(
     struck(frame, n, charge, rng)
     saturated = int((frame.counts == SATURATION).sum())
     assert spots(frame, before) == Spots(n, saturated)
-
-
-def test_what_stays_and_few_photons_are_none(fake: Any, rng: np.random.Generator) -> None:
-    before, frame, *scarce = fake.views(4)
-    for each in (before, frame):
-        each.counts[10, 20] = each.counts[31, 50] = 60_000  # hot
-        each.counts[:, 70:72] = 30_000  # a gap
-    for each in scarce:
-        each.counts[:] = 200 + 40 * rng.poisson(5, each.counts.shape)
-    assert spots(frame, before).n == spots(*scarce[::-1]).n == 0
 
 
 def only(fake: Any, frames: Sequence[Frame]) -> list[Flag]:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.foreign.ghost import COLUMNS, GhostCheck, Peak, best_trail
+from beamline.monitor.foreign.ghost import GhostCheck, Peak, best_trail
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs, blob
 
 BEGINS = 50
@@ -69,12 +69,6 @@ def line(speed: float, views: range, *, col: float = 10.0, score: float = 6.0) -
     return [Peak(view, col + speed * view, score) for view in views]
 
 
-@pytest.mark.parametrize("speed", [0.9, -0.7, 5.0])
-def test_a_trail_begins_at_its_first_peak_and_is_as_fast(speed: float) -> None:
-    trail = best_trail(line(speed, range(6)), TURN)
-    assert trail is not None and trail.first == 0 and trail.speed == pytest.approx(speed)
-
-
 @pytest.mark.parametrize(
     "peaks",
     [
@@ -88,9 +82,3 @@ def test_a_trail_begins_at_its_first_peak_and_is_as_fast(speed: float) -> None:
 )
 def test_other_peaks_are_none(peaks: list[Peak]) -> None:
     assert best_trail(peaks, TURN) is None
-
-
-def test_near_the_samples_rim_the_limit_falls() -> None:
-    """Its points there move along the beam."""
-    assert best_trail(line(0.35, range(8)), TURN) is None
-    assert best_trail(line(0.35, range(8), col=COLUMNS - 2.5), TURN) is not None

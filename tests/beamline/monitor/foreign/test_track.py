@@ -36,12 +36,6 @@ def test_noise_has_no_track_above_the_limit(octave: int) -> None:
     assert played(300, 0.0, 3.0, 7.0, octave) == []
 
 
-def test_the_highest_tracks_of_noise_are_those_of_a_gaussian() -> None:
-    """In 300 views some 10^8 lines are tried: the largest of as many Gaussian numbers is 5.6."""
-    scores = [track.score for track in played(300, 0.0, 3.0, 0.0)]
-    assert 4.0 < max(scores) < 6.2
-
-
 def test_a_crumb_far_below_the_peak_of_any_view_is_found_by_all_of_them() -> None:
     depth = 2.2 * NOISE / np.sqrt(LIGHT)  # in the smoothed cell about 3 standard deviations of a view
     tracks = played(70, depth, 2.6, 7.0)
@@ -57,11 +51,3 @@ def test_the_score_grows_as_the_root_of_the_views(speed: float) -> None:
     assert max(lengths) <= MEMORY and max(lengths) > 1.5 * min(lengths)
     ratios = [track.score / np.sqrt(len(track.steps)) for track in tracks]
     assert np.std(ratios) < 0.25 * np.mean(ratios)
-
-
-def test_a_point_of_the_sample_has_itself_as_rival() -> None:
-    turn, sample = np.radians(2.0), SampleMotion(np.radians(2.0), (63.5,), 66.0)
-    seen = looks(90, 0.2, lambda view: 63.5 + 60 * np.sin(turn * (view - 45)), 7.0, sample=sample)
-    tracks = [track for look in seen for track in look]
-    assert tracks
-    assert all(track.score**2 - track.rival**2 < 36 or track.rival > 0.85 * track.score for track in tracks)

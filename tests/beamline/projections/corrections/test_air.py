@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import recon
-from beamline.core.errors import DataError
 from beamline.projections.corrections.air import without_background
 from recon.base.geometry import Geometry
 from simulators.frame.shot import Detector
@@ -107,34 +104,6 @@ def test_views_held_out_lose_their_background_by_their_own_air() -> None:
     others = views[unseen].copy()
     without_background(views[used].copy(), GEOMETRY.select(used), "auto", (others, GEOMETRY.select(unseen)))
     assert np.sqrt(np.mean((others - clean[unseen]) ** 2)) < 0.003
-
-
-def test_dust_in_some_views_and_dead_pixels_do_not_bend_the_surface() -> None:
-    clean = _views(DOME, POST)
-    views = clean + BENT
-    views[20:24, 30:36, 56:61] += 0.3
-    views[:, 3, 5] = np.nan
-    without_background(views, GEOMETRY, "auto")
-    left = views - clean
-    left[20:24, 30:36, 56:61] = left[:, 3, 5] = 0
-    assert np.sqrt(np.mean(left**2)) < 0.002
-
-
-def test_the_same_surface_in_a_cone() -> None:
-    angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    cone = Geometry.cone(angles, SHAPE, 1.0, 400.0, 400.0, axis_col=32.3)
-    detector = Detector(SHAPE, 1.0, 32.3, cone.axis_row, 400.0)
-    sample = Phantom.of((DOME, replace(POST, height=12.0)))
-    clean = np.stack([sample.line_integrals(angle, detector) for angle in angles])
-    clean = (clean + np.random.default_rng(0).normal(0, NOISE, clean.shape)).astype(np.float32)
-    views = clean + BENT
-    assert "taken off. Air" in without_background(views, cone, "auto")[0]
-    assert np.sqrt(np.mean((views - clean) ** 2)) < 0.003
-
-
-def test_a_surface_that_no_ray_tells_is_refused() -> None:
-    with pytest.raises(DataError, match="miss the sample"):
-        without_background(_views(Cylinder(60.0, 60.0, 0.02)), GEOMETRY, 2)
 
 
 def test_a_positive_background_of_a_beam_brighter_than_its_flats_is_the_beams() -> None:

@@ -69,14 +69,6 @@ def test_a_region_of_views_that_are_turned_lies_where_its_pixels_went(binning: i
     np.testing.assert_array_equal(some, turned[:, 4 // binning : 12 // binning])
 
 
-def test_views_marked_later_take_the_line_of_those_after_them() -> None:
-    seen = [flag(4, (4, 8, 20, 24), first=2), flag(5, (4, 8, 22, 26)), flag(6, (4, 8, 24, 28))]
-    regions = regions_of(found(*seen), SHAPE)
-    assert regions.local[2:7].all()
-    left = {int(frame): int(box[2]) + 1 for frame, box in zip(regions.frames, regions.boxes, strict=True)}
-    assert left == {2: 16, 3: 18, 4: 20, 5: 22, 6: 24}
-
-
 @pytest.mark.parametrize("region", [None, (0, 20, 0, 30)])
 def test_without_a_region_or_with_most_of_the_view_the_whole_view_is_meant(
     region: tuple[int, int, int, int] | None,

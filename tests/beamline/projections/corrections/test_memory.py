@@ -13,26 +13,22 @@ import pytest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.beam_hardening.hardening import Hardening
 from beamline.projections.corrections.calibration.calibrate import Calibrate
-from beamline.projections.corrections.jumps.jumps import Jumps
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
-from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.prep.correct import Projections
-from recon.prep.dynamic_flats import DynamicFlats, find_dynamic_flats, search_memory, view_memory
 from recon.prep.resample import Distortion
 from recon.voxels.direct import Fbp
-from tests.beamline.projections.corrections.jumps import test_jumps as of_jumps
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 LENS = Distortion.parse("xcenter = 80\nycenter = 120\nfactor0 = 1.0\nfactor1 = 2e-5\n")
@@ -108,45 +104,6 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape:
         assert step.apply(prepared, angles, lambda n, of: None).sentence
 
     assert 0.25 * step.memory(part).alone < peak(work) - 4 * views.size < step.memory(part).alone
-
-
-@pytest.mark.parametrize(("pixels", "flats"), [((50, 80), 12), ((120, 200), 20)])
-def test_dynamic_flats_take_no_more_than_they_state(pixels: tuple[int, int], flats: int) -> None:
-    rng, size = np.random.default_rng(0), pixels[0] * pixels[1]
-    images = 1e4 + rng.normal(0, 20, (flats, *pixels)).astype(np.float32)
-    taken = peak(lambda: find_dynamic_flats(lambda: iter(images), rng))
-    assert 0.5 * search_memory(flats, size) < taken < search_memory(flats, size)
-    found = DynamicFlats(images[0], rng.normal(0, 1, (10, *pixels)).astype(np.float32))
-    taken = peak(lambda: found.flat_of(images[1] / 2)) + found.components.nbytes
-    assert 0.5 * view_memory(flats, size) < taken < view_memory(flats, size)
-
-
-@pytest.mark.slow
-def test_the_search_of_the_tilt_takes_no_more_than_it_states(tmp_path: Path) -> None:
-    path, step = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(40, 64))), TiltAndLens("auto")
-    with open_scan(SourceOptions(path)) as source:
-        part = part_of(source, step)
-        frames = usable_views(source, True).frames
-        taken = peak(lambda: with_tilt(source, part.selection, frames, pytest.fail, lambda n, of: None))  # type: ignore[arg-type]
-        assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
-        assert step.memory(part).correcting >= replace(step, tilt=0.5).memory(part).correcting > 0
-
-
-@pytest.mark.slow
-def test_the_search_of_a_jump_takes_no_more_than_it_states(tmp_path: Path) -> None:
-    path, step = of_jumps.scan(tmp_path, of_jumps.moved(1.5, 1.0), of_jumps.JUMP), Jumps()
-    with open_scan(SourceOptions(path)) as source:
-        part = part_of(source, step)
-        usable = usable_views(source, True)
-        taken = peak(lambda: step.place(source, part.selection, usable, 23.5, lambda n, of: None))
-        assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
-
-
-def test_a_scan_without_a_jump_needs_no_memory_for_it_unless_the_monitor_is_to_look(tmp_path: Path) -> None:
-    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(8, 40)))
-    with open_scan(SourceOptions(path)) as source:
-        stated = [Jumps().memory(part_of(source, *steps)).alone for steps in ((), (Preparation("judge"),))]
-    assert stated[0] == 0 < stated[1]
 
 
 def test_the_budget_counts_the_largest_step_that_is_alone_in_memory(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.files.validate import source_findings
-from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
@@ -97,10 +96,3 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     assert (found.geometry.n_views, warnings) == (45, [])
     fine.exposures[np.array(fine.image_key) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
     assert list(references_usable(fine)) == []  # type: ignore[arg-type]
-
-
-def test_good_references_are_all_used() -> None:
-    scan = source()
-    correction = ScanCorrection(scan, SELECTION, pytest.fail)  # type: ignore[arg-type]
-    assert correction.at_once(np.arange(6, 51)).view_ids.size == 45
-    assert {f for frames, _ in scan.was_read for f in frames} == set(range(57))

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from beamline.core.durations import Phases
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from recon.assess.metrics import psnr
@@ -78,19 +73,6 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
         assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
         assert _quality(found) > _quality(straight) - 0.3
     assert _quality(as_it_is) < _quality(straight) - 1
-
-
-@pytest.mark.slow
-def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> None:
-    events: list[Event] = []
-    phases = Phases(events.append, SimpleNamespace(now=itertools.count(0.0, 1.0).__next__))
-    source, selection = _source(1.5), SELECTION.with_steps(TiltAndLens("auto"))
-    prepare_projections(source, selection, lambda text: None, phases=phases)  # type: ignore[arg-type]
-    told = [(event.data["phase"], event.data["n"], event.data["of"]) for event in events if event.data["n"]]
-    bands = [n for phase, n, _ in told if phase == "tilt and references"]
-    assert bands == sorted(bands) and bands[:16] == list(range(1, 17))
-    steps = [(n, of) for phase, n, of in told if phase.startswith("background")]
-    assert steps and steps == [(n, len(steps)) for n in range(1, len(steps) + 1)]
 
 
 def test_no_tilt_changes_nothing() -> None:

@@ -12,7 +12,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
-from beamline.projections.step import StepDone, options_of
+from beamline.projections.step import StepDone
 from beamline.reconstruct.followed_views import FollowedViews
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import ArraySource
@@ -114,13 +114,6 @@ def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: st
     with pytest.raises(ConfigError, match="calibrated"):
         _rays(Width(arc="1:0.1"), _source(), learnt)
     assert _rays(Width(), _source(), Selection().with_steps(Calibrate(("axis", "shifts"))))[1].skew > 0
-
-
-@pytest.mark.parametrize(("field", "words"), [("spread", ("wide", "-1", "500")), ("arc", ("-1", "1:2:3", "x", "720"))])
-def test_other_words_are_refused(field: str, words: tuple[str, ...]) -> None:
-    for text in words:
-        with pytest.raises(ValueError, match="is neither"):
-            options_of(Width)[field].parse(text)
 
 
 def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.monitor.checks import ALARM_SHIFT
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.averaged import JOINED_DEG, AveragedSource
+from beamline.storage.readers.averaged import AveragedSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.transforms import cropped
 from drivers.base.frame import FrameKind
@@ -46,12 +46,6 @@ def test_a_view_is_the_mean_of_its_frames_and_references_stay(dtype: Any) -> Non
     np.testing.assert_allclose(read.read([4], slice(1, 2)), means(base, [6, 7, 8])[:, 1:2], rtol=6e-8)
     assert read.dtype == np.float32 and read.frames_per_view == 3
     assert read.triggers.tolist() == [0, 1, 2, 3, 6, 9] and read.framestamps.tolist() == [7] * 6
-
-
-def test_how_far_apart_the_frames_of_a_view_are_is_an_attribute() -> None:
-    base = scan([VIEW] * 8, [0, 0, 10, 10, 20, 20, 30, 30])
-    assert JOINED_DEG not in AveragedSource(base, 2).attributes
-    assert AveragedSource(base, 4).attributes[JOINED_DEG] == pytest.approx(10)
 
 
 def test_frames_that_are_missing_or_invalid_move_no_frame_to_another_view() -> None:

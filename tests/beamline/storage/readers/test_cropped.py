@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
 from beamline.storage.flag_legend import TODAY, FrameFlags
@@ -45,12 +44,6 @@ def test_everything_else_is_as_in_the_whole_scan(path: Path) -> None:
         assert part.refresh() == whole.refresh()
 
 
-@pytest.mark.parametrize("cols", [(0, 6), (5, 6), (3, 3)])
-def test_columns_outside_the_detector_are_refused(path: Path, cols: tuple[int, int]) -> None:
-    with pytest.raises(ConfigError, match="columns 0:5"):
-        open_scan(SourceOptions(path, cols=cols))
-
-
 class _Flagged(ArraySource):
     """A scan of 3 frames of 10 x 100 pixels. The second one has a flag in columns 60 to 70."""
 
@@ -65,10 +58,6 @@ class _Flagged(ArraySource):
         regions[1, 0] = 2, 6, 60, 70
         bits = np.array([0, 1 << TODAY[0].bit, 0], np.uint64)
         return FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions)
-
-
-def test_rows_are_read_as_late_as_in_the_whole_scan() -> None:
-    assert cropped(_Flagged(), (40, 100)).row_period == 2e-5  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])

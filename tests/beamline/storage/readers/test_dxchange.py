@@ -132,18 +132,6 @@ def test_real_files(shared_data: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "said"), [("S3", "text"), ("c8", "complex numbers"), ("?", "true and false"), ([("a", "f4")], "records")]
-)
-@pytest.mark.parametrize("name", ["data", "data_dark", "theta"])
-def test_what_is_no_real_number_is_refused(tmp_path: Path, parts: Parts, name: str, dtype: object, said: str) -> None:
-    parts[name] = np.zeros(parts[name].shape, dtype)  # type: ignore[call-overload]
-    path = store(tmp_path / "s.h5", parts)
-    with pytest.raises(DataError) as error:
-        open_scan(path)
-    assert str(error.value) == f"/exchange/{name} in {path} holds {said}; expected whole or real numbers."
-
-
-@pytest.mark.parametrize(
     ("theta", "white"),
     [
         (np.arange(8) * 20.0, [0, 0, 160, 160]),

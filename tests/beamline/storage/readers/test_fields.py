@@ -300,15 +300,6 @@ def test_numbers_in_text_and_units_in_full_are_used_or_named(tmp_path: Path, val
         assert any(each.where == field for each in source.not_used) is (um is None)
 
 
-@pytest.mark.parametrize(("value", "units"), [("25.0", "keV"), (b"25 keV", None), ("25000", "electronvolts")])
-def test_an_energy_and_angles_in_text(tmp_path: Path, value: Any, units: str | None) -> None:
-    angles = np.array([f"{n:.3f}" for n in np.r_[0, 0, np.arange(VIEWS) * 36.0]], h5py.string_dtype())
-    changes = ("instrument/beam/incident_energy", value, units), ("sample/rotation_angle", angles, "degrees")
-    with open_scan(nxtomo(tmp_path / "s.nx", *changes)) as source:
-        assert source.energy_kev == pytest.approx(25.0)
-        np.testing.assert_allclose(np.degrees(source.angles[2:]), np.arange(VIEWS) * 36.0)
-
-
 @pytest.mark.parametrize(
     ("where", "value"), [(ENERGY, 25.0), (f"{PIXEL}/x_pixel_size", 0.65), (f"{PIXEL}/y_pixel_size", 6.5)]
 )

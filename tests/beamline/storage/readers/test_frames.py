@@ -16,16 +16,6 @@ def _of(n: int, first: int = 0) -> Any:
     return ArraySource(frames, [0] * n, np.arange(n, dtype=float))
 
 
-def test_what_one_source_does_not_state_is_unknown_of_its_frames_alone() -> None:
-    one, other = _of(2), _of(3, 12)
-    other.currents, other.shifts = np.array([1.0, 2.0, 3.0]), np.ones((3, 2))
-    both = Frames(one, other)
-    np.testing.assert_array_equal(both.currents, [np.nan, np.nan, 1, 2, 3])
-    np.testing.assert_array_equal(both.shifts, [[np.nan] * 2] * 2 + [[1, 1]] * 3)
-    assert both.energies is None and both.flags is None and both.replaces is None
-    np.testing.assert_array_equal(both.angles, [0, 1, 0, 1, 2])
-
-
 def test_rows_count_from_the_first_frame_of_all() -> None:
     one, other = _of(2), _of(3, 12)
     one.damaged, other.damaged, other.altered = frozenset({1}), frozenset({0}), frozenset({2})

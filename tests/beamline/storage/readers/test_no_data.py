@@ -97,8 +97,3 @@ def test_a_mask_is_mirrored_with_its_frames(tmp_path: Path, rng: np.random.Gener
     with open_scan(path) as source:
         assert not source.read([-1])[0, :, ::-1][MASK > 0].any()
         assert source.read([-1]).max() < 1000
-
-
-def test_a_mask_of_most_pixels_is_of_another_meaning(tmp_path: Path, rng: np.random.Generator) -> None:
-    with open_scan(_scan(tmp_path / "s.nx", rng, "u2", None, 1 - np.minimum(MASK, 1))) as source:
-        assert source.read([-1]).min() > 0

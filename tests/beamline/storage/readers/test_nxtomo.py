@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
-from beamline.storage import datasets
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.readers.replacements import overlaid
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -67,15 +66,6 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
         np.testing.assert_allclose(a.angle, b.angle, rtol=1e-15)  # degrees in the file
 
 
-def test_what_the_file_says_about_the_scan(path: Path) -> None:
-    with open_scan(path) as source:
-        assert (source.format, source.quantity, source.finished) == ("nxtomo", "counts", True)
-        assert (source.dtype, source.shape) == (np.uint16, (12, 16))
-        assert (source.pixel_size_mm, source.energy_kev, source.axis_col) == (0.0046, 25.0, 7.25)
-        said = {name: source.attributes[name] for name in ("sample", "distance_mm", "exposure_s")}
-        assert said == {"sample": "battery", "distance_mm": 100.0, "exposure_s": 0.05}
-
-
 def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: list[Frame]) -> None:
     own = [replace(frame, exposure=0.01 * (frame.index + 1)) for frame in frames]
     with open_scan(write(own)) as source:
@@ -91,20 +81,6 @@ def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: l
             file["entry1/tomo_entry/instrument/detector/count_time"].attrs["units"] = "ms"
         with open_scan(tmp_path / "f.nxs") as source:
             np.testing.assert_allclose(source.exposures, expected)
-
-
-def test_frames_come_in_the_order_asked_for(path: Path, frames: list[Frame]) -> None:
-    everything = np.stack([frame.counts for frame in frames])
-    with open_scan(path) as source:
-        for wanted in ([3, 1, 2, 3], [-1, 0], np.arange(4, 9), [], slice(2, 9, 3), slice(None, None, -1)):
-            np.testing.assert_array_equal(
-                source.read(wanted), everything[wanted if isinstance(wanted, slice) else np.array(wanted, int)]
-            )
-        np.testing.assert_array_equal(source.read([5, 4], slice(2, 7)), everything[[5, 4], 2:7])
-        with pytest.raises(IndexError, match=r"only 0\.\.13"):
-            source.read([14])
-        with pytest.raises(IndexError, match="whole numbers"):
-            source.read([0.5])
 
 
 def foreign(path: Path, *, units: str | None = "degree", dtype: str = "u2", entry: str = "entry1/tomo_entry") -> Path:
@@ -170,15 +146,6 @@ def test_float_frames_are_of_unknown_quantity_and_no_frames_of_a_camera(tmp_path
         assert source.quantity == "unknown"
         with pytest.raises(DataError, match="uint16"):
             next(source.frames())
-
-
-def test_counts_that_do_not_agree_are_named(tmp_path: Path) -> None:
-    path = foreign(tmp_path / "f.nxs")
-    with h5py.File(path, "r+") as file:
-        del file["entry1/tomo_entry/instrument/detector/image_key"]
-        file["entry1/tomo_entry/instrument/detector/image_key"] = [0, 0]
-    with pytest.raises(DataError, match="6 frames, 2"):
-        open_scan(path)
 
 
 def test_several_entries_need_a_default(tmp_path: Path) -> None:
@@ -283,29 +250,6 @@ def test_virtual_frames_join_the_tiles_of_a_detector(tmp_path: Path, tiles: list
         open_scan(path)
 
 
-@pytest.mark.parametrize("drawn", [h5py.Empty("u2"), np.zeros((3, 3, 3, 3), np.uint16), None], ids=str)
-def test_virtual_frames_of_a_dataset_that_was_replaced_are_refused(path: Path, drawn: object) -> None:
-    """HDF5 crashes on a null dataspace there, and reads for ever where the source has more dimensions."""
-    with h5py.File(path, "r+") as file:
-        del file["entry/instrument/detector/data"]
-        if drawn is not None:
-            file["entry/instrument/detector/data"] = drawn
-    with pytest.raises(DataError, match=r"/entry/instrument/detector/data\b.* is not there"):
-        open_scan(path)
-
-
-def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "f.h5", "w") as file:
-        file.create_dataset("exchange/data", (3, 10**9, 10**9), "u2", chunks=(1, 10, 10))
-    with (
-        h5py.File(tmp_path / "f.h5") as file,
-        pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"),
-    ):
-        datasets.require_possible(file["exchange/data"])
-    with pytest.raises(DataError, match="claims 6e"):
-        open_scan(tmp_path / "f.h5")
-
-
 def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
     with pytest.raises(NotReadyError, match="does not exist"):
         open_scan(tmp_path / "soon.h5", follow=True)
@@ -348,13 +292,3 @@ def test_what_is_no_real_number_is_refused(path: Path, where: str, dtype: str, s
         file["entry"][where].attrs.update(attributes)
     with pytest.raises(DataError, match=rf"^/entry/{where} in .* holds {said}; expected whole or real numbers\.$"):
         open_scan(path)
-
-
-def test_exposures_that_are_text_are_not_known(path: Path, frames: list[Frame]) -> None:
-    with h5py.File(path, "r+") as file:
-        del file["entry/instrument/detector/count_time"]
-        del file["entry/progress"]  # ours never has text there
-        file["entry/instrument/detector/count_time"] = np.full(len(frames), b"long")
-        file["entry/instrument/detector/count_time"].attrs["units"] = "s"
-    with open_scan(path) as source:
-        assert np.isnan(source.exposures).all()

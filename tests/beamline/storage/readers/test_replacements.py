@@ -47,11 +47,6 @@ def test_a_log_may_hold_no_angle_for_darks_and_flats_but_no_other_word() -> None
         parse_angles("0\ninf\n", "a.txt")
 
 
-def test_a_missing_angle_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere\.txt cannot be read \(No such file or directory\)\.$"):
-        load_angles(tmp_path / "nowhere.txt")
-
-
 class Frames(StacksSource):
     """Frames without pixels, with image keys and the numbers of their files."""
 
@@ -155,12 +150,6 @@ def test_the_scan_is_found_between_standing_references(
     table = np.concatenate([np.full(before, scan[0]), scan, np.full(after, scan[-1])])
     expected = (before, before + n - 1) if before + after else None
     assert evenly_spaced_window(table, n) == expected
-
-
-@given(n=st.integers(4, 40), more=st.integers(1, 12), noise=st.floats(0, 0.1))
-def test_no_rows_are_advised_where_others_would_do_as_well(n: int, more: int, noise: float) -> None:
-    table = np.arange(n + more) + noise * np.random.default_rng(n).normal(size=n + more).clip(-2, 2)
-    assert evenly_spaced_window(table, n) is None
 
 
 SHAPE = (6, 8)

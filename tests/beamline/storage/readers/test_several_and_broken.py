@@ -80,18 +80,6 @@ def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, where: str, link: ob
         open_scan(path)
 
 
-def test_a_broken_link_to_angles_or_to_a_dataset_by_its_name_is_named(tmp_path: Path) -> None:
-    gone = h5py.ExternalLink("gone.h5", "/raw/data")
-    with open_scan(_broken(tmp_path / "a.h5", "entry/sample/rotation_angle", gone)) as source:
-        assert "is a link to gone.h5::/raw/data, which is not there" in str(source.attributes["angles"])
-    path = _broken(tmp_path / "b.h5", "exchange/other", gone)
-    for data in ("exchange/other", "exchange/other/below"):
-        with pytest.raises(DataError, match=r"/exchange/other"):
-            open_scan(SourceOptions(path, data_path=data, angles=ANGLES))
-    with pytest.raises(DataError, match="exchange/none"):
-        open_scan(SourceOptions(path, data_path="exchange/none", angles=ANGLES))
-
-
 @pytest.mark.parametrize("number", [37, 38, 95])
 def test_a_disk_without_locks_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     path, real = two_detectors(tmp_path / "s.nx"), h5py.File
@@ -104,12 +92,3 @@ def test_a_disk_without_locks_is_read(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(h5py, "File", without_locks)
     with hdf5.open_hdf5(path) as file:
         assert "entry" in file
-
-
-def test_fewer_angles_than_views_are_refused_without_advice_to_choose_among_them(tmp_path: Path) -> None:
-    path = tmp_path / "s.h5"
-    with h5py.File(path, "w") as file:
-        _exchange(file)
-    with pytest.raises(DataError, match=r"2 angles") as told:
-        open_scan(SourceOptions(path, angles=ANGLES[:2]))
-    assert "--angle-rows" not in str(told.value)

@@ -122,15 +122,6 @@ def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding
         assert white[:2] == ([0, 60_000] if FILES[name][0] == NIKON else [False, False])
 
 
-def test_what_is_given_goes_before_a_makers_file(images: Path) -> None:
-    (images / "s.xtekct").write_text(NIKON)
-    flats = np.full((2, *SHAPE), 61_000, np.uint16)
-    given = SourceOptions(images, side_file=images / "s.xtekct", flats=flats, angles=np.arange(N) * 1.0)
-    with open_scan(given) as source:
-        assert source.read([1, 2])[:, 0, 0].tolist() == [61_000, 61_000]
-        np.testing.assert_allclose(source.angles[-N:], np.arange(N))
-
-
 def test_nikons_list_of_angles_goes_before_its_step(images: Path) -> None:
     (images / "s.xtekct").write_text(NIKON)
     rows = "".join(f"{i + 1}\t{i * 59.5:.4f}\t{i}\n" for i in range(N))
@@ -161,9 +152,3 @@ def test_a_file_that_does_not_say_enough_is_refused_and_not_offered(
         open_scan(SourceOptions(images, side_file=images / name))
     with open_scan(images) as source:
         assert source.not_used == ()
-
-
-def test_a_refusal_names_the_file_that_would_help(images: Path) -> None:
-    (images / "s.xtekct").write_text(NIKON)
-    with pytest.raises(DataError, match=r"transmission.*Beside it lies s\.xtekct: --from .*s\.xtekct takes it"):
-        open_scan(SourceOptions(images, quantity="transmission"))

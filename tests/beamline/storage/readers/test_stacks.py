@@ -41,32 +41,12 @@ def path(tmp_path: Path, images: np.ndarray) -> Path:
     return tmp_path / "s.h5"
 
 
-def test_darks_then_flats_then_projections(path: Path, images: np.ndarray) -> None:
-    with open_scan(SourceOptions(path, **PATHS)) as source:
-        assert (source.format, source.quantity, source.finished) == ("hdf5_stacks", "counts", True)
-        assert source.image_key.tolist() == [2, 2, 1, 1, 1, 0, 0, 0, 0, 0]
-        np.testing.assert_array_equal(source.read(slice(None)), images)
-        np.testing.assert_array_equal(source.read([9, 0, 4], slice(1, 3)), images[[9, 0, 4], 1:3])
-        np.testing.assert_allclose(source.angles[5:], np.linspace(0, np.pi, 5))
-        assert np.isnan(source.angles[:5]).all()
-        assert [frame.trigger for frame in source.frames()] == [0, 1, 0, 1, 2, 0, 1, 2, 3, 4]
-
-
 @pytest.mark.parametrize("unit", ["deg", "rad"])
 def test_a_unit_that_is_given_goes_before_the_file(path: Path, unit: str) -> None:
     for where, values in (("/motors/omega", np.linspace(0, np.pi, 5)), ("/motors/plain", np.linspace(0, 180, 5))):
         with open_scan(SourceOptions(path, **{**PATHS, "angles_path": where}, angles_unit=unit)) as source:
             expected = values if unit == "rad" else np.radians(values)
             np.testing.assert_allclose(source.angles[5:], expected)
-
-
-def test_of_one_angle_for_each_frame_those_of_the_projections_are_named(path: Path) -> None:
-    """Nothing says whether darks and flats were taken before the projections or after them."""
-    said = {**PATHS, "angles_path": "/motors/of_all", "angles_unit": "deg"}
-    with pytest.raises(DataError, match=r"10 angles.*--angle-rows"):
-        open_scan(SourceOptions(path, **said))
-    with open_scan(SourceOptions(path, **said, angle_rows="2:7")) as source:
-        np.testing.assert_allclose(np.degrees(source.angles[5:]), np.linspace(0, 450, 10)[2:7])
 
 
 def test_a_reference_may_be_a_single_image(path: Path, images: np.ndarray) -> None:
@@ -175,12 +155,6 @@ def test_dimensions_that_shapes_tell(
     with open_scan(_options(_stored(tmp_path / "s.mat", images, ORDERS[dimensions], matlab, one))) as source:
         np.testing.assert_array_equal(source.read(slice(5 - 3 * one, None)), images[5:])
         np.testing.assert_array_equal(source.read([0])[0], images[0])
-
-
-def test_names_of_dimensions_that_say_nothing(path: Path) -> None:
-    for names in ("frame,row", "a,b,c", "row,col,x"):
-        with pytest.raises(DataError, match=f"given as {names}; expected three"):
-            open_scan(SourceOptions(path, **(PATHS | {"data_path": f"/raw/images:{names}"})))
 
 
 @pytest.mark.parametrize("store", ["stacks", "exchange"])

@@ -87,11 +87,6 @@ def test_angles_are_those_of_all_views_or_of_the_selected_ones(series: Path) -> 
         open_scan(SourceOptions(series, frames="darks=0:1,flats=1:2,8:", angles=np.arange(8.0)))
 
 
-def test_names_of_files_say_kinds_where_views_alone_are_selected(series: Path) -> None:
-    with open_scan(SourceOptions(series, frames="0::2", angles=np.arange(4.0))) as source:
-        assert [int((source.image_key == kind).sum()) for kind in (DARK, VIEW)] == [3, 2]
-
-
 def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
     """Darks, flats and two halves of the views in files of their own, as Diamond and others write them."""
     paths = []

@@ -84,8 +84,3 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
         assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION)), counts)
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.FLAT)), flats)
-
-
-def test_counts_beyond_four_signed_bytes_are_told() -> None:
-    counts = (SCAN.counts(40_000).astype(np.uint32) * 60_000).view(np.int32)
-    assert type_wrapped(counts) == np.uint32

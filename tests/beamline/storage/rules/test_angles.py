@@ -87,10 +87,6 @@ def test_a_rod_about_an_axis_far_from_the_middle_is_never_refused(axis: float) -
         assert all(hit.severity == "warning" for hit in told(scan(rod, true, true, axis)))
 
 
-def test_a_round_sample_shows_no_angle() -> None:
-    assert told(scan(ROUND, turn(180, 90), turn(200, 90))) == []
-
-
 def ordered(source: ArraySource) -> list[Finding]:
     seen = coarse_views(source)  # type: ignore[arg-type]
     return [] if seen is None else list(angles_in_order(seen))
@@ -151,19 +147,6 @@ def test_neighbours_that_are_mirror_images_are_named(
     assert hit.severity == "warning" and "are mirror images" in hit.message
 
 
-@pytest.mark.parametrize("views", [53, 67, 74, 89, 107])
-def test_any_number_of_views_shows_halves_exchanged_and_no_symmetric_sample(views: int) -> None:
-    even = turn(180, views)
-    for balls in (WITHIN, WIDER):
-        (hit,) = ordered(scan(balls, np.roll(even, views // 2), even))
-        assert "are mirror images" in hit.message
-    copied = even.copy()
-    copied[views // 2 : views // 2 + 2] = even[views // 2 - 1]
-    two: Balls = [(0, 0, 22, 0.01), (9, 5, 6, 0.04)]
-    for balls in (ROD, two):
-        assert ordered(scan(balls, copied, even)) == []
-
-
 @pytest.mark.parametrize("stands", [4, 8, 12])
 def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
     true = turn(180, 120)
@@ -178,14 +161,3 @@ def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
     source.angles[source.image_key == 0] = np.concatenate([true[:1], np.repeat(true[1::stands], stands)])[:120]
     (uneven,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
     assert "--angles FILE" in uneven.message and "--frames" not in uneven.message
-
-
-@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
-@pytest.mark.parametrize("stands", [1, 2, 4, 8])
-def test_frames_of_one_angle_that_are_averaged_do_not_differ(balls: Balls, stands: int) -> None:
-    angles = np.repeat(turn(180, 120)[::stands], stands)
-    source = scan(balls, angles, angles)
-    assert not list(angles_stand(coarse_views(source)))  # type: ignore[arg-type]
-    views = np.flatnonzero(source.image_key == 0)
-    source._data[views] = source._data[views[::stands]].repeat(stands, axis=0)  # a camera that repeats them to the bit
-    assert not list(angles_stand(coarse_views(source)))  # type: ignore[arg-type]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from itertools import product
@@ -21,7 +20,6 @@ from drivers.base.frame import Frame
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.beamline.storage.conftest import SHAPE
 
-Write = Callable[[list[Frame]], Path]
 DETECTOR = "entry/instrument/detector"
 
 
@@ -62,16 +60,6 @@ def test_frames_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     flip(path, offset + 8, 3)
     (hit,) = [hit for hit in validate(path, deep=lambda n, of: None) if hit.rule == "unreadable"]
     assert hit.message.startswith("1 frame cannot be read: 34. Frame 30 of /exchange/data in ")
-
-
-def test_frames_of_big_endian_files_are_as_written_when_ingested(tmp_path: Path) -> None:
-    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(), {"data": TwoCylinders().counts().astype(">u2")})
-    ingest(path, tmp_path / "ours.h5")
-
-    def differ() -> list[str]:
-        return [hit.message for hit in validate(tmp_path / "ours.h5", lambda n, of: None) if hit.rule == "checksums"]
-
-    assert differ() == []
 
 
 def test_a_damaged_scan_is_not_ingested(path: Path, tmp_path: Path) -> None:

@@ -75,25 +75,11 @@ def test_views_that_were_scaled_each_by_itself(dtype: type) -> None:
     assert not list(views_scaled(ArraySource(one_scale, [0] * len(one_scale), ANGLES)))  # type: ignore[arg-type]
 
 
-def test_a_dead_and_a_hot_pixel_are_no_scale() -> None:
-    _, _, views = counts(20.0)
-    views[:, 2, 3], views[:, 5, 6] = 0, 65535
-    assert not list(views_scaled(ArraySource(views.astype(np.uint16), [0] * len(views), ANGLES)))  # type: ignore[arg-type]
-
-
 def test_whole_numbers_that_stand_for_transmission() -> None:
     """A full scale of 16 bits for all light, as documented, is written and not saturated."""
     full = np.full((1, *SHAPE), 65535.0)
     said = told(0 * full, full, 65535 * np.exp(-lines(20.0)))
     assert said == ""
-
-
-@pytest.mark.parametrize("end", [65535.0, 4095.0])
-def test_flats_saturated_everywhere_beside_darks_of_one_number(end: float) -> None:
-    darks, flats, views = counts(20.0)
-    said = told(np.full_like(darks, 100), np.full_like(flats, end), views)
-    assert said.startswith("refused: ")
-    assert "100.00% of their pixels are saturated" in said
 
 
 def test_a_beam_that_flickers_or_drifts_has_no_lights_in_turn() -> None:

@@ -40,12 +40,6 @@ def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, sev
     assert describe(path)["reconstructable"] is (severity != "error")
 
 
-def test_a_scan_without_flags_has_no_finding(tmp_path: Path) -> None:
-    path = write_flagged(tmp_path / "s.h5", FRAMES, {})
-    assert [finding for finding in validate(path) if finding.rule == "flags"] == []
-    assert (describe(path)["flagged_frames"], describe(path)["flags"]) == (None, None)  # nor a plan: no monitor looked
-
-
 IN_A_PART = "Of 18 views 4 are flagged in a part, where rays weigh half, with an alarm nothing (bands 4 alarm)."
 
 

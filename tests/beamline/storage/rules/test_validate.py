@@ -25,8 +25,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.closable import Closable
 from tests.beamline.scans import seal
-from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, append
-from tests.clock import SteppedClock
+from tests.beamline.storage.conftest import EPOCH, SHAPE, append
 
 Write = Callable[[list[Frame]], Path]
 DETECTOR = "entry/instrument/detector"
@@ -138,11 +137,6 @@ def shorter(name: str, n: int) -> Spoil:
     return lambda file: swap(file, name, file[name][:-n])
 
 
-def copied_link(file: h5py.File) -> None:
-    del file["entry/data/data"]
-    file["entry/data/data"] = file[FRAMES][()]
-
-
 def repainted(rows: Iterable[int], pixels: Callable[[h5py.Dataset, int], np.ndarray]) -> Spoil:
     """A file with other pixels in these rows, as if they had been written."""
 
@@ -211,14 +205,6 @@ def test_a_frame_that_the_camera_counted_is_missed_unless_it_was_taken_again(wri
     assert validate(write([*lost, again], "again.h5")) == []  # type: ignore[call-arg]
 
 
-def test_missing_references(write: Write, frames: list[Frame]) -> None:
-    projections = [replace(frame, index=i) for i, frame in enumerate(frames[5:])]
-    hits = [finding for finding in validate(write(projections)) if finding.rule == "references"]
-    assert [finding.severity for finding in hits] == ["error", "error"]
-    assert "without flats" in hits[0].message
-    assert "without darks" in hits[1].message
-
-
 def test_one_view_is_no_scan(write: Write, frames: list[Frame]) -> None:
     assert ("error", "views") in found(write(frames[:6]))
 
@@ -232,16 +218,6 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
     assert validate(write(lost, "lost.h5")) == []  # type: ignore[call-arg]
     back = [replace(frame, trigger=0, framestamp=0) if frame.index == 12 else frame for frame in frames]
     assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
-
-
-def test_degrees_that_are_radians(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
-    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        append(writer, *frames[:5])
-        for i in range(40):
-            angle = np.radians(i * np.pi / 39)
-            frame = replace(frames[5], index=5 + i, framestamp=i, angle=angle, counts=frames[5].counts + np.uint16(i))
-            append(writer, frame)
-    assert "radians" in angles_told(SourceOptions(tmp_path / "s.h5"))[0].message
 
 
 @pytest.mark.parametrize(
@@ -326,30 +302,10 @@ def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:
     assert ("error", "quantity") in found(tmp_path / "s.h5")
 
 
-def test_what_cannot_be_opened_is_a_finding(tmp_path: Path) -> None:
-    (tmp_path / "s.h5").write_bytes(b"no HDF5")
-    assert found(tmp_path / "s.h5") == {("error", "readable")}
-    assert found(tmp_path / "nowhere.h5") == {("error", "readable")}
-    with h5py.File(tmp_path / "empty.h5", "w"):
-        pass
-    assert found(tmp_path / "empty.h5") == {("error", "readable")}
-
-
 def test_a_growing_file_can_be_validated(writer: NXtomoWriter, tmp_path: Path, frames: list[Frame]) -> None:
     append(writer, *frames)
     assert found(tmp_path / "s.h5") == {("warning", "unfinished")}
     writer.close()
-
-
-def test_describe(path: Path) -> None:
-    said = describe(path)
-    assert said["format"] == "nxtomo"
-    assert said["kinds"] == {"projection": 9, "flat": 3, "dark": 2}
-    assert (said["first_angle_deg"], said["last_angle_deg"]) == (0, pytest.approx(180))
-    assert said["step_deg"] == pytest.approx(22.5)
-    assert (said["quantity"], said["exposure_s"], said["missing_triggers"]) == ("counts", 0.05, 0)
-    assert said["findings"] == []
-    assert said["reconstructable"] is True
 
 
 def test_the_beamless_scan_is_refused(shared_data: Path) -> None:
@@ -392,13 +348,6 @@ def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None
         for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
             step = (180 - lost) / (views - 1)
             assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
-
-
-def test_angles_at_random_are_rarely_a_limited_angle() -> None:
-    rng = np.random.default_rng(5)
-    for views in (30, 60, 200):
-        alarms = sum(half_turn_unseen(rng.uniform(0, np.pi, views)) > 0 for _ in range(400))
-        assert alarms <= 4  # a thousandth is asked: more than 4 of 400 have a chance of 1 in 16 000
 
 
 def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:

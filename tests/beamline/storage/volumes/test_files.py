@@ -110,12 +110,6 @@ def test_grey_values_are_the_window_to_half_a_step(tmp_path: Path, name: str, bi
     assert grey[1, 0, 0] == 0
 
 
-def test_grey_values_have_no_place_in_nxtomoproc(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="and window out"):
-        write_volume(tmp_path / "v.h5", RECORD, Pixels(8, (0.0, 1.0)))
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The disk is full at the second slice."""
@@ -216,11 +210,3 @@ def test_a_scan_is_no_volume(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("scan.tif", "angles.npy", "text.nrrd", "empty", "missing.h5"):
         assert volume_format(tmp_path / name) is None
-
-
-@pytest.mark.parametrize("shape", [(1, 4, 5), (3, 5, 1), (1, 1, 1)])
-def test_a_tiff_of_a_slice_or_a_column_comes_back(tmp_path: Path, shape: tuple[int, int, int]) -> None:
-    values = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
-    write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values, Grid(shape, 0.25))))
-    with opened_volume(tmp_path / "v.tif") as read:
-        np.testing.assert_array_equal(read.volume.data[:], values)

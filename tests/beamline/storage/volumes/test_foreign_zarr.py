@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.page.volume import CopiedSlices, ScaledSlices, TileRegion, _bytes_read, slices_of
+from beamline.page.volume import ScaledSlices, TileRegion, slices_of
 from beamline.storage.foreign_zarr import ZarrScale, open_zarr
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume
@@ -99,27 +99,6 @@ def test_shards_and_an_array_by_its_name_are_read(tmp_path: Path) -> None:
     with opened_volume(path / "s0") as record:
         np.testing.assert_array_equal(record.volume.data[:], VALUES)
         assert record.length_unit == "px"
-
-
-def test_a_length_without_a_unit_is_not_guessed(tmp_path: Path) -> None:
-    _write(path := tmp_path / "v.zarr", 3, "zstd", unit="")
-    assert open_zarr(path)[1] is None
-
-
-def test_large_chunks_are_counted_as_a_whole(tmp_path: Path) -> None:
-    """A plane across z of compressed chunks costs all of them; the viewer then takes a coarser scale."""
-    _write(path := tmp_path / "v.zarr", 3, "zstd")
-    scale, _ = open_zarr(path)
-    whole = math.prod(CHUNK) * 2 * 3 * 3
-    assert _bytes_read(scale, [5, 0, 0], [6, 130, 151]) == whole
-
-
-def test_one_with_a_large_coarsest_scale_is_copied_as_other_files_are(tmp_path: Path) -> None:
-    _write(path := tmp_path / "v.zarr", 2, "zstd")
-    values, _ = open_zarr(path, "s0")
-    shown = slices_of(path, values, 2**18)
-    assert isinstance(shown, CopiedSlices) and shown.bin == 2
-    np.testing.assert_array_equal(shown.part(0, 7, TileRegion(0, 130, 0, 151))[0], VALUES[7])
 
 
 def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import h5py
@@ -19,9 +18,8 @@ from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, append
+from tests.beamline.storage.conftest import INFO, SHAPE, append
 from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
@@ -67,13 +65,6 @@ def test_nxdata_holds_hard_links_that_name_their_target(path: Path) -> None:
             assert file[nxdata[name].attrs["target"]] == nxdata[name]
         np.testing.assert_allclose(nxdata["x"][()], np.arange(SHAPE[1]) * 0.0046)
         assert nxdata["y"].shape == (SHAPE[0],)
-
-
-def test_times_are_iso_8601(path: Path) -> None:
-    with h5py.File(path) as file:
-        for name in ("start_time", "end_time"):
-            said = datetime.fromisoformat(file["entry"][name][()].decode())
-            assert said == datetime.fromtimestamp(EPOCH, UTC)
 
 
 def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: SteppedClock) -> None:
@@ -260,15 +251,3 @@ def test_wrong_frames_are_refused_and_nothing_is_written(
     with h5py.File(tmp_path / "s.h5") as file:
         assert {file[path].shape[0] for path in layout.COLUMNS} == {1}
         assert file["entry/instrument/detector/data"].shape[0] == 1
-
-
-def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
-    """Writing an earlier row again keeps those after it."""
-    with h5py.File(tmp_path / "s.h5", "x") as file:
-        layout.create(file, INFO, SHAPE, np.dtype("<u2"), quantity="counts", preview_bin=4, start=None)
-        rows = Rows(file)
-        for row in (0, 1, 2, 0):
-            counts = frames[row].counts
-            rows.write(row, counts, digest(counts), Record(frames[row].kind, 0.0))
-        rows.flush()
-        assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}

@@ -201,11 +201,6 @@ def test_a_disk_that_hangs_does_not_hold_the_writer(
     assert len(calls) > 2
 
 
-def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EINVAL, "Invalid argument")))
-    disk_file.to_disk(0)
-
-
 def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
     tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,13 +66,6 @@ def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
     assert found.held_out is not None and found.held_out[1].shifts.any()
 
 
-def test_rows_around_a_region_are_placed_as_the_whole_scan_is(scan: Path) -> None:
-    whole = prepared(scan, LEARN)
-    near = prepared(scan, LEARN, rows=(2, 10), axis_rows=(0, 24))
-    np.testing.assert_array_equal(near.geometry.shifts, whole.geometry.shifts)
-    assert near.geometry.axis_col == whole.geometry.axis_col
-
-
 @pytest.mark.parametrize(("off", "given", "told"), [(0.0, None, False), (2.0, None, True), (2.0, AXIS, False)])
 def test_poses_of_a_volume_with_another_axis_are_told(
     scan: Path, tmp_path: Path, off: float, given: float | None, told: bool

@@ -121,11 +121,6 @@ def test_without_fringes_views_are_those_of_none_to_the_bit() -> None:
     }
 
 
-def test_views_of_counted_photons_are_left_alone() -> None:
-    found = _prepared(_rimmed(0.8), Preparation(noise="counts", gain=1.0))
-    assert found.projections.weights is not None and found.done["phase"].sentence == ""
-
-
 def test_an_overshoot_that_no_filter_explains_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recon.features.phase.length_by_held_out_views", lambda *_: None)
     found = _prepared(_rimmed(0.8))
@@ -151,14 +146,6 @@ def test_the_search_takes_no_more_memory_than_it_states() -> None:
     given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
     taken = peak(lambda: Phase().estimated(source, Selection(), given, geometry))  # type: ignore[arg-type]
     assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
-
-
-def test_a_length_by_the_views_of_a_cone_without_a_distance_has_no_ratio() -> None:
-    """Source to axis and source to detector are alike in scans whose pixels are given at the sample."""
-    source = _source()
-    source.cone, source.energy_kev = (40.0, 40.0), 25.0
-    paganin, sentence = replace(Phase(), length=2.0).filter_of(source, replace(SELECTION, steps=()))  # type: ignore[arg-type]
-    assert paganin.length == 2.0 and "by views held out" in sentence
 
 
 def test_an_unsharp_mask_that_no_filter_precedes_is_not_dropped_without_a_word() -> None:

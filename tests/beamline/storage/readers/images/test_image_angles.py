@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_angles import angles_in
 from beamline.storage.readers.images.image_names import in_order
-from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.angles import angles_known
 
 UP, BOTH, FINE = np.arange(0, 180, 2.0), np.arange(-90, 90, 2.0), np.arange(0, 180, 1.25)
 GOLDEN = np.round((np.arange(90) * 111.246) % 180, 3)
@@ -81,23 +75,3 @@ def test_what_may_be_read_in_two_ways_is_asked_for(kind: str) -> None:
     assert np.isnan(images.angles).all()
     assert "angles in names such as" in images.doubt
     assert why in images.doubt
-
-
-def test_the_sentence_asks_for_angles_and_those_given_are_taken(tmp_path: Path) -> None:
-    for i, name in enumerate(_named(UP, lambda a, i: f"bone-{a:.1f}deg-{i}")):
-        tifffile.imwrite(tmp_path / name, np.full((4, 6), i, np.uint16))
-    with open_scan(tmp_path) as source:
-        (finding,) = angles_known(source)
-        assert (
-            "the hyphen before the number may be a minus sign, or separate. Give them with --angles" in finding.message
-        )
-    with open_scan(SourceOptions(tmp_path, angles=np.radians(UP))) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), UP)
-        np.testing.assert_array_equal(source.read([1, 10])[:, 0, 0], [1, 10])
-
-
-@pytest.mark.parametrize("names", [["a.tif", "a1.tif", "1a.tif"], ["deg.tif", "1deg.tif"]])
-def test_names_with_numbers_here_and_there_are_several_series(names: list[str]) -> None:
-    assert angles_in(names).radians is None
-    with pytest.raises(DataError, match="several series"):
-        in_order("scan", names)

@@ -116,14 +116,6 @@ def test_two_numbers_that_do_not_go_along_are_several_series(tmp_path: Path, pat
         open_scan(tmp_path)
 
 
-@pytest.mark.parametrize("pattern", ["a_{i:04d}_{along:04d}.tif", "a_{i:04d}_{away}.tif", "a_{i:04d}_{other}.tif"])
-def test_a_second_number_that_goes_along_or_counts_nothing_is_not_told(tmp_path: Path, pattern: str) -> None:
-    other = np.random.default_rng(2).permutation(1000)
-    _written(tmp_path, [pattern.format(i=i, along=5 * i, away=i**3, other=other[i]) for i in range(VIEWS)])
-    with open_scan(tmp_path) as source:
-        assert source.not_used == ()
-
-
 def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
     names = [f"a_{i}.tif" for i in range(3)] + [f"dark_{i}.tif" for i in range(2)]
     _written(tmp_path, names)
@@ -135,17 +127,3 @@ def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
         assert source.image_key.tolist() == [2, 2, 0, 0, 0]
         np.testing.assert_allclose(np.degrees(source.angles[2:]), [0, 1, 2])
     assert len(load_images(tmp_path, DARK)) == 5
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le-bom"])
-def test_a_byte_order_mark_is_no_part_of_angles(tmp_path: Path, encoding: str) -> None:
-    _written(tmp_path / "s", [f"a_{i}.tif" for i in range(3)])
-    text = "# view\r\n0.5\r\n1,\r\n".replace("1,", "1.5") + "2.5"
-    content = b"\xff\xfe" + text.encode("utf-16-le") if encoding.endswith("bom") else text.encode(encoding)
-    for place, options in (
-        (tmp_path / "angles.txt", SourceOptions(tmp_path / "s", angles=tmp_path / "angles.txt")),
-        (tmp_path / "s/angles.txt", SourceOptions(tmp_path / "s")),
-    ):
-        place.write_bytes(content)
-        with open_scan(options) as source:
-            np.testing.assert_allclose(np.degrees(source.angles), [0.5, 1.5, 2.5])

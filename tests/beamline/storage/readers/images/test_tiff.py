@@ -112,19 +112,6 @@ def test_a_frame_of_a_larger_type_is_refused_not_wrapped(series: tuple[Path, np.
         source.read(np.arange(3, 15))
 
 
-def test_an_encrypted_archive_is_refused(series: tuple[Path, np.ndarray]) -> None:
-    path = zipped(series[0])
-    content = bytearray(path.read_bytes())
-    for signature, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):  # bit 0 of the general purpose flags: encrypted
-        place = content.find(signature)
-        while place >= 0:
-            content[place + at] |= 1
-            place = content.find(signature, place + 1)
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=r"cannot be read .*encrypted"):
-        open_scan(path)
-
-
 def test_a_gap_in_the_numbers_is_told_and_moves_no_angle(series: tuple[Path, np.ndarray]) -> None:
     folder, images = series
     (folder / "tiffs" / "raw_5.tiff").unlink()
@@ -135,18 +122,6 @@ def test_a_gap_in_the_numbers_is_told_and_moves_no_angle(series: tuple[Path, np.
             np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12))[there])
             np.testing.assert_array_equal(source.read(np.arange(3, 14)), images[there])
     assert any("leaves out the numbers 5" in finding.message for finding in validate(folder))
-
-
-@pytest.mark.parametrize("log", ["before", "around", "after"])
-def test_an_angle_log_of_darks_and_flats_too_is_refused(series: tuple[Path, np.ndarray], log: str) -> None:
-    folder, _ = series
-    scan = list(np.linspace(0, 165, 12))
-    table = {"before": [0.0] * 3 + scan, "around": [0.0, *scan, 165.0, 165.0], "after": scan + [0.0] * 3}[log]
-    np.savetxt(folder / "angles.txt", table)
-    first = {"before": 3, "around": 1, "after": 0}[log]
-    said = rf"15 angles, one for each frame, and .* does not say when .*--angle-rows {first}:{first + 12} "
-    with pytest.raises(DataError, match=said):
-        open_scan(folder)
 
 
 def test_an_image_of_another_shape_or_a_broken_one_is_named(series: tuple[Path, np.ndarray]) -> None:
@@ -242,19 +217,6 @@ def test_the_real_series_is_the_real_hdf5_scan(shared_data: Path) -> None:
         np.testing.assert_allclose(tiffs.angles, exchange.angles, atol=1e-9)
         np.testing.assert_array_equal(tiffs.image_key, exchange.image_key)
         np.testing.assert_array_equal(tiffs.read(slice(None)), exchange.read(slice(None)))
-
-
-def test_complex_pixels_are_refused(tmp_path: Path, series: tuple[Path, np.ndarray]) -> None:
-    waves = np.ones((4, *SHAPE), np.complex64)
-    tifffile.imwrite(tmp_path / "waves.tif", waves, photometric="minisblack")
-    with pytest.raises(DataError, match=r"waves\.tif"):
-        open_scan(tmp_path / "waves.tif")
-    for flats in (tmp_path / "waves.tif", waves):
-        with pytest.raises(DataError, match="holds complex numbers"):
-            open_scan(SourceOptions(series[0], flats=flats))
-    tifffile.imwrite(series[0] / "dark_0.tif", waves[0], photometric="minisblack")
-    with pytest.raises(DataError, match=r"dark_0\.tif in .* holds complex numbers"):
-        open_scan(series[0])
 
 
 def _packed(path: Path) -> None:

@@ -11,7 +11,6 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
-from beamline.storage.volumes.base import Pixels
 from beamline.storage.volumes.files import opened_volume, write_volume
 from recon.base.volume import Grid, Volume
 from tests.beamline.storage.volumes.test_files import RECORD
@@ -55,14 +54,6 @@ def test_scales_are_means_in_their_places(tmp_path: Path) -> None:
     with opened_volume(tmp_path / "v.ome.zarr") as read:
         np.testing.assert_array_equal(read.volume.data[14:18], VALUES[14:18])  # of two rows of chunks
         np.testing.assert_array_equal(read.volume.data[::7], VALUES[::7])
-
-
-def test_grey_values_and_thin_volumes_have_scales(tmp_path: Path) -> None:
-    thin = Volume(np.abs(VALUES[:1, :3]), Grid((1, 3, 530), 0.25))
-    write_volume(tmp_path / "v.zarr", replace(LARGE, volume=thin), Pixels(8, (0.0, 4.0)))
-    first, second = _array(tmp_path / "v.zarr/0"), _array(tmp_path / "v.zarr/1")
-    assert second.shape == (1, 1, 265)
-    np.testing.assert_allclose(second[0, 0], first[0, :2].reshape(2, 265, 2).mean(axis=(0, 2)), atol=0.5 + 1e-6)
 
 
 def test_a_folder_that_lost_chunks_is_refused(tmp_path: Path) -> None:
