@@ -160,20 +160,6 @@ def test_one_that_is_moved_each_time_is_missing_and_named(stage: str, disturb: D
     assert angles == pytest.approx(np.delete(np.arange(VIEWS) * 20.0, MOVED), abs=0.011)
 
 
-def test_views_on_the_way_back_are_looked_at_too(tmp_path: Path) -> None:
-    """The frames after the views are those on the way back: the second is moved."""
-    settings = small(f"scan.angles={{scheme: fixed, views: {VIEWS}}}", *WORDS, "scan.return_views=3")
-    with devices.connect(settings) as instrument:
-        used = nudged(instrument, touched, FIRST + VIEWS + 1, 1)
-        result = run_scan(settings, tmp_path, instrument=used)
-    with h5py.File(result.path) as file:
-        control = file["entry/instrument/detector/image_key_control"][()]
-        angles = file["entry/sample/rotation_angle"][()]
-    back = angles[control == FrameKind.ALIGNMENT]
-    assert back.size == 3 and np.abs(back / 20 - np.rint(back / 20)).max() < 1e-3
-    assert (control == FrameKind.INVALID).sum() == 1
-
-
 @pytest.mark.parametrize("times", [1, 3])
 def test_the_pairs_of_align_are_looked_at_too(times: int) -> None:
     settings = small(*WORDS)

@@ -15,8 +15,8 @@ import pytest
 
 from beamline.core.process import ProcessEnd
 from beamline.core.text import csv_text, safe_name
-from beamline.features.batch import batch, command
-from beamline.features.batch.batch import COMMAND, BatchOptions, BatchRow, names_of, run_batch
+from beamline.features.batch import command as batch
+from beamline.features.batch.command import COMMAND, BatchOptions, BatchRow, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -204,7 +204,7 @@ def test_rows_of_an_earlier_call_keep_their_names() -> None:
     known = [BatchRow("scan", "/x/run1/scan.h5", "done")]
     rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
     assert [row.name for row in rows] == ["scan", "run2_scan"]
-    assert command.batch.name == "batch"
+    assert batch.batch.name == "batch"
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -11,8 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_angles import angles_in
-from beamline.storage.readers.images.image_names import in_order
+from beamline.storage.readers.images.image_names import angles_in, in_order
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.angles import angles_known
 
