@@ -78,7 +78,7 @@ def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Fore
     Raises:
         ValueError: the method does not take the views.
     """
-    return None if method.traits.several else Timing(geometry, grid, now).of(method)
+    return None if method.traits.in_time else Timing(geometry, grid, now).of(method)
 
 
 class Timing:

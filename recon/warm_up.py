@@ -56,7 +56,7 @@ def warm_up(
     method = method or by_name(DEFAULT)()
     if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
         cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry, _SEVERAL if method.traits.several else 1)
+    data, views = toy_of(geometry, _SEVERAL if method.traits.in_time else 1)
     where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.

@@ -314,7 +314,7 @@ from beamline.core.errors import ConfigError
 from beamline.instrument.connect import connect
 from beamline.scan.preflight import dry_run
 from drivers.base.clock import SystemClock
-from simulators.wires.registry import WIRES
+from beamline.instrument.simulated import WIRES
 
 turn = "kind: turn, port: 'sim://turn', counts_per_turn: 3600, max_speed_deg_s: 90, acceleration_deg_s2: 180"
 path = config_folder() / "simulated.yaml"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.cli.commands import CORE
+from beamline.cli.main import CORE
 from tests.features import PACKAGES, ROOT, folders, table
 
 _LOADS = """
@@ -19,7 +19,7 @@ import click
 
 from beamline.cli.main import main
 from beamline.instrument.connect import connect
-from simulators.wires.registry import WIRES
+from beamline.instrument.simulated import WIRES
 
 context = click.Context(main)
 commands = {name: main.get_command(context, name) for name in main.list_commands(context)}

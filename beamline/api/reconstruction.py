@@ -36,7 +36,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
 from recon.auto import Auto
 from recon.base.choices import AUTO
-from recon.base.method import Method, volume_names_of
+from recon.base.method import Method
 from recon.base.volume import Volume
 from recon.methods import by_name
 
@@ -84,14 +84,13 @@ def reconstruct(
 
     stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
     wanted = replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
-    with target_of(output) as given:
-        target = replace(given, names=volume_names_of(chosen))
+    with target_of(output) as target:
         command = (
             f"beamline.api.reconstruct({str(source.path)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         )
         options = ReconOptions(source, target, wanted, chosen, command=command)
         record = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
-    return record if output is not None else replace(record, output=None, outputs={})
+    return record if output is not None else replace(record, output=None)
 
 
 def _method(method: str | Method) -> Method:

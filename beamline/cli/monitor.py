@@ -23,7 +23,6 @@ from drivers.base.clock import Clock, SystemClock
 if TYPE_CHECKING:
     from beamline.monitor.check import Check, Level
     from beamline.monitor.references import ReferenceLimits
-    from beamline.projections.flagged_frames import ReturnedView
     from beamline.projections.replay import FrameVerdict, Kind, ScanVerdict
 
 
@@ -77,11 +76,11 @@ def monitor(request: MonitorRequest) -> None:
             read = load(request.config, request.overrides)
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
         watched = _watched(request, checks, limits, sink, clock)
-        summed, returned = watched.verdict, watched.returned
+        summed = watched.verdict
         altered = [summed.altered] if summed.altered else []
         for fault in [*summed.references, *altered, *watched.ended]:
             sink(Warned(fault, time=clock.now()))
-        sink(Done(_facts(request.file, summed, returned), time=clock.now()))
+        sink(Done(_facts(request.file, summed), time=clock.now()))
     n, alarmed, references = summed.n_frames, summed.alarmed, summed.references
     if not request.as_json:
         click.echo("\n".join(_in_lines(request.file, watched)))
@@ -94,10 +93,9 @@ def monitor(request: MonitorRequest) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Watched:
-    """A scan that the checks have looked at: the verdict, its views on the way back, how it ended, and a stop."""
+    """A scan that the checks have looked at: the verdict, how it ended, and a stop."""
 
     verdict: ScanVerdict
-    returned: Sequence[ReturnedView]
     ended: Sequence[str]
     stopped: bool
 
@@ -112,15 +110,14 @@ def _in_lines(file: Path, watched: _Watched) -> list[str]:
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
     altered = [summed.altered] if summed.altered else []
     left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
-    back = [f"On the way back: {view.in_words()}." for view in watched.returned]
-    return [*table(summed.kinds), *summed.references, *altered, *left_out, *back, *watched.ended, end]
+    return [*table(summed.kinds), *summed.references, *altered, *left_out, *watched.ended, end]
 
 
 def _watched(
     request: MonitorRequest, checks: Sequence[Check], limits: ReferenceLimits | None, sink: Sink, clock: Clock
 ) -> _Watched:
     """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
-    from beamline.projections.flagged_frames import returned_views, worst_frames
+    from beamline.projections.flagged_frames import worst_frames
     from beamline.projections.replay import replay, verdict
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
@@ -141,7 +138,6 @@ def _watched(
                     sink(FrameFlagged(flag, time=clock.now()))
             active = now
         summed = verdict(source, frames, limits)
-        returned = [] if stopped() else returned_views(source)
         ended = [finding.message for finding in scan_ended(source)]
         if request.sheet is not None:
             worst = worst_frames(source, FrameFlags.of_flags([judged.flags for judged in frames]))
@@ -149,15 +145,15 @@ def _watched(
                 from beamline.report.sheets import contact_sheet
 
                 write_whole(request.sheet, contact_sheet(worst))
-        return _Watched(summed, returned, ended, stopped())
+        return _Watched(summed, ended, stopped())
 
 
-def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) -> dict[str, Any]:
+def _facts(file: Path, summed: ScanVerdict) -> dict[str, Any]:
     """What the event `done` says of a scan."""
     return {
         "file": file, "n_frames": summed.n_frames, "alarmed_frames": len(summed.alarmed),
         "retaken": len(summed.retaken), "flags": summed.flags, "references": summed.references,
-        "aside": summed.aside, "returned": [vars(view) for view in returned],
+        "aside": summed.aside,
         "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
     }  # fmt: skip
 

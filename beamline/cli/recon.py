@@ -177,13 +177,13 @@ def run_reconstruction(
         Of several volumes there are some from the first trial on.
         """
         of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
-        if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.several)):
+        if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.in_time)):
             stop.ready = True
 
     with events_shown(values["as_json"]) as shown:
         scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
         record = reconstruct_file(options, fan_out(made, shown), SystemClock(), stop_scope=scope)
-    output = " and ".join(map(str, options.target.outputs))
+    output = str(options.target.output)
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
     if lost := record.ending.lost_checkpoint:

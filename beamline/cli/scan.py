@@ -353,7 +353,6 @@ def _results(result: RunResult) -> str:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
     if result.retaken:
         lines.append(f"{'retaken':<10}{result.retaken} flagged views; `beamline recon` uses the new ones")
-    lines += [f"{'returned':<10}{view.in_words()}" for view in result.returned]
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
         if report := result.recon.get("report"):

@@ -254,7 +254,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 
 def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
-    lines = [f"{name:<20}{path}" for name, path in record.outputs.items()] or [f"{'output':<10}{record.output}"]
+    lines = [f"{'output':<10}{record.output}"]
     if record.report:
         drawn = record.times.get("report")
         lines.append(f"{'report':<10}{record.report}" + (f" ({drawn:.1f} s)" if drawn else ""))

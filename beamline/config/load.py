@@ -178,7 +178,6 @@ def plan_of(config: Config) -> ScanPlan:
         period=scan.period_s,
         settle=scan.settle_s,
         warm_up=scan.warm_up_s,
-        return_views=scan.return_views,
         wide_views=scan.wide_views,
         wide_places=wide_places(config),
         filter=scan.filter,

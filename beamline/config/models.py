@@ -139,11 +139,6 @@ class ScanSection(Section):
         description="keV of a series: a scan at each, one after the other; each begins a fraction of a step later "
         "in angle.",
     )
-    return_views: Annotated[int, Field(ge=0, le=100)] = Field(
-        default=0,
-        description="Views that are taken a second time on the way back, evenly spread: they tell whether the "
-        "sample has moved.",
-    )
     wide_views: Annotated[int, Field(ge=0, le=100)] = Field(
         default=0,
         description="Angles at which a sample wider than the field is stepped across the beam after the views, "

@@ -25,7 +25,6 @@ class RunResult:
         bytes: size of the file that was written.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
         status: `complete`, `stopped` or `failed`.
-        returned: views on the way back, with the motion of the sample (`projections.flagged_frames.ReturnedView`).
         sample: its name.
     """
 
@@ -41,7 +40,6 @@ class RunResult:
     bytes: int
     recon: Mapping[str, Any] | None
     status: str
-    returned: Sequence[Any] = ()
     sample: str = ""
 
     @property
@@ -71,8 +69,7 @@ class RunResult:
 
     def file_values(self) -> dict[str, Any]:
         """Values of the event `scan_done`, by name, when the file is closed."""
-        without = ("sample",) if self.returned else ("sample", "returned")
-        return {name: value for name, value in vars(self).items() if name not in without}
+        return {name: value for name, value in vars(self).items() if name != "sample"}
 
     def run_values(self) -> dict[str, Any]:
         """Values of the event `done`, by name, of a run that has ended successfully."""

@@ -31,7 +31,7 @@ from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
 from drivers.in_beam import ManualFilter, OutputShutter
-from recon.base.registry import in_folders
+from recon.base.registry import Registry, in_folders
 from recon.base.volume import Grid, Volume
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VIRTUAL_START, ScaledClock, VirtualClock
@@ -45,8 +45,17 @@ from simulators.effects.chain import Label
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.scene import Scene, load_scene
-from simulators.wires.registry import WIRES
-from simulators.wires.wire import Controller, register
+from simulators.wires.wire import Build, Controller, register
+
+WIRES: Registry[type[Build]] = Registry(
+    "wire",
+    {
+        kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name)
+        for kind, name in in_folders("simulators.wires", "CONTROLLERS").items()
+    },
+)
+"""Kind -> how its simulated controller is built."""
+
 
 IN_PLACE = 0.1  # deg or mm: how far a motor may be from its place while the sample is seen there
 

@@ -56,7 +56,6 @@ class ScanPlan:
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
         end_references: kinds of references that are still to be taken after the views, where all else but wide views
             is stored. None: all that are planned, before and after the views.
-        return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
         wide_views: angles, evenly spread, of one frame each with the sample at each of `wide_places`, in mm aside.
         filter: the place of the filter for all frames; None: as it stands.
         energy: keV of the monochromator for all frames; None: as it stands.
@@ -75,7 +74,6 @@ class ScanPlan:
     stored: frozenset[int] = frozenset()
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
-    return_views: int = 0
     wide_views: int = 0
     wide_places: tuple[float, ...] = ()
     filter: str | None = None
@@ -313,20 +311,6 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
         turned[passed] = np.sign(views.angles[passed][-1] - views.angles[first]) * views.speed * views.exposure / 2
         first += train.n
     return turned
-
-
-def return_triggers(views: Block, n: int) -> NDArray[np.int64]:
-    """Triggers of `n` views, evenly spread in angle, in the order in which a stage passes them on its way back."""
-    ahead = np.argsort(views.angles, kind="stable")
-    chosen = spread(ahead, n)
-    back = abs(views.angles[chosen[0]] - views.angles[-1]) > abs(views.angles[chosen[-1]] - views.angles[-1])
-    return np.asarray(chosen[::-1] if back else chosen, np.int64)
-
-
-def return_block(views: Block, n: int, *, stored: bool) -> Block:
-    """The block that repeats some views on the way back; the stage stands during each exposure."""
-    block = retake_block(views, return_triggers(views, n))
-    return replace(block, kind=FrameKind.ALIGNMENT, stored=frozenset(range(block.n)) if stored else frozenset[int]())
 
 
 def wide_block(views: Block, n: int, aside: float) -> Block:

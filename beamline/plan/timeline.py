@@ -1,6 +1,6 @@
 """Timeline: a plan computed for one stage and one camera, as values and as lines for the operator.
 
-Darks then flats come before the views; views on the way back, flats, then darks after them. A fly scan turns at step /
+Darks then flats come before the views; wide views, flats, then darks after them. A fly scan turns at step /
 period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
 to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return at
 full speed between them.
@@ -28,7 +28,6 @@ from beamline.plan.plan import (
     ScanPlan,
     Timeline,
     retake_block,
-    return_block,
     spread_retakes,
     wide_block,
 )
@@ -210,10 +209,6 @@ def _blocks(
     views = _views(plan, flight, row, scale, stage)
     yield views
     row += views.n
-    if plan.return_views:
-        back = return_block(views, plan.return_views, stored=missing is not None)
-        yield replace(back, first_trigger=row)
-        row += back.n
     for mm in plan.wide_places:
         yield replace(wide_block(views, plan.wide_views, mm), first_trigger=row)
         row += plan.wide_views

@@ -281,7 +281,7 @@ def _is_early(job: Job, result: Reconstruction) -> bool:
     """Whether a stop ended the method before its last step."""
     method = job.method
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
-    if method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0):
+    if method.traits.in_time or (isinstance(method, FitMethod) and method.finish_sweeps > 0):
         return job.stop.stopped
     return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))
 

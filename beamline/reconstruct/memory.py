@@ -183,13 +183,12 @@ def memory_of(options: ReconOptions) -> int:
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
     """Raise ConfigError for methods and options that need everything in memory."""
-    if (traits := options.method.traits).several:
+    if options.method.traits.in_time:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
-        of = "in time" if traits.in_time else "of materials"
         raise ConfigError(
-            f"{count(volumes_of(options.method), 'volume')} {of} of {Grid.matching(needs.geometry).shape} voxels "
-            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes {of} are not made in slabs: "
+            f"{count(volumes_of(options.method), 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
+            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes in time are not made in slabs: "
             f"give {rows}--bin. Nothing was written."
         )
     poses = stated_poses(source, options.selection)

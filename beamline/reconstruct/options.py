@@ -39,20 +39,12 @@ def report_beside(output: Path) -> Path:
 @dataclass(frozen=True)
 class OutputPaths:
     """Paths of the results. `report` is None if none is wanted; `replace` overwrites older results. If `written` is
-    False, the folder of `output` serves as scratch only.
-    `names`: of volumes that get a file each, OUTPUT's stem + _NAME; empty: there is one file, `output` itself."""
+    False, the folder of `output` serves as scratch only."""
 
     output: Path
     report: Path | None
     replace: bool = False
     written: bool = True
-    names: tuple[str, ...] = ()
-
-    @property
-    def outputs(self) -> tuple[Path, ...]:
-        """The files of volumes, in order."""
-        stem, suffix = self.output.stem, self.output.suffix
-        return tuple(self.output.with_name(f"{stem}_{name}{suffix}") for name in self.names) or (self.output,)
 
     @property
     def partial(self) -> Path:
@@ -75,7 +67,7 @@ class OutputPaths:
     def refuse_existing(self) -> None:
         """Raise DataError before any work if a result exists, or its folder is not writable."""
         if not self.replace:
-            for path in (*self.outputs, self.report):
+            for path in (self.output, self.report):
                 if path is not None:
                     refuse_existing(path)
         try:

@@ -97,7 +97,7 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if not options.method.traits.several and cone_of(source, options.selection) is not None:
+    if not options.method.traits.in_time and cone_of(source, options.selection) is not None:
         raise DataError(
             f"{source.path}: {options.method.name} would take {size(at_once)}, {size(allowed)} of memory may be used, "
             "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
@@ -147,7 +147,7 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
     """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
-    if options.method.traits.several:
+    if options.method.traits.in_time:
         needs = ReconMemory(options.method, geometry, 0, True)
         if needs.at_once > plan.allowed:
             refuse_whole(source, options, needs, plan.allowed)
@@ -292,7 +292,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 def _refuse_several_volumes(options: ReconOptions) -> None:
     """Raises ConfigError where options of one volume stand beside a method that makes several."""
-    if options.method.traits.several:
+    if options.method.traits.in_time:
         _require_hdf5(options.target)
         of_one = ("region", "truth", "uncertainty", "cluster", "partial")
         if wrong := [name for name in of_one if getattr(options, name)]:

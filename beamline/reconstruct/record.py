@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone, Warned
-from beamline.core.files import write_together
-from beamline.core.quantities import VoxelKind
 from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
@@ -85,7 +83,7 @@ def write_result(
     record, volumes = _record(found, prepared, context, clock.now())
     phases.enter("writing the volume")
     if target.written:
-        _write(record, target)
+        write_volume(target.output, record, replace=target.replace)
     timed: Callable[[float], None] = _nothing
     if (page := target.report) is not None:
         phases.enter("report")
@@ -139,7 +137,6 @@ def _record(
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
-        kind=VoxelKind.SHARE if made.series is not None and made.series.names else VoxelKind.ATTENUATION,
         raw_file=str(context.facts.path.resolve()),
         title=_title(made, context),
         sample=context.facts.sample or "not stated",
@@ -154,8 +151,7 @@ def _record(
         warnings=tuple(found.warnings),
         hiding=found.hiding,
         chosen=made.chosen,
-        output=target.outputs[0],
-        outputs=dict(zip(target.names, target.outputs, strict=True)) if target.names else {},
+        output=target.output,
         report=target.report,
     )
     return record, volumes
@@ -163,41 +159,19 @@ def _record(
 
 def _title(made: Reconstruction, context: ReportContext) -> str:
     if made.series is not None:
-        what = ", ".join(made.series.names) or f"{made.series.n} volumes in time"
-        return f"{what} of {context.facts.name}"
+        return f"{made.series.n} volumes in time of {context.facts.name}"
     return f"{label_of(made.method)} reconstruction of {context.facts.name}"
-
-
-def _write(record: ReconRecord, target: OutputPaths) -> None:
-    """All files, or none of them."""
-    records = zip(target.outputs, _in_files(record, target.names), strict=True)
-    write_together((path, partial(write_volume, record=each, replace=target.replace)) for path, each in records)
-
-
-def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord]:
-    """The record of each file: of one volume where each has a name."""
-    if not names or record.series is None:
-        yield record
-        return
-    for name, data in zip(names, record.series.each(), strict=True):
-        yield replace(
-            record,
-            volume=replace(record.volume, data=data[:]),
-            series=None,
-            title=f"volume fraction of {name}",
-            parameters={**record.parameters, "material": name},
-        )
 
 
 def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconRecord:
     """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:
-        at = None if target.names or series is None else 0
-        voxels: Any = VoxelsInFile(volume.grid.shape, partial(_voxels, target.outputs[0], at))
+        at = None if series is None else 0
+        voxels: Any = VoxelsInFile(volume.grid.shape, partial(_voxels, target.output, at))
         volume = replace(volume, data=voxels)
         if series is not None:
-            series = replace(series, data=VoxelsInFile(series.data.shape, partial(_some_volumes, target.outputs)))
+            series = replace(series, data=VoxelsInFile(series.data.shape, partial(_dataset, target.output)))
     else:
         volume = replace(volume, data=np.array(volume.data))  # it may lie in a temporary file
     return replace(record, volume=volume, series=series, deviation=None, model={})
@@ -207,17 +181,6 @@ def _voxels(path: Path, at: int | None, part: Any) -> NDArray[np.float32]:
     """Part [z, y, x] of the volume of a file, or of its volume number `at`."""
     with opened_volume(path, at=at) as stored:
         return np.array(stored.volume.data[part])
-
-
-def _some_volumes(paths: Sequence[Path], part: Any) -> NDArray[np.float32]:
-    """Part [volume, z, y, x] of the volumes of one file, or of a file each."""
-    if len(paths) == 1:
-        return _dataset(paths[0], part)
-    which, *within = part if isinstance(part, tuple) else (part,)
-    numbers = range(len(paths))[which]
-    if isinstance(numbers, int):
-        return _dataset(paths[numbers], tuple(within))
-    return np.stack([_dataset(paths[n], tuple(within)) for n in numbers])
 
 
 def _dataset(path: Path, part: Any) -> NDArray[np.float32]:

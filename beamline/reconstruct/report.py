@@ -80,10 +80,8 @@ def _summary(
     best = best if best in own else "seconds"  # a region by FBP is compared with nothing
     shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
     if made.series is not None:
-        seconds, names = made.series.seconds, made.series.names
-        what = f"{len(names)} materials, {', '.join(names)}, of"
-        if not names:
-            what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
+        seconds = made.series.seconds
+        what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
         f"{what} {shape} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s; "
@@ -206,21 +204,20 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
 
 def _several(series: VolumeSeries) -> Iterator[Picture]:
     """Slices of some of several volumes, side by side."""
-    of, what = (
-        ("material", "materials in one grey window: 1 where a voxel is full of it.")
-        if series.names
-        else ("time", "times in one grey window: what differs has changed or moved.")
-    )
     n, depth = series.data.shape[:2]
     some = spread(np.arange(n), _SHOWN)
-    for title, turned in ((f"Slices of each {of}", False), (f"Upright slices of each {of}", True)):
+    for title, turned in (("Slices of each time", False), ("Upright slices of each time", True)):
         if turned and depth < _UPRIGHT:
             continue
         sheet = SliceSheet("z" if turned else "y")
         for k in some:
             volume = series.data[k]
             sheet.add(series.labels[k], volume.swapaxes(0, 1) if turned else volume)
-        yield Picture(title, f"{len(some)} of {n} {what}", sheet.png(sheet.labels()))
+        yield Picture(
+            title,
+            f"{len(some)} of {n} times in one grey window: what differs has changed or moved.",
+            sheet.png(sheet.labels()),
+        )
 
 
 def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Unexplained | None) -> Iterator[Picture]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
 from beamline.core.text import spans
-from beamline.projections.flagged_frames import reasons, reference_images, returned_views, worst_frames
+from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
@@ -96,13 +96,10 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     table = _table(source, sample or "not stated", columns)
     table["flagged by the monitor"] = "no monitor looked at it" if flags is None else counted(flags.counts())
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
-    n, again, returned = int(source.image_key.size), rows_replaced(source), returned_views(source)
+    n, again = int(source.image_key.size), rows_replaced(source)
     if again.size:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
-    if returned:
-        table["views on the way back"] = "; ".join(view.in_words() for view in returned)
     remarks = [] if flags is None else reasons(flags)
-    remarks += [f"On the way back {view.in_words()} since the first view." for view in returned if view.moved]
     return ScanFacts(
         source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks,
         flagged=[] if flags is None else worst_frames(source, flags),

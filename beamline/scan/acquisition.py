@@ -136,8 +136,8 @@ class Acquisition:
                 return
             if self._stop.stopping and not self._still_needed(block):
                 continue
-            if block.kind in (FrameKind.ALIGNMENT, FrameKind.WIDE_VIEW):
-                yield from self._standing(block)
+            if block.kind is FrameKind.WIDE_VIEW:
+                yield from self._wide(block)
                 continue
             done = RecordedBlock(block, BlockTally())
             yield from self._block(done)
@@ -186,17 +186,14 @@ class Acquisition:
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 
-    def _standing(self, block: Block) -> Iterator[Frame]:
-        """Views on the way back, or wide ones, at angles of the first views. Nothing replaces anything."""
+    def _wide(self, block: Block) -> Iterator[Frame]:
+        """Wide views, at angles of the first views. Nothing replaces anything."""
         views = self._timeline.views
         beyond = float(max(middle_of_exposure(views), key=abs))  # every pass goes the same way; one pulse has none
-        done = RecordedBlock(block, BlockTally(), again=block.kind is FrameKind.ALIGNMENT)
-        first = 0 if done.again else block.first_trigger - views.first_trigger  # in files wide views are views, too
-        for frame in self._block(done):
+        first = block.first_trigger - views.first_trigger  # in files wide views are views, too
+        for frame in self._block(RecordedBlock(block, BlockTally())):
             invalid = frame.kind is FrameKind.INVALID
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
-        if done.again and done.taken.missing:
-            self._sink(Warned(f"Of {block.n} views on the way back {len(done.taken.missing)} gave no frame."))
 
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.

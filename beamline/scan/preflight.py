@@ -290,7 +290,6 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "period_s": plan.period,
         "settle_s": plan.settle,
         "warm_up_s": plan.warm_up,
-        "return_views": plan.return_views,
         **({"frames_per_view": plan.frames_per_view} if plan.frames_per_view > 1 else {}),
         **({"wide_views": plan.wide_views, "wide_places_mm": plan.wide_places} if plan.wide_places else {}),
         "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},

@@ -31,7 +31,6 @@ from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
 from beamline.plan.plan import Retake, spread_retakes
-from beamline.projections.flagged_frames import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.ledger import LedgerError
@@ -44,7 +43,6 @@ from beamline.scan.runs import record_sink
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
 from beamline.simulate import LabelLog, labels_path, write_labels
-from beamline.storage.readers.open import open_scan
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
@@ -324,7 +322,6 @@ class _Run:
             bytes=writer.path.stat().st_size,
             recon=None,
             status=status,
-            returned=self._returned(path) if closed else (),
             sample=self.config.sample.name,
         )
         self.sink(ScanDone(result))
@@ -335,20 +332,6 @@ class _Run:
         if ended.error is not None:
             raise ended.error
         return replace(result, seconds=time.monotonic() - self.began)
-
-    def _returned(self, path: Path) -> tuple[ReturnedView, ...]:
-        """Views on the way back; a warning says where the sample has moved."""
-        if not self.ready.plan.return_views:
-            return ()
-        try:
-            with open_scan(path) as source:
-                returned = tuple(returned_views(source))
-        except (DataError, OSError, ValueError) as error:  # the scan is stored, whatever this says
-            self.sink(Warned(f"Views on the way back could not be compared: {error}"))
-            return ()
-        if moved := [view.in_words() for view in returned if view.moved]:
-            self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let the sample settle, fix it, or scan faster."))
-        return returned
 
     def _acquire(
         self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None

@@ -16,7 +16,6 @@ from recon.base.method import Ending
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Value = str | int | float | bool | NDArray[Any]
-_MOVE = ("x", "y", "z", "turn", "image", "magnification")  # of a sample between two scans
 _ENDS = {"ended_early": "early", "resumed_from": "resumed_from", "checkpoint_lost": "lost_checkpoint"}
 """Parameters that tell how it ended, and fields of `Ending`."""
 
@@ -79,7 +78,6 @@ class ReconRecord:
         hiding: the warning of what the volume may hide; empty without.
         chosen: how `auto`, a budget or a preset came to its settings; empty where they were given.
         output, report: files of the volume and of its report; None: not written.
-        outputs: the file of each of several materials, by name; empty of others.
         elapsed, times: s in all, and of each phase.
     """
 
@@ -101,7 +99,6 @@ class ReconRecord:
     hiding: str = ""
     chosen: str = ""
     output: Path | None = None
-    outputs: Mapping[str, Path] = field(default_factory=dict)
     report: Path | None = None
     elapsed: float = math.nan
     times: Mapping[str, float] = field(default_factory=dict)
@@ -144,12 +141,6 @@ class ReconRecord:
         return () if self.series is None else tuple(self.series.seconds.tolist())
 
     @property
-    def displacements(self) -> list[dict[str, float]]:
-        """Displacement of the sample in each of several scans, with the fields of `recon.voxels.displacement`."""
-        rows: Any = self.parameters.get("displacements", ())
-        return [dict(zip(_MOVE, map(float, row), strict=True)) for row in rows]
-
-    @property
     def figures(self) -> Mapping[str, float]:
         """Figures of merit; the name of `metrics` in scripts."""
         return self.metrics
@@ -175,8 +166,6 @@ class ReconRecord:
     def event_values(self) -> dict[str, Any]:
         """Values of the event `done`, by name, in the order of its line."""
         others = {
-            "outputs": self.outputs or None,
-            "displacements": self.displacements or None,
             "times_s": self.seconds_of_volumes or None,
             "hiding": self.hiding or None,
             "chosen": self.chosen or None,

@@ -270,8 +270,8 @@ class Traits:
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
-        in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
-            `volume_names` if they are of materials; `Reconstruction.series` has all.
+        in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, which all
+            views determine together; `Reconstruction.series` has all.
         least_views: of each of several volumes.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
@@ -291,11 +291,6 @@ class Traits:
     own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None
-
-    @property
-    def several(self) -> bool:
-        """Whether the method makes several volumes, which all views determine together."""
-        return self.in_time
 
 
 @runtime_checkable
@@ -350,12 +345,7 @@ def for_part(method: M, share: float, of_time: float) -> M:
 
 def volumes_of(method: Any) -> int:
     """Number of volumes that a method makes."""
-    return int(method.volumes) if method.traits.several else 1
-
-
-def volume_names_of(method: Any) -> tuple[str, ...]:
-    """Names of the materials whose volumes a method makes; empty for other methods."""
-    return tuple(method.volume_names) if method.traits.several else ()
+    return int(method.volumes) if method.traits.in_time else 1
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:

@@ -238,30 +238,28 @@ class Volume:
 
 @dataclass(frozen=True, eq=False)
 class VolumeSeries:
-    """Volumes that all views determine together: of a sample that changes, or of each of its materials.
+    """Volumes that all views determine together: of a sample that changes.
 
     Attributes:
-        seconds: float64 [volume], from the first view on; empty where they are of materials.
+        seconds: float64 [volume], from the first view on.
         data: float32 [volume, z, y, x], or a dataset of a file.
         residual: what they leave of the views, each view with the mixture that it shows, over the views (root mean
             squares); NaN as read from a file, whose metrics have it.
-        names: of the materials; empty where they are of times.
     """
 
     seconds: NDArray[np.float64]
     data: Any
     residual: float = math.nan
-    names: tuple[str, ...] = ()
 
     @property
     def n(self) -> int:
         """Number of volumes."""
-        return len(self.names) or len(self.seconds)
+        return len(self.seconds)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A short name of each volume: its material or its time."""
-        return self.names or tuple(f"{at:.4g} s" for at in self.seconds)
+        """A short name of each volume: its time."""
+        return tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
         """The volumes one by one; each reads its voxels only when it is sliced along z."""

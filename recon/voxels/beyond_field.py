@@ -83,7 +83,7 @@ def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunCont
 
 def knows_outside(traits: Traits) -> bool:
     """Whether a method explains views by a box that holds all of the sample."""
-    return not (traits.direct or traits.several)
+    return not (traits.direct or traits.in_time)
 
 
 def sample_radius(

@@ -26,7 +26,7 @@ from drivers.orca_quest import SENSOR_SHAPE
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
 from simulators.frame.mapping import Positive, build, located, named
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.composed import build_sample
 from simulators.samples.sample import Sample
 

@@ -27,7 +27,7 @@ from recon.base.jit import njit
 from recon.base.volume import Grid
 from simulators.effects.scattering.phase_fringes import PhaseFringes
 from simulators.frame.shot import Detector
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.composed import build_sample
 from tests.simulators import shots
 

@@ -26,7 +26,7 @@ from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.builders.battery import battery
+from simulators.samples.composed import battery
 from simulators.samples.voxels.voxels import Voxels
 
 F32 = NDArray[np.float32]

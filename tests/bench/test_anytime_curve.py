@@ -30,7 +30,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.builders.battery import battery
+from simulators.samples.composed import battery
 from tests.clock import SteppedClock
 
 F32 = NDArray[np.float32]

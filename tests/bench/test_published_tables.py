@@ -33,7 +33,7 @@ from recon.base.method import DataUse, RunControl
 from recon.features.published.r2_published import R2Published, published_fit
 from recon.methods import with_settings
 from recon.warm_up import warm_up
-from splatline_neural.train import FieldMethod
+from splatline_neural.methods import FieldMethod
 from tests.bench.quality_cases import F32, Case, cone, diamond, seen_by_simulator, walnut_halved
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(0)]

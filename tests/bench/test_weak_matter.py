@@ -21,7 +21,7 @@ from beamline.storage.readers.open import open_scan
 from recon.assess import metrics
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.builders.battery import Battery, labels_of
+from simulators.samples.composed import Battery, labels_of
 
 pytestmark = pytest.mark.bench
 CAP, AIR, RADIUS = slice(27, 37), slice(4, 19), 40  # slices of the cap, slices above it; voxels about the middle

@@ -17,7 +17,7 @@ from simulators.frame.shot import Detector
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Polyhedron, Solid
-from simulators.samples.builders.battery import battery
+from simulators.samples.composed import battery
 from tests.simulators.bodies import SOLIDS, volume
 
 ANGLES = st.floats(-7.0, 7.0)

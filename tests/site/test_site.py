@@ -108,7 +108,7 @@ with warnings.catch_warnings(record=True) as told:
     text = suffixes_text()
     from beamline.projections.registry import all_steps
     steps = [step.name for step in all_steps()]
-    from simulators.wires.registry import WIRES
+    from beamline.instrument.simulated import WIRES
     wires = list(WIRES)  # plug-ins are looked up when a registry is first asked
 
 left_out = {str(one.message).split(" was left out")[0] for one in told if "left out" in str(one.message)}
@@ -118,7 +118,7 @@ assert left_out == {f"The {kind} 'wrong' {package} (math:pi)" for kind in kinds}
     f"The correction 'air' {package} (site_of_an_instrument.corrections:Lift)",
     f"The effect 'gone' {package} (no_such_module:Gone)",
     f"The method 'fbp' {package} (site_of_an_instrument.methods:Mean)",
-    f"The volume format 'taken' {package} (beamline.storage.volumes.single_files:Npy)",
+    f"The volume format 'taken' {package} (beamline.storage.volumes.files:Npy)",
 }, left_out
 
 grid = recon.Grid((2, 8, 8), 1.0)
@@ -197,7 +197,7 @@ def test_one_of_each_kind_is_found_by_its_entry_point_and_what_does_not_fit_is_n
             ("splatline.method", "fbp = site_of_an_instrument.methods:Mean"),
             ("splatline.correction", "air = site_of_an_instrument.corrections:Lift"),
             ("splatline.effect", "gone = no_such_module:Gone"),
-            ("splatline.volume_format", "taken = beamline.storage.volumes.single_files:Npy"),
+            ("splatline.volume_format", "taken = beamline.storage.volumes.files:Npy"),
         ],
     )
     path = os.pathsep.join([str(tmp_path), str(HERE.parents[1])])

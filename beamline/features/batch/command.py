@@ -2,15 +2,263 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import click
 
 from beamline.cli.options import json_option
 from beamline.cli.terminal import answering
-from beamline.core.errors import DataError, ScanStopped
-from beamline.features.batch.batch import TABLE, BatchOptions, run_batch
+from beamline.core.durations import seconds_left
+from beamline.core.errors import DataError, QualityError, ScanStopped
+from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
+from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
+from beamline.core.process import ProcessEnd, json_object, run_to_end
+from beamline.core.text import SENTENCE, csv_text, one_line, safe_name
+from beamline.storage.writer_lock import WriterLock
+from drivers.base.clock import Clock
+
+RowState = Literal["waiting", "done", "poor", "failed"]
+
+TABLE, RECIPE = "batch.csv", "recipe.yaml"
+_WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
+COMMAND = (sys.executable, "-m", "beamline.cli.main")
+_SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
+
+
+@dataclass(frozen=True)
+class BatchRow:
+    """A scan of a batch and its result.
+
+    Attributes:
+        name: of its folder of results, inside the batch's.
+        state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
+            one; "waiting": not tried yet.
+        residual: of the volume, of views held out where there were any.
+        message: why it failed, or is poor.
+    """
+
+    name: str
+    scan: str
+    state: RowState = "waiting"
+    seconds: float | None = None
+    method: str = ""
+    residual: float | None = None
+    message: str = ""
+
+    @property
+    def has_volume(self) -> bool:
+        return self.state in ("done", "poor")
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What to reconstruct, how and where.
+
+    Attributes:
+        recipe: file with the options of `beamline recon`; None: its defaults.
+        folder: of the results, new or of an earlier call with the same recipe.
+    """
+
+    scans: Sequence[Path]
+    recipe: Path | None
+    folder: Path
+
+
+def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]:
+    """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
+
+    A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
+    is tried again by the next call. Ctrl-C ends the scan under way, which leaves nothing; the others stay.
+
+    Returns:
+        All rows of the table, also those of earlier calls.
+
+    Raises:
+        DataError: the folder is not that of a batch, or of one with another recipe; nothing was touched.
+        KeyboardInterrupt: stopped; the table has the scans that were done.
+    """
+    folder = options.folder
+    _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+    try:
+        lock = WriterLock(folder / RECIPE, exclusive=True)
+    except (BlockingIOError, PermissionError) as error:
+        raise DataError(
+            f"Another batch works in {folder}, or its {RECIPE} cannot be written to ({error.strerror}). Wait for its "
+            "end, or name another folder."
+        ) from error
+    try:
+        rows = _rows(options.scans, _read(folder))
+        _write(folder, rows)
+        start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
+        for tried, n in enumerate(waiting):
+            spent = clock.now() - start
+            eta, rate = seconds_left(tried, len(waiting), spent), 60 * tried / max(spent, 1e-9)
+            sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
+            row = rows[n] = _one(rows[n], options, sink, clock)
+            _write(folder, rows)
+            sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+            now = clock.now()
+            sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
+        return rows
+    finally:
+        lock.release()
+
+
+def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[str]:
+    """A safe name for each file: its stem, with as many of its folders as tell it from the other files and those of
+    earlier rows, and a number where their names, or the batch's own, are the same."""
+    paths = [*(Path(row.scan) for row in earlier), *scans]
+    parts = [(*path.absolute().parent.parts[1:], Path(SCAN if path.name == JOINED else path).stem) for path in paths]
+    names = [safe_name(own[-1]) for own in parts]
+    for depth in range(2, max(map(len, parts), default=0) + 1):
+        folded = [name.casefold() for name in names]
+        names = [
+            safe_name("_".join(own[-depth:])) if folded.count(name.casefold()) > 1 else name
+            for own, name in zip(parts, names, strict=True)
+        ]
+    free, used = list[str](), {TABLE, RECIPE, *(row.name.casefold() for row in earlier)}
+    for name in names[len(earlier) :]:
+        numbered = (f"{safe_name(name, 100)}_{n}" for n in itertools.count(2))
+        free.append(next(each for each in itertools.chain([name], numbered) if each.casefold() not in used))
+        used.add(free[-1].casefold())
+    return free
+
+
+def _begin(folder: Path, recipe: bytes) -> None:
+    """Make the folder, or check that it belongs to this recipe."""
+    if folder.exists():
+        _refuse_other(folder, recipe)
+        return
+    with whole_file(folder) as partial:
+        partial.mkdir()
+        (partial / RECIPE).write_bytes(recipe)
+        _write(partial, [])
+
+
+def _refuse_other(folder: Path, recipe: bytes) -> None:
+    """Raises DataError for a folder that is not that of a batch by this recipe."""
+    kept = folder / RECIPE
+    if not (folder / TABLE).is_file():
+        raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
+    if not kept.is_file() or kept.read_bytes() != recipe:
+        raise DataError(
+            f"{folder} holds results of another recipe, {kept}. Give that one as --config, or name another folder. "
+            "Nothing was touched."
+        )
+
+
+def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
+    """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
+    from beamline.storage.interrupted import whole_scan  # here: help needs none of it
+
+    rows = [row if row.has_volume else replace(row, scan=str(whole_scan(Path(row.scan)))) for row in earlier]
+    old = {row.scan for row in rows}
+    new = [path for path in dict.fromkeys(map(whole_scan, scans)) if str(path) not in old]
+    return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
+
+
+def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> BatchRow:
+    """Reconstruct a scan."""
+    began, last = clock.now(), dict[str, Any]()
+
+    def pass_on(line: str) -> None:
+        nonlocal last
+        try:
+            event = event_of(json_object(line) or {})
+        except ValueError:
+            return
+        if isinstance(event, Done | Failed):
+            last = event.data
+        else:
+            sink(replace(event, scan=row.scan))
+
+    place = options.folder / row.name
+    if (place / RECON).is_file():
+        return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
+    try:
+        with whole_file(place) as work:
+            work.mkdir()
+            log = work / "stderr.txt"
+            ending, code, stderr = run_to_end(
+                [*COMMAND, *_arguments(options, row.scan, work)], log, pass_on, silence=_SILENCE
+            )
+            log.unlink()
+            reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+            if ending is ProcessEnd.SILENT:
+                reason = f"no output from its process for {_SILENCE:g} s; it was ended"
+            if code not in _WITH_VOLUME or not (work / RECON).is_file():
+                raise DataError(reason or f"no volume: its process ended with code {code}")
+        state = _WITH_VOLUME[code]
+    except DataError as error:  # also of a folder of this name that somebody else made
+        state, reason = "failed", str(error)
+    return replace(
+        row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
+        residual=last.get("residual_held_out", last.get("residual")),
+        message="" if state == "done" else one_line(reason, SENTENCE),
+    )  # fmt: skip
+
+
+def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
+    recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
+    return [
+        "recon",
+        scan,
+        *recipe,
+        "--output",
+        str(work / RECON),
+        "--beside-scan",
+        "--json",
+    ]
+
+
+def _read(folder: Path) -> list[BatchRow]:
+    """The table of an earlier call; a row whose volume is no longer there waits.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    from pydantic import TypeAdapter, ValidationError  # here, since help loads this module
+
+    path = folder / TABLE
+    try:
+        with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
+            reader = csv.DictReader(file)
+            rows = [{name: value for name, value in row.items() if name and value} for row in reader]
+            if not {"name", "scan"} <= {*(reader.fieldnames or ())}:
+                raise ValueError(f"expected a first line with name and scan, not {reader.fieldnames}")
+        table = TypeAdapter(list[BatchRow]).validate_python(rows)
+        _refuse_names(table)
+        return [
+            BatchRow(row.name, row.scan) if row.has_volume and not (folder / row.name / RECON).is_file() else row
+            for row in table
+        ]
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = f"row {int(first['loc'][0]) + 1}, {first['loc'][-1]}"
+        raise DataError(f"{path} is no table of a batch ({place}: {first['msg']}). Nothing was touched.") from error
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path} is no table of a batch ({one_line(str(error))}). Nothing was touched.") from error
+
+
+def _refuse_names(rows: Sequence[BatchRow]) -> None:
+    """ValueError for a name that is not safe for a folder, or that another row or file of the batch has."""
+    folded = [TABLE, RECIPE, *(row.name.casefold() for row in rows)]
+    for n, row in enumerate(rows, start=2):
+        if row.name != safe_name(row.name) or folded[n] in folded[:n]:
+            raise ValueError(f"{row.name!r} is no name that this program gives the folder of a scan")
+
+
+def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
+    names = [column.name for column in fields(BatchRow)]
+    table = csv_text([names, *(vars(row).values() for row in rows)])
+    write_whole(folder / TABLE, table.encode("utf-8", "surrogateescape"), replace=True)
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +16,8 @@ from beamline.core.errors import DataError
 from beamline.core.events import RuleBroken
 from beamline.core.files import refuse_existing
 from beamline.core.text import SENTENCE, aligned, count, one_line, printable
-from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.projections.flagged_frames import ReturnedView
     from beamline.projections.scan_statistics import LightAsked
     from beamline.storage.readers.open import SourceOptions
 
@@ -82,17 +79,14 @@ def info(
         return
     with answering(as_json) as answer:
         facts = dict(describe(SourceOptions(file, **scan_facts)))
-        returned = _returned(SourceOptions(file, **scan_facts)) if "alignment" in facts.get("kinds", {}) else []
-        if returned:
-            facts["returned"] = [vars(view) for view in returned]
-        answer.done(facts, *_described(facts, [view.in_words() for view in returned]))
+        answer.done(facts, *_described(facts))
 
 
-def _described(facts: Mapping[str, Any], returned: Sequence[str]) -> list[str]:
-    """The facts of a scan or a volume in lines, with how the sample came back to earlier angles."""
+def _described(facts: Mapping[str, Any]) -> list[str]:
+    """The facts of a scan or a volume in lines."""
     from beamline.storage.flag_legend import counted
 
-    apart = ("attributes", "not_used", "findings", "returned")
+    apart = ("attributes", "not_used", "findings")
     shown = {name: value for name, value in facts.items() if name not in apart}
     if shown.get("flags") is not None:
         shown["flags"] = counted(shown["flags"])
@@ -100,21 +94,7 @@ def _described(facts: Mapping[str, Any], returned: Sequence[str]) -> list[str]:
         shown |= facts.get(name, {})
     width = max(map(len, shown)) + 2
     lines = [f"{name:<{width}}{_text(value)}" for name, value in shown.items()]
-    lines += [f"{'on the way back':<{width}}{words}" for words in returned]
     return [*lines, *(f"! {message}" for message in facts["findings"])]
-
-
-def _returned(scan: SourceOptions) -> list[ReturnedView]:
-    from beamline.features.files.validate import LOOK
-    from beamline.projections.flagged_frames import returned_views
-    from beamline.storage.readers.base import TakesTooLongError
-    from beamline.storage.readers.open import open_scan
-    from beamline.storage.readers.transforms import brief_source
-
-    until = SystemClock().now() + LOOK
-    with suppress(TakesTooLongError), open_scan(scan) as source:
-        return returned_views(brief_source(source, lambda: SystemClock().now() > until))
-    return []
 
 
 def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:

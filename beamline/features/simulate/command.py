@@ -19,13 +19,108 @@ from beamline.core.machine import free_memory
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
-from beamline.scenes.request import Output, SimulateRequest
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.features.simulate.write import SimulatedScan
     from beamline.scenes.scene_file import SceneFile
     from simulators.scenes.expose import Scan
+
+import inspect
+from dataclasses import dataclass, replace
+
+from beamline.cli.options import json_option, set_by
+from beamline.core.events import Event
+from drivers.base.clock import Clock
+from simulators.effects.catalogue import CATALOGUE, load_effect
+
+
+def effects_text() -> str:
+    """Each effect that a scene may name, in the order of physics: its parameters with their defaults, what it acts on,
+    what happens, and what the parameters mean. This imports all of them."""
+    lines = []
+    for name, row in sorted(CATALOGUE.items(), key=lambda item: item[1].domain):
+        effect = load_effect(name)
+        declared = inspect.signature(effect).parameters.values()
+        parameters = ", ".join(str(each.replace(annotation=inspect.Parameter.empty)) for each in declared)
+        _, _, meanings = (inspect.getdoc(effect) or "").partition("\nAttributes:\n")
+        lines.append(f"{name}({parameters})  {row.domain.words}: {row.summary}\n{meanings}".strip())
+    return "\n".join(lines)
+
+
+_OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
+_VIEWS = click.IntRange(1)
+_SEED = click.IntRange(0, 2**63 - 1)
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+def _print_effects(ctx: click.Context, param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(effects_text())
+        ctx.exit()
+
+
+@dataclass(frozen=True, eq=False)
+class SimulateRequest:
+    """The arguments of `beamline simulate`."""
+
+    scene: str = set_by(click.argument("scene", metavar="SCENE"))
+    explains: bool = set_by(
+        click.option(
+            "--effects",
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_effects,
+            help="Print all effects that a scene may name, with their parameters, and end.",
+        ),
+        "--explain",
+        is_flag=True,
+        help="Print the steps of computing a frame, in order.",
+    )
+    views: int | None = set_by(
+        "--frames",
+        type=_VIEWS,
+        metavar="N",
+        help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
+    )
+    out: Path | None = set_by(
+        "-o", "--output", "--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
+    )
+    truth: Path | None = set_by(
+        "--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file."
+    )
+    truth_bin: int | None = set_by(
+        "--truth-bin",
+        type=click.IntRange(min=1),
+        help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 "
+        "voxels.",
+    )
+    picture: Path | None = set_by(
+        "--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out."
+    )
+    seed: int = set_by(
+        "--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers."
+    )
+    overrides: tuple[str, ...] = set_by("--set", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
+    as_json: bool = set_by(json_option)
+
+
+class Output:
+    """Prints results as lines for people and sends them as events to programs."""
+
+    def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
+        self._sink, self._clock, self._plain = sink, clock, plain
+
+    def __call__(self, what: str, text: str) -> None:
+        self.lines(f"{what:<10}{text}")
+
+    def lines(self, text: str) -> None:
+        if self._plain:
+            click.echo(text)
+
+    def event(self, event: Event) -> None:
+        self._sink(replace(event, time=self._clock.now()))
 
 
 @click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")

@@ -208,7 +208,7 @@ def study(request: StudyRequest) -> None:
     the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.features.trials.study import planned_study
+    from beamline.features.trials.tradeoff import planned_study
 
     methods, command = tuple(dict.fromkeys(request.methods)), click.get_current_context().command
     settings = row_settings(command, methods, dict(request.values))

@@ -3,31 +3,219 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, whole_file
-from beamline.storage import hdf5
+from beamline.core.quantities import VoxelKind
+from beamline.storage import datasets, hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
+from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
-from beamline.storage.volume_file import read_volume
-from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
-from beamline.storage.volumes.registry import formats
-from beamline.storage.volumes.single_files import NexusVolume, Npy, NXtomoproc
+from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
+from beamline.storage.volume_file import axes_of, read_volume
+from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, facts_of, marked, record_of
+from beamline.storage.volumes.registry import REGISTRY, formats
 from beamline.storage.writers.recon_file import (
+    DEFINITION,
     SUFFIXES,
     opened_reconstruction,
     volumes_in_time,
     write_reconstruction,
+    write_record,
 )
 from recon.base.registry import did_you_mean
+from recon.base.volume import Volume
+
+
+@dataclass(frozen=True)
+class NXtomoproc:
+    """HDF5, float32, with all settings, figures of merit and the history."""
+
+    name: str = "HDF5 (NXtomoproc)"
+    suffixes: tuple[str, ...] = REGISTRY["hdf5"].suffixes
+    greys: bool = False
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        write_record(path, record)
+
+    def holds(self, path: Path) -> bool:
+        if not path.is_file() or not hdf5.is_hdf5(path):
+            return False
+        with hdf5.readable(path):
+            try:
+                with hdf5.open_hdf5(path) as file:
+                    return datasets.text_at(file, "entry/definition") == DEFINITION
+            except (DataError, OSError, TypeError):
+                return False
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        with opened_reconstruction(path) as record:
+            yield record
+
+
+@dataclass(frozen=True)
+class NexusVolume:
+    """HDF5 whose default plot has the axes z, y, x: a reference volume of `simulate`, labels of `segment`; only
+    read."""
+
+    name: str = "HDF5 (NXdata)"
+    suffixes: tuple[str, ...] = ()
+    greys: bool = False
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        raise ValueError(f"{self.name} can only be read; write {NXtomoproc().name}.")
+
+    def holds(self, path: Path) -> bool:
+        if not path.is_file() or not hdf5.is_hdf5(path):
+            return False
+        try:
+            with hdf5.open_hdf5(path) as file:
+                return _plotted(file) is not None
+        except (DataError, *hdf5.ALTERED):
+            return False
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+            values = _plotted(file)
+            assert values is not None
+            spacing, first = axes_of(file, str(values.name))
+            record = bare_record(path, values, spacing)
+            if spacing is not None and first is not None:
+                half = [(n - 1) / 2 * edge for n, edge in zip(values.shape, spacing, strict=True)]
+                z, y, x = (low + middle for low, middle in zip(first, half, strict=True))
+                grid = replace(record.volume.grid, centre=(z, y, x))
+                record = replace(record, volume=Volume(values, grid))
+            yield replace(record, kind=VoxelKind.of_unit(datasets.attribute(values, "units")))
+
+
+def _plotted(file: h5py.File) -> h5py.Dataset | None:
+    """The volume [z, y, x] that the file's attributes `default` and `signal` name; None without one."""
+    entry = datasets.resolve(file, datasets.attribute(file, "default") or "entry")
+    data = (
+        datasets.resolve(entry, datasets.attribute(entry, "default") or "data")
+        if isinstance(entry, h5py.Group)
+        else None
+    )
+    if not isinstance(data, h5py.Group) or [datasets.text(name) for name in data.attrs.get("axes", ())] != [
+        "z",
+        "y",
+        "x",
+    ]:
+        return None
+    values = datasets.dataset(data, datasets.attribute(data, "signal"))
+    return values if values is not None and values.ndim == 3 and values.dtype.kind in "uif" else None
+
+
+_TYPES = {32: "float", 16: "uint16", 8: "uint8"}
+_LONGEST_HEADER = 2**20
+_KEY = b"splatline:="
+
+
+@dataclass(frozen=True)
+class Nrrd:
+    """NRRD 4 (teem.sourceforge.net/nrrd/format.html), raw, attached header; the facts are JSON under `splatline`."""
+
+    name: str = "NRRD"
+    suffixes: tuple[str, ...] = REGISTRY["nrrd"].suffixes
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        grid, nz, ny, nx = record.volume.grid, *slices.shape
+        z, y, x = (float(centres[0]) for centres in grid.coordinates())
+        dz, dy, dx = (float(edge) for edge in grid.spacing)
+        units = f'space units: "{record.length_unit}" "{record.length_unit}" "{record.length_unit}"\n'
+        facts = json.dumps(facts_of(record, slices.pixels))
+        header = (
+            f"NRRD0004\ntype: {_TYPES[slices.pixels.bits]}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n"
+            f"space directions: ({dx!r},0,0) (0,{dy!r},0) (0,0,{dz!r})\nkinds: space space space\nendian: little\n"
+            f"encoding: raw\n{units}space origin: ({x!r},{y!r},{z!r})\n"
+        ).encode("ascii")
+        with path.open("xb") as file:
+            file.write(header + _KEY + _escaped(facts) + b"\n\n")
+            for values in slices:
+                file.write(values.data)
+
+    def holds(self, path: Path) -> bool:
+        return path.name.lower().endswith(self.suffixes) and path.is_file() and VOLUME.encode() in _header(path)[0]
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        header, begin = _header(path)
+        fields = dict(line.split(b": ", 1) for line in header.splitlines() if b": " in line and b":=" not in line)
+        notes = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
+        kinds = {name.encode(): bits for bits, name in _TYPES.items()}
+        try:
+            facts = marked(_unescaped(notes[0])) if len(notes) == 1 else None
+            if facts is None:
+                raise ValueError(f"its field {_KEY.decode()} is not that of this program")
+            shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])
+            dtype = dtype_of({32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]])
+            require_held(shape, dtype, begin, path.stat().st_size)
+            values = np.memmap(path, dtype, "r", begin, shape)
+        except (KeyError, ValueError, OSError) as error:
+            raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
+        yield record_of(path, facts, values)
+
+
+@dataclass(frozen=True)
+class Npy:
+    """NumPy's own format: only the voxels and their shape."""
+
+    name: str = "npy"
+    suffixes: tuple[str, ...] = REGISTRY["npy"].suffixes
+    greys: bool = True
+
+    def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
+        header = {"descr": slices.pixels.dtype.str, "fortran_order": False, "shape": slices.shape}
+        with path.open("xb") as file:
+            np.lib.format.write_array_header_1_0(file, header)
+            for values in slices:
+                file.write(values.data)
+
+    def holds(self, path: Path) -> bool:
+        """Whether the file has three axes of numbers."""
+        if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
+            return False
+        try:
+            with path.open("rb") as file:
+                shape, dtype = require_npy(file)
+        except (OSError, ValueError, EOFError, OverflowError, TypeError):
+            return False
+        return len(shape) == 3 and dtype.kind in "uif"
+
+    @contextmanager
+    def open(self, path: Path) -> Iterator[ReconRecord]:
+        yield bare_record(path, np.load(path, mmap_mode="r", allow_pickle=False))
+
+
+def _header(path: Path) -> tuple[bytes, int]:
+    """The header of an NRRD and where its data begin; (b"", 0) where it has none."""
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+    end = head.find(b"\n\n")
+    return (head[:end], end + 2) if head.startswith(b"NRRD") and end >= 0 else (b"", 0)
+
+
+def _escaped(text: str) -> bytes:
+    """JSON has no line ends; the other thing that NRRD escapes are backslashes."""
+    return text.replace("\\", "\\\\").encode("ascii")
+
+
+def _unescaped(text: bytes) -> str:
+    return text.decode("ascii").replace("\\\\", "\\")
 
 
 def format_of(path: Path) -> VolumeFormat:

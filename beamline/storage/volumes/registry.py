@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 _HERE = "beamline.storage.volumes."
 REGISTRY = {
-    "hdf5": FormatEntry(_HERE + "single_files", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
+    "hdf5": FormatEntry(_HERE + "files", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
     **in_folders("beamline.storage.volumes", "FORMATS"),
-    "npy": FormatEntry(_HERE + "single_files", "Npy", (".npy",)),
-    "nrrd": FormatEntry(_HERE + "single_files", "Nrrd", (".nrrd",)),
+    "npy": FormatEntry(_HERE + "files", "Npy", (".npy",)),
+    "nrrd": FormatEntry(_HERE + "files", "Nrrd", (".nrrd",)),
 }
 
 

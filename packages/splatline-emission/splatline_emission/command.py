@@ -40,8 +40,7 @@ def simulate(
     from beamline.storage.volumes.base import bare_record
     from beamline.storage.volumes.files import write_volume
     from recon import Geometry, Grid, Volume
-    from splatline_emission.counts import write_counts
-    from splatline_emission.phantom import Scanner, activity, counts_of
+    from splatline_emission.counts import Scanner, activity, counts_of, write_counts
 
     with answering(as_json) as answer:
         for path in filter(None, (output, truth)):

@@ -13,7 +13,7 @@ from beamline.storage.volumes.files import opened_volume
 from recon import Geometry, Grid
 from recon.voxels.projector import Projector
 from splatline_emission import read_counts
-from splatline_emission.phantom import RODS, WATER, Scanner, activity, chords, counts_of
+from splatline_emission.counts import RODS, WATER, Scanner, activity, chords, counts_of
 from tests.beamline.cli.small_scan import beamline, succeeds
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (4, 64))

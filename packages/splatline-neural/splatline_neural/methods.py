@@ -10,11 +10,238 @@ The density begins at the mean of the box (published: at half of the highest, wh
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass, replace
+from typing import ClassVar, Self
 
-from splatline_neural.networks import Field, HashGrid, Waves
-from splatline_neural.train import FieldMethod
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon import Geometry, Grid, Progress, Reconstruction, RunControl, Volume
+from recon.base.masks import masked
+from recon.base.method import ReconProblem, Traits
+from recon.splatting.initialise import first_volume
+from recon.voxels.voxel_problem import density_unit
+from splatline_neural.networks import F32, Field, HashGrid, Waves, drawn, rays_of
+
+CHUNK = 2**15  # Samples that one pass through the network takes
+_FLOATS = 24  # of a sample and a number of its layers: activations and their slopes
+_SOME = 256  # rays of a view that tell the mean density
+_DROP, _DROP_AT = 0.1, 0.5  # factor of the rate, and share of the run from which it holds
+_TOP = 0.98  # share of the highest density that counts as reached
+
+
+@dataclass(frozen=True)
+class FieldMethod(ABC):
+    """Settings that all neural fields share.
+
+    Attributes:
+        steps: of one view each.
+        seconds: of the whole run, from the call to the last step; steps end it, too.
+        allow_negative: density without a limit to either side, in place of a sigmoid.
+        rays: of a step, drawn at random among those of its view.
+        samples: along a ray, 2 or more, one at random in each of as many equal parts. None: five for four voxels of the
+            longest edge, as published.
+        rate: of Adam; a tenth of it from half of the steps on.
+        highest: density, in density units (the 99.5th percentile of a first FBP).
+        width: numbers of a hidden layer.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    traits: ClassVar[Traits] = Traits(device=True, any_grid=True, needs_matter=True, halo=4)
+
+    steps: int = 3000
+    seconds: float | None = None
+    allow_negative: bool = False
+    rays: int = 1024
+    samples: int | None = None
+    rate: float = 1e-2
+    highest: float = 2.0
+    width: int = 32
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.rays, self.rate, self.highest, self.width) <= 0:
+            raise ValueError(f"steps, rays, rate, highest and width must be above 0, got {self}")
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        return fit_field(self, problem, control)
+
+    @abstractmethod
+    def network(self, across: int) -> Field:
+        """The network for a box of so many voxels along its longest edge, without trained values."""
+
+    @property
+    def limit(self) -> float | None:
+        """The highest density, or None."""
+        return None if self.allow_negative else self.highest
+
+    def samples_of(self, across: int) -> int:
+        count = math.ceil(1.25 * across) if self.samples is None else self.samples
+        return count + count % 2
+
+    @property
+    def windows(self) -> tuple[int, int]:
+        """Windows of rays of a step beside `rays`, and their edge in pixels."""
+        return 0, 0
+
+    def toy(self) -> Self:
+        return replace(self, steps=2, seconds=None, rays=min(self.rays, 16))
+
+    def for_part(self, share: float, of_time: float) -> Self:
+        """The method for a share of a volume: with its share of the seconds."""
+        return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        with torch.device("meta"):
+            values = sum(part.numel() for part in self.network(max(grid.shape)).parameters())
+        line = max(CHUNK, 2 * max(grid.shape))
+        data = 6 * math.prod(grid.shape) + (3 + 2 * weighted) * geometry.n_views * math.prod(geometry.detector_shape)
+        return 4 * (4 * values + _FLOATS * self.width * line + data)
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Line integrals [view, row, col] in widest edges of the box times density units, and weights of about one."""
+
+    data: F32
+    weights: F32 | None
+    geometry: Geometry
+    grid: Grid
+
+    def usable(self, view: int) -> NDArray[np.bool_]:
+        return np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
+
+    def mean_density(self) -> float:
+        """Mean density in the box, from some rays of each view."""
+        pixels = np.arange(0, self.data[0].size, max(1, self.data[0].size // _SOME))
+        lengths = sum(float(rays_of(self.geometry, v, pixels, self.grid).lengths.sum()) for v in range(len(self.data)))
+        return float(self.data.reshape(len(self.data), -1)[:, pixels].sum()) / max(lengths, 1e-9)
+
+
+def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
+    """Fit the field to the views, and sample its density at the centres of voxels.
+
+    Raises:
+        ValueError: views without matter.
+
+    Warns:
+        UserWarning: rays have a width, which a field does not know; or densities reach the highest one.
+    """
+    begin, geometry = control.now(), problem.geometry
+    if geometry.width:
+        warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
+    used = np.setdiff1d(np.arange(geometry.n_views), np.asarray(problem.use.held_out, int))
+    data, weights = masked(problem.projections, problem.use.weights)
+    grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
+    unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
+    if unit <= 0 or not (data[used] > 0).any():
+        raise ValueError("the views show no absorbing matter. A field needs views of a sample")
+    edge = float(np.ptp(grid.edges, axis=0).max())
+    if weights is not None:
+        weights = weights / np.float32(weights[weights > 0].mean(dtype=np.float64))
+    fit = _Fit(method, _Views(data / np.float32(edge * unit), weights, geometry, grid), problem, begin, control)
+    fit.run(used)
+    volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)
+    if not method.allow_negative and volume.data.max(initial=0) > _TOP * method.highest * unit:
+        warnings.warn(
+            f"densities reach the highest one of the field, {method.highest * unit:.4g}: give a larger `highest` than "
+            f"{method.highest:g}",
+            stacklevel=2,
+        )
+    record = {**asdict(method), "steps": fit.step, "planned_steps": method.steps, "seed": problem.seed}
+    record |= {"device": problem.device, "density_unit": unit}
+    return Reconstruction(volume, record, tuple(fit.history))
+
+
+class _Fit:
+    """The state of a fit: network, optimiser, random generator, record."""
+
+    def __init__(
+        self, method: FieldMethod, views: _Views, problem: ReconProblem, begin: float, control: RunControl
+    ) -> None:
+        self.method, self.views, self.control, self.begin = method, views, control, begin
+        across = max(views.grid.shape)
+        self.device, self.rng = torch.device(problem.device), np.random.default_rng(problem.seed)
+        network = method.network(across)
+        network.start(torch.Generator().manual_seed(problem.seed), views.mean_density())
+        self.network = network.to(self.device)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=method.rate, fused=True)
+        self.samples, self.step = method.samples_of(across), 0
+        self.history: list[Progress] = []
+        self.loss = self.residual = float("nan")
+
+    def run(self, used: NDArray[np.intp]) -> None:
+        method, now = self.method, self.control.now
+        lit = [int(view) for view in used if self.views.usable(int(view)).any()]
+        order: list[int] = []
+        seconds = math.inf if method.seconds is None else method.seconds
+        reported = -math.inf
+        while self.step < method.steps:
+            share = max(self.step / method.steps, (now() - self.begin) / seconds)
+            if self.step and share >= 1:
+                break
+            order = order or self.rng.permutation(lit).tolist()
+            self._advance(order.pop(), method.rate * (_DROP if share >= _DROP_AT else 1.0))
+            if now() - reported > 0.1:
+                reported = now()
+                self._report(len(used))
+            if self.control.stop():
+                break
+        self._report(len(used))
+
+    def _advance(self, view: int, rate: float) -> None:
+        """One step of Adam on the squared differences of rays of one view."""
+        method, count = self.method, max(1, CHUNK // self.samples)
+        pixels = drawn(self.rng, self.views.usable(view), method.rays, *method.windows)
+        values = self.views.data[view].reshape(-1)[pixels]
+        weights = np.ones_like(values) if self.views.weights is None else self.views.weights[view].reshape(-1)[pixels]
+        rays = rays_of(self.views.geometry, view, pixels, self.views.grid)
+        places = np.arange(self.samples, dtype=np.float32) + self.rng.random((pixels.size, self.samples), np.float32)
+        points, lengths = rays.samples(places / np.float32(self.samples)), rays.lengths
+        self.optimiser.param_groups[0]["lr"] = rate
+        self.optimiser.zero_grad(set_to_none=False)
+        squares = 0.0
+        for first in range(0, pixels.size, count):
+            part = slice(first, first + count)
+            integrals = self.network(self._tensor(points[part])).mean(1) * self._tensor(lengths[part])
+            loss = (self._tensor(weights[part]) * (integrals - self._tensor(values[part])) ** 2).sum() / pixels.size
+            loss.backward()
+            squares += float(loss.detach())
+        self.optimiser.step()
+        self.step += 1
+        residual = math.sqrt(squares * pixels.size / max(float((weights * values**2).sum()), 1e-30))
+        self.loss = squares if self.step == 1 else self.loss + 0.05 * (squares - self.loss)
+        self.residual = residual if self.step == 1 else self.residual + 0.05 * (residual - self.residual)
+
+    def _tensor(self, values: F32) -> Tensor:
+        return torch.from_numpy(values).to(self.device)
+
+    def _report(self, n_views: int) -> None:
+        seconds = self.control.now() - self.begin
+        self.history.append(Progress(self.step, self.method.steps, seconds, self.loss, self.residual, 0, n_views))
+        self.control.tell(self.history[-1])
+
+    @torch.no_grad()
+    def volume(self, grid: Grid) -> F32:
+        """Density [z, y, x] in density units at the centres of voxels, whose lines along x are lines of the network."""
+        low, high = self.views.grid.edges
+        edge = (high - low).max()
+        z, y, x = (
+            np.clip((at - first) / edge, 0, (last - first) / edge).astype(np.float32)
+            for at, first, last in zip(grid.coordinates(), low[::-1], high[::-1], strict=True)
+        )
+        out, lines = np.empty(grid.shape, np.float32).reshape(-1, x.size), max(1, CHUNK // x.size)
+        for first in range(0, len(out), lines):
+            at = np.arange(first, min(first + lines, len(out)))
+            points = np.empty((at.size, x.size, 3), np.float32)
+            points[..., 0], points[..., 1], points[..., 2] = x, y[at % y.size, None], z[at // y.size, None]
+            out[at] = self.network(self._tensor(points)).cpu().numpy()
+        return out.reshape(grid.shape)
+
 
 _COARSEST = 16  # cubes an edge of the first level
 

@@ -17,8 +17,8 @@ from recon.base.volume import Grid
 from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
 from splatline_neural import NAF, IntraTomo, SaxNerf
+from splatline_neural.methods import FieldMethod
 from splatline_neural.networks import LineAttention
-from splatline_neural.train import FieldMethod
 from tests.recon.helpers import data_residual
 
 ANGLES = np.linspace(0, 2 * np.pi, 12, endpoint=False)

@@ -12,8 +12,7 @@ import yaml
 from beamline.core.errors import ConfigError
 from simulators.samples.materials.materials import palette_of
 from splatline_spectral.contrast import find_edge
-from splatline_spectral.scene import series_of_scene
-from splatline_spectral.sources import _curve
+from splatline_spectral.sources import _curve, series_of_scene
 
 SCENE: dict[str, Any] = {
     "phantom": {

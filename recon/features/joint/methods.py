@@ -44,10 +44,6 @@ class TimeSeries(Checked):
     sweeps: Count = SWEEPS
     weight: NonNegative | None = None
 
-    @property
-    def volume_names(self) -> tuple[str, ...]:
-        return ()
-
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         _require_own_grid(problem)
         n, times = problem.geometry.n_views, problem.use.times

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError, choose, located
 from simulators.frame.shot import Detector, Pose
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.pixels.bands import share_rows
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import SOLIDS, Solid, kind_of

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from simulators.light.beam import Beam, Tube
+from simulators.light import Beam, Tube
 
 Reals = NDArray[np.float64]
 Attenuation = Callable[[ArrayLike], Reals]  # Linear attenuation in 1/mm at energies in keV

@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 import click
 import pytest
 
-from beamline.cli.commands import commands
+from beamline.cli.main import commands
 from recon.base import registry
 
 hi = click.Command("say-hi", help="Say hi.", callback=print)

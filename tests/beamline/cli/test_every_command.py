@@ -7,8 +7,7 @@ from pathlib import Path
 import click
 import pytest
 
-from beamline.cli.commands import own_commands
-from beamline.cli.main import main
+from beamline.cli.main import main, own_commands
 from tests.beamline.cli.small_scan import beamline, left
 
 CONTEXT = click.Context(main)

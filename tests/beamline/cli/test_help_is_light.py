@@ -10,7 +10,7 @@ from tests.beamline.scans import write_exchange
 
 LOADS = """
 import contextlib, io, sys
-from beamline.cli.commands import commands
+from beamline.cli.main import commands
 from beamline.cli.main import main
 for name in commands():
     assert main.get_command(None, name) is not None

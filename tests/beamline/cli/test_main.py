@@ -27,7 +27,7 @@ def _raiser(error: BaseException) -> Callable[[], None]:
 
 def _run(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> click.testing.Result:
     fake = SimpleNamespace(demo=click.command("demo")(_raiser(error)))
-    monkeypatch.setattr("beamline.cli.commands.import_module", lambda name: fake)
+    monkeypatch.setattr("beamline.cli.main.import_module", lambda name: fake)
     return CliRunner().invoke(module.main, ["demo"])
 
 
@@ -91,7 +91,7 @@ def test_a_developer_sees_the_defect_itself(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], environment: dict[str, str]
 ) -> None:
     fake = SimpleNamespace(demo=click.command("demo")(_raiser(ZeroDivisionError())))
-    monkeypatch.setattr("beamline.cli.commands.import_module", lambda name: fake)
+    monkeypatch.setattr("beamline.cli.main.import_module", lambda name: fake)
     result = CliRunner().invoke(module.main, [*arguments, "demo"], env=environment)
     assert isinstance(result.exception, ZeroDivisionError)
 
@@ -122,7 +122,7 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
         return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
 
     assert completed("doctor", "--se") == ["--session", "--set"]
-    monkeypatch.setattr("beamline.cli.commands.import_module", None)
+    monkeypatch.setattr("beamline.cli.main.import_module", None)
     assert completed("re")[:3] == ["resume", "recon", "recover"]
     assert completed("--v") == ["--version"]
 

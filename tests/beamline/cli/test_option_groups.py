@@ -9,8 +9,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from beamline.cli.commands import own_commands
-from beamline.cli.main import main
+from beamline.cli.main import main, own_commands
 from beamline.cli.recipe import GROUPS, Grouped
 from beamline.cli.terminal import Terminal
 from beamline.core.events import FitReached

@@ -16,6 +16,7 @@ import pytest
 from beamline.config.load import Config, config_folder, load, resolved_yaml
 from beamline.core.files import CONFIG, WATCHDOG_LOG
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.instrument.simulated import WIRES
 from beamline.scan import watchdog
 from beamline.scan.watchdog import BETWEEN, FROZEN, inhibited, until_dead, watched
 from drivers.base.clock import Clock, SystemClock
@@ -23,7 +24,6 @@ from drivers.epics.channel import PvValue
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
-from simulators.wires.registry import WIRES
 from tests.beamline.ball_scan import COMMON
 from tests.clock import wait_until
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from recon.features.tuning import align_pair, finest_structure
+from beamline.features.tuning.align import align_pair, finest_structure
 from recon.prep.align import AxisError
 
 SHAPE = (120, 200)

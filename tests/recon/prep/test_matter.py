@@ -8,7 +8,7 @@ import xraylib
 
 from recon.features.beam_hardening import curve_of_spectrum
 from recon.prep.matter import KNOWN, absorbed_dose, delta_beta, mass_attenuation, tube_spectrum
-from simulators.light.beam import Beam, Tube
+from simulators.light import Beam, Tube
 from simulators.samples.materials.materials import Palette
 from simulators.samples.materials.spectrum import light
 

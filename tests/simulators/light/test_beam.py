@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from simulators.frame.mapping import SceneError, build
-from simulators.light.beam import Beam
+from simulators.light import Beam
 
 
 def test_a_scene_can_say_every_light() -> None:

@@ -16,7 +16,7 @@ from drivers.orca_quest import timing
 from simulators.effects.chain import Chain
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector, Pose
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.sample import Sample

@@ -6,10 +6,10 @@ import pytest
 import serial
 
 from beamline.config.stages import STAGES
+from beamline.instrument.simulated import WIRES
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
-from simulators.wires.registry import WIRES
 from simulators.wires.wire import register
 
 

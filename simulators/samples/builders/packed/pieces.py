@@ -14,7 +14,7 @@ from pydantic import Field
 
 from recon.base.registry import unknown
 from simulators.frame.mapping import SceneError, build, choose, located
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Solid
 from simulators.samples.sample import Changing, Sample

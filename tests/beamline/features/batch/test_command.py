@@ -13,9 +13,9 @@ import psutil
 import pytest
 
 from beamline.core.process import ProcessEnd
-from beamline.core.text import csv_text
-from beamline.features.batch import batch
-from beamline.features.batch.batch import COMMAND, BatchOptions, names_of, run_batch
+from beamline.core.text import csv_text, safe_name
+from beamline.features.batch import command as batch
+from beamline.features.batch.command import COMMAND, BatchOptions, BatchRow, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -183,6 +183,33 @@ def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sen
 )  # fmt: skip
 def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> None:
     assert names_of([Path(path) for path in paths]) == names
+
+
+def test_rows_of_an_earlier_call_keep_their_names() -> None:
+    known = [BatchRow("scan", "/x/run1/scan.h5", "done")]
+    rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
+    assert [row.name for row in rows] == ["scan", "run2_scan"]
+    assert batch.batch.name == "batch"
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_names_that_mean_something_else_are_only_names(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    hostile = ("..h5", "batch.csv.h5", "recipe.yaml.h5", "=1+1.h5", "[", "\x1b[2J.h5", f"{'x' * 246}.h5")
+    Path("in/[").mkdir(parents=True)
+    for name in hostile:
+        Path("in", name if name != "[" else "[/b].h5").write_bytes((folder / "scan.h5").read_bytes())
+    Path("in/circle.h5").symlink_to("circle.h5")
+    os.mkfifo("in/pipe.h5")
+    for _ in range(2):
+        result = beamline("batch", "in/*.h5", "in/[[]/*.h5", "--config", "recipe.yaml", "-o", "out")
+        assert result.exit_code == 5 and "2 of 9 scans failed" in result.output, result.output
+        assert "\x1b" not in result.output
+    table = _table(folder / "out")
+    assert {"unnamed", "batch.csv_2", "recipe.yaml_2", "1+1", "b]", "_[2J", "x" * 120} < table.keys()
+    assert all(name == safe_name(name) for name in table)
+    made = {name for name, row in table.items() if row["state"] == "done"}
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", *made}
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -10,11 +10,10 @@ import pytest
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Ellipsoid, Polyhedron
-from simulators.samples.builders.battery import ELECTROLYTE, PARTICLE, battery
-from simulators.samples.composed import build_sample
+from simulators.samples.composed import ELECTROLYTE, PARTICLE, battery, build_sample
 from tests.simulators.bodies import volume
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
 from simulators.samples.materials.materials import of_formula, palette_of

@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
-from simulators.light.beam import Beam, Tube
+from simulators.light import Beam, Tube
 from simulators.samples.materials.spectrum import Attenuation, Spectrum, fewer, light
 
 Reals = NDArray[np.float64]

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.composed import build_sample
 from simulators.samples.sample import Stored
 from simulators.samples.voxels.files import VolumeSettings, filled, require_closed, volume_sample

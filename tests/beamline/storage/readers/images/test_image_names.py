@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_angles import angles_in
-from beamline.storage.readers.images.image_names import kinds_of
+from beamline.storage.readers.images.image_names import angles_in, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.replacements import load_images
 from drivers.base.frame import FrameKind

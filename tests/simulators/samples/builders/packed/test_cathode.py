@@ -11,7 +11,7 @@ from scipy.stats import kstest, truncnorm
 
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.solids import Ellipsoid
 from simulators.samples.builders.packed.cathode import (
     GREY,

@@ -10,7 +10,7 @@ import pytest
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.builders.packed.foam import Foam
 from simulators.samples.builders.packed.pieces import Charge, Settle

@@ -11,7 +11,7 @@ import pytest
 
 from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
-from simulators.light.beam import Beam
+from simulators.light import Beam
 from simulators.samples.builders.packed.resolution import Resolution
 from simulators.samples.composed import build_sample
 from tests.simulators.bodies import volume
