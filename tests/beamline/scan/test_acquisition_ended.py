@@ -1,5 +1,6 @@
 """A scan that is stopped, aborted or cut short by a device: what was exposed keeps its angles, and it ends up safe."""
 
+import numpy as np
 import pytest
 
 from beamline.core.errors import InstrumentError, ScanStopped
