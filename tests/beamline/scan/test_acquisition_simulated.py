@@ -121,14 +121,15 @@ def test_a_camera_that_is_silent_at_the_end_of_a_pass_has_its_missing_frames_nam
 
 
 @pytest.mark.parametrize("after", [1, 12])
-def test_a_stop_while_turning_keeps_the_angles_of_the_frames_on_their_way(after: int) -> None:
+def test_frames_after_a_stop_while_turning_are_kept_and_those_exposed_while_it_brakes_are_invalid(after: int) -> None:
     instrument = FaultyInstrument(set(), set(), set())
     acquisition, frames, error = instrument.scan(StopRequest(), stop_after=after)
     assert isinstance(error, ScanStopped)
     assert after < len(frames) < N
-    assert [frame.trigger for frame in frames] == list(range(len(frames)))
-    assert all(frame.kind is FrameKind.PROJECTION for frame in frames)
-    instrument.assert_true_angles(frames)
+    views = [frame for frame in frames if frame.kind is FrameKind.PROJECTION]
+    assert [frame.trigger for frame in frames] == [*range(len(views)), *[-1] * (len(frames) - len(views))]
+    assert {frame.kind for frame in frames[len(views) :]} == {FrameKind.INVALID} and len(views) >= after
+    instrument.assert_true_angles(views)
     assert acquisition.missing == []
     assert instrument.stage.position() == 0.0
     instrument.stage.close()
