@@ -6,13 +6,14 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
-from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, more_light
+from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.field import PixelsCheck
@@ -122,7 +123,7 @@ def look(
             continue
         begin(check.name)
         try:
-            looks.append(_look_of(check.look(state, frame, digest, monitor.context), frame.index))
+            looks.append(_valid(check.look(state, frame, digest, monitor.context), check.name, frame.index))
         except BaseException as error:  # a plug-in may call sys.exit
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
@@ -158,12 +159,24 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
     return replace(digest, preview=preview, peaks=peaks)
 
 
-def _look_of(answer: Any, at: int) -> Look[Any]:
-    """What a check returned at a frame; TypeError where it is no `Look` at frames so far, as of another package's."""
-    if not isinstance(answer, Look) or not isinstance(answer.flag, Flag | None):
+def _valid(answer: Any, name: str, at: int) -> Look[Any]:
+    """What the check of this name returned at a frame. TypeError, ValueError: a scan cannot go on with it."""
+    if not isinstance(answer, Look) or type(answer.flag) not in (Flag, type(None)):
         raise TypeError(f"it returned {answer!r:.80}; expected a Look with a Flag or None")
-    if answer.flag is not None and not 0 <= answer.flag.frame <= at:
-        raise TypeError(f"its flag is of frame {answer.flag.frame}; expected 0 to {at}")
+    if (flag := answer.flag) is None:
+        return answer
+    rows, boxes = (flag.frame if flag.first is None else flag.first, flag.frame), (flag.region, flag.from_region)
+    numbers = (flag.score, flag.limit, *(side for box in boxes for side in box or ()))
+    typed = (
+        isinstance(flag.level, Level)
+        and isinstance(flag.advice, str)
+        and all(isinstance(row, Integral) for row in rows)
+        and all(isinstance(number, Real) for number in numbers)
+    )
+    if not typed or any(len(box) != 4 for box in boxes if box is not None):
+        raise TypeError(f"its flag has a field of another type: {flag!r:.300}")
+    if flag.check != name or rows[0] > rows[1] or not 0 <= rows[1] <= at:  # `_from` cuts what reaches too far back
+        raise ValueError(f"its flag is of {flag.check!r}, rows {rows[0]} to {rows[1]}; expected {name!r}, up to {at}")
     return answer
 
 

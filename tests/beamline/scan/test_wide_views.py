@@ -184,15 +184,18 @@ def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
     with h5py.File(path) as ours, h5py.File(tmp_path / "other.nxs", "w") as file:
         for name in ("detector/data", "detector/image_key"):
             file[f"entry/instrument/{name}"] = ours[f"entry/instrument/{name}"][()]
-        for name, unit in (("rotation_angle", "deg"), ("x_translation", "mm")):
-            file[f"entry/sample/{name}"] = ours[f"entry/sample/{name}"][()]
-            file[f"entry/sample/{name}"].attrs["units"] = unit
+        file["entry/sample/rotation_angle"] = ours["entry/sample/rotation_angle"][()]
+        file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+        across = ours["entry/sample/x_translation"][()] / PIXEL
         file["entry/instrument/detector/x_pixel_size"] = PIXEL
         file["entry/instrument/detector/x_pixel_size"].attrs["units"] = "mm"
         file["entry"].attrs["NX_class"], file["entry/definition"] = "NXentry", "NXtomo"
         for name, kind in (("instrument", "NXinstrument"), ("instrument/detector", "NXdetector")):
             file[f"entry/{name}"].attrs["NX_class"] = kind
-    selection = Selection(axis_col=19.5).with_steps(PosesOfFile(read_poses(f"{tmp_path / 'other.nxs'}:x,0")))
+    rows = [f"{row},{shift},0" for row, shift in enumerate(across)]
+    poses = tmp_path / "poses.csv"
+    poses.write_text("\n".join(["frame,shift_col_px,shift_row_px", *rows]), encoding="utf-8")
+    selection = Selection(axis_col=19.5).with_steps(PosesOfFile(read_poses(str(poses))))
     with open_scan(tmp_path / "other.nxs") as source:
         other = prepare_projections(source, selection, lambda sentence: None)
     views, _ = prepared(path)
