@@ -248,7 +248,7 @@ OF_LINES = (
     FaultElsewhere(
         "another device at the port",
         "another device answers",
-        ("drivers/stages/zaber/test_stage.py", "test_the_configured_serial_number_is_required"),
+        ("drivers/stages/test_every_stage.py", "test_the_configured_serial_number_is_required"),
     ),
 )
 OF_MOTION = (

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.testing.stages.bench import LONG
+from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
 from tests.simulators.wires.transports import serve_pty
 
@@ -99,6 +99,30 @@ def test_limits_in_the_controller_that_leave_no_room_are_respected(maker: str, b
     rig.open(low=math.radians(-8), high=math.radians(80)).close()
 
 
+@pytest.mark.parametrize(("maker", "unreferenced"), [("pi_gcs", {"referenced": False}), ("zaber", {"homed": False})])
+def test_without_a_reference_it_does_not_move_until_it_has_searched_one(maker: str, unreferenced: Any) -> None:
+    rig = RIGS[maker](**unreferenced)
+    stage = rig.open()
+    with pytest.raises(DeviceRefused, match=r"reference.*home.*Nothing has moved"):
+        stage.start_move(math.radians(10), SPEED)
+    stage.start_home()
+    assert stage.wait(LONG) == 0.0
+    stage.start_move(math.radians(10), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(10.0, abs=0.01)
+    assert math.degrees(rig.line.angle_at(rig.clock.now())) == pytest.approx(10.0, abs=0.01)
+
+
+@pytest.mark.parametrize("maker", ["pi_gcs", "zaber"])
+def test_the_configured_serial_number_is_required(maker: str) -> None:
+    rig = RIGS[maker]()
+    stage = rig.open()
+    serial = str(stage.describe()["serial"])
+    stage.close()
+    rig.open(serial=serial).close()
+    with pytest.raises(DeviceRefused, match=rf"another device answers.*{serial}.*42.*swapped.*Nothing has moved"):
+        rig.open(serial="42")
+
+
 # somebody else's controller
 
 
@@ -134,6 +158,3 @@ def test_a_second_driver_does_not_get_the_port_and_does_not_disturb_the_first(
         assert len(bench.pulses()) == 3
         bench.stage.close()
         rig.open().close()
-
-
-# pulses on the cable

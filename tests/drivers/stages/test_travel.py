@@ -1,7 +1,8 @@
-"""Travel: how near pulses may be, against fractions, and which trains of pulses a stage is given."""
+"""Travel: how near pulses may be, which trains a stage is given, and when it is seen to stand."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from fractions import Fraction
@@ -13,7 +14,36 @@ from hypothesis import strategies as st
 from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.settings import StageFigures
+from drivers.stages.shared import POLL, STOP_MARGIN, longest_stop, until_standing
 from drivers.stages.travel import Travel, least_interval
+from simulators.devices.clock import VirtualClock
+
+
+@given(polls=st.integers(-10, 100), part=st.floats(0.01, 0.99), timeout=st.floats(-1, 1))
+def test_the_last_status_is_the_first_of_a_standing_stage_or_at_the_deadline(
+    polls: int, part: float, timeout: float
+) -> None:
+    """Looks fall on every POLL and on the deadline; where there is no time left, there is one all the same. The move
+    ends between two of them."""
+    clock, end = VirtualClock(), (polls + part) * POLL
+    begun, looks = clock.now(), []
+
+    def look() -> float:
+        looks.append(clock.now() - begun)
+        return looks[-1]
+
+    last = until_standing(clock, look, lambda now: now < end, timeout)
+    due = max(0.0, min((polls + 1) * POLL, timeout))
+    assert last == looks[-1] == pytest.approx(due, abs=1e-6)
+    assert all(b - a <= POLL + 1e-6 for a, b in itertools.pairwise(looks))
+    assert len(looks) <= due / POLL + 3
+
+
+def test_a_stop_may_take_the_ramp_from_full_speed() -> None:
+    """30 deg/s at 60 deg/s² are half a second."""
+    limits = StageLimits(360_000, math.radians(30), math.radians(60), 0.0, 1.0, True)
+    assert longest_stop(limits) == pytest.approx(0.5 + STOP_MARGIN)
+
 
 LIMITS = StageLimits(360_000, math.radians(30), math.radians(60), 0.0, math.radians(100), True, 0, 2e-3)
 """30 000 counts/s at full speed, of which 60 take 2 ms."""

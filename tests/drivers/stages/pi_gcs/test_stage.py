@@ -9,9 +9,7 @@ import pytest
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import RotationStage
 from drivers.testing.stages.bench import LONG, SPEED
-from simulators.wires.wire import register
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
-from tests.drivers.stages.rig import NAMES
 
 
 @pytest.fixture
@@ -93,18 +91,6 @@ def test_where_acc_and_dec_are_missing_parameters_do() -> None:
 
 
 # moves and the reference
-
-
-def test_an_unreferenced_axis_does_not_move_until_it_has_searched() -> None:
-    rig = Rig(referenced=False, found_at=3.0)
-    stage = rig.open()
-    with pytest.raises(DeviceRefused, match=r"no reference yet.*'MOV 1 10'.*start_home.*Nothing has moved"):
-        stage.start_move(math.radians(10), SPEED)
-    stage.start_home()
-    assert stage.wait(LONG) == 0.0
-    stage.start_move(math.radians(10), SPEED)
-    stage.wait(LONG)
-    assert math.degrees(rig.line.angle_at(rig.clock.now())) == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize(
@@ -219,14 +205,6 @@ def test_an_error_before_opening_is_in_the_description(rig: Rig) -> None:
     assert "motion error" in str(stage.describe()["found_at_opening"])
     stage.start_move(math.radians(5), SPEED)
     stage.wait(LONG)
-
-
-def test_the_configured_serial_number_is_required(rig: Rig) -> None:
-    serial = str(rig.open().describe()["serial"])
-    rig.url = register(next(NAMES), rig)
-    rig.open(serial=serial).close()
-    with pytest.raises(DeviceRefused, match=rf"is {serial}.*swapped"):
-        rig.open(serial="42")
 
 
 def test_other_outputs_can_be_set_and_that_of_the_pulses_cannot(rig: Rig) -> None:

@@ -49,13 +49,6 @@ def test_remote_that_is_not_granted_is_named(rig: Rig) -> None:
         rig.open()
 
 
-def test_another_controller_on_the_port_is_named() -> None:
-    rig = Rig(garbled={0})
-    with pytest.raises(DeviceError, match=r"'VER\?'.*PM16C-04XD"):
-        rig.open()
-    rig.open().close()
-
-
 @pytest.mark.parametrize("channel", [-1, 16])
 def test_a_channel_that_does_not_exist_is_refused(rig: Rig, channel: int) -> None:
     with pytest.raises(ValueError, match=r"channel is .*>= 0 and <= 15"):

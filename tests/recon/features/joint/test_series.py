@@ -17,6 +17,18 @@ from recon.features.joint.proportions import SOLUTION_STEPS
 from recon.features.joint.series import TimedViews, TimedVolumes, fit_series, hats, of_moments
 from recon.voxels.projector import Projector
 
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (2, 8), pixel_pitch=1.0)
+ONES = np.ones((40, 2, 8), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("data", "weights"), [(0 * ONES, None), (np.nan * ONES, None), (ONES, 0 * ONES)], ids=["zero", "NaN", "no weight"]
+)
+def test_views_without_matter_are_refused(data: np.ndarray, weights: np.ndarray | None) -> None:
+    with pytest.raises(ValueError, match="show no matter"):
+        recon.reconstruct(data, VIEWS, recon.TimeSeries(), use=recon.DataUse(weights))
+
+
 SIDE, ROWS = 40, 2
 GOLDEN = np.pi * (np.sqrt(5) - 1) / 2
 

@@ -1,4 +1,4 @@
-"""Losses: the Triton kernels against the reference and the CPU's."""
+"""Losses, and Adam: the Triton kernels against the reference and the CPU's."""
 
 from __future__ import annotations
 

@@ -103,21 +103,6 @@ def test_it_stays_on_the_sensor_in_any_roi_and_binning(row: int, col: int, binni
     assert whole.std() > 0.01
 
 
-def test_specks_take_the_light_of_their_gaussians() -> None:
-    """Mean loss of many: their number x mean depth x 2 pi E r² over the sensor's area. Radii are even in 1/2 ... 3/2 of
-    10 pixels: E r² = 100 x 13/12, and E (depth r²)² gives the spread; wrong once in a million seeds."""
-    specks = FlatStructure(specks=4000, radius_um=100.0, depth=0.01, scratches=0, seed=2)
-    loss = 1 - specks.transmission(_roi(0, 0, 2304, 4096))
-    area = 2304 * 4096
-    mean = 4000 * 0.01 * 2 * math.pi * 100 * (13 / 12) / area
-    # E depth² = 4/3 of the mean's square; E r^4 of the same law = (1.5^5 - 0.5^5) / 5 = 1.5125.
-    each = 2 * math.pi * 100 * 0.01 * math.sqrt(4 / 3 * 1.5125)
-    overlaps, edge = 0.01 * mean * 10, 0.01 * mean
-    assert loss.mean() == pytest.approx(mean, abs=4.9 * each * math.sqrt(4000) / area + overlaps + edge)
-    assert 0.005 < loss.max() < 0.06
-    assert loss.min() == 0.0
-
-
 def test_a_speck_is_round_and_a_gaussian() -> None:
     rng = fixed_rng("flat_structure", 11)
     row, col, size, deep = rng.random(4) * (2304, 4096, 6.0, 0.4) + (0, 0, 3.0, 0)

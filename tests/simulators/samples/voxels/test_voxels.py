@@ -94,22 +94,6 @@ def test_the_error_against_the_closed_form_falls_with_the_square_of_the_voxel(so
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.25)
 
 
-@pytest.mark.parametrize("angle", [0.0, math.pi / 2, math.pi, -math.pi / 2])
-def test_along_the_axes_it_is_a_sum_of_voxels(random: Voxels, angle: float) -> None:
-    turned = abs(math.sin(angle)) > 0.5
-    across, along = (1, 2) if turned else (2, 1)
-    n = SHAPE[across]
-    values = random.padded[1:-1, 1:-1, 1:-1].astype(np.float64)
-    # Columns stand on the voxels' centres, in the order that the turn gives; rows lie between two planes.
-    detector = Detector((3, n), SPACING[across], (n - 1) / 2, 1)
-    got = random.line_integrals(angle, detector)
-    heights = detector.v() / SPACING[0] + (SHAPE[0] - 1) / 2
-    planes = np.stack([values[int(h)] * (1 - h % 1) + values[int(h) + 1] * (h % 1) for h in heights])
-    expected = planes.sum(axis=along) * SPACING[along]
-    forward = math.cos(angle) + math.sin(angle) > 0
-    np.testing.assert_allclose(got, expected if forward else expected[:, ::-1], rtol=1e-5)
-
-
 def test_truth_on_its_own_grid_is_the_volume_and_on_a_coarser_one_the_mean_of_blocks(random: Voxels) -> None:
     values = np.arange(4 * 6 * 8, dtype=float).reshape(4, 6, 8)
     voxels = Voxels.of(values, 0.1)
