@@ -16,7 +16,6 @@ from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_WEIGHT
 from beamline.storage.rules.treatment import FEWEST_VIEWS
-from drivers.base.frame import FrameKind
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -61,11 +60,6 @@ def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path
     np.testing.assert_array_equal(kept.view_weights == WARNED_WEIGHT, expected)
 
 
-def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
-    _, (line,) = prepare(scan(tmp_path, {FIRST + 9: Level.ALARM}), SELECTION)
-    assert line == "Of 30 views 1 has an alarm and is left out (beam 1 alarm). --flags ignore weighs all equally."
-
-
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
     found, told = prepare(scan(tmp_path), SELECTION.with_steps(Preparation("ignore")))
     assert found.geometry.n_views == 30 and found.view_weights is None and found.ray_weights() is None
@@ -89,16 +83,3 @@ def test_a_file_without_flags_is_judged_where_that_is_wanted(tmp_path: Path) -> 
     assert prepare(path, SELECTION)[0].geometry.n_views == 30
     found, told = prepare(path, SELECTION.with_steps(Preparation("judge")))
     assert found.geometry.n_views == 28 and "2 have an alarm and are left out (stuck 2 alarm)" in told[0]
-
-
-def test_flags_of_darks_and_flats_leave_the_views_alone(tmp_path: Path) -> None:
-    found, told = prepare(scan(tmp_path, {1: Level.WARN, 3: Level.WARN}), SELECTION)
-    assert found.geometry.n_views == 30 and told == [] and found.view_weights is None
-
-
-def test_references_of_the_caller_do_not_shift_the_flags(tmp_path: Path) -> None:
-    frames = frames_of(SCAN)
-    flats = np.stack([f.counts for f in frames if f.kind is FrameKind.FLAT])
-    found, _ = prepare(scan(tmp_path), SELECTION, flats=flats)
-    assert found.geometry.n_views == 24
-    np.testing.assert_allclose(found.geometry.angles, np.delete(SCAN.angles, range(10, 16)), atol=1e-9)
