@@ -1,4 +1,4 @@
-"""The registry of cameras of other packages; `drivers.dcam` and the simulated ORCA-Quest have sections of their own."""
+"""The registry of cameras of other packages; `drivers.dcam` and the simulated ORCA-Quest have their own sections."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ REACH = 0.25
 FINER = 100
 """Steps of a pixel."""
 EVEN = 1e-6
-"""Share of the other way's change: with less, rows or columns are all alike."""
+"""Share of the other way's change: with less, all rows or columns are equal."""
 SIGMAS = 8.0
 """The least correlation of both views, in standard deviations of that of noise."""
 KNOWN = 0.25

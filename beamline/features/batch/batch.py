@@ -1,4 +1,4 @@
-"""Batches: many scans by one recipe, each in a process of its own, and a table of the results."""
+"""Batches: many scans by one recipe, each in a separate process, and a table of the results."""
 
 from __future__ import annotations
 

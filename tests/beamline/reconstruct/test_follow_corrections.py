@@ -23,21 +23,18 @@ from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
-from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.base.method import Progress, Reconstruction
-from recon.prep.correct import Correction, Projections, Transmission
+from recon.prep.correct import Projections
 from recon.splatting.stream import StreamingFit
 from recon.voxels.enough_views import Goal
 from tests.beamline.reconstruct.growing_scan import (
     BRIEF,
     EPOCH,
     INTERLACED,
-    RHYTHM,
     SCAN,
-    TICK,
     ScanClock,
     alarms,
     close,
@@ -105,26 +102,6 @@ def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, lat
     assert metrics["residual"] < 0.1
     record = read_reconstruction(tmp_path / "recon.h5")
     assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20
-
-
-@pytest.mark.slow
-def test_what_stands_in_the_beam_of_all_views_counts_as_not_measured(tmp_path: Path) -> None:
-    """It cannot be told before the last view; the line integrals are then those of the finished scan."""
-    clock, events = ScanClock(), list[Event]()
-    frames = frames_of(replace(INTERLACED, shape=(16, 40)))
-    for frame in frames:
-        if frame.kind is FrameKind.PROJECTION:
-            frame.counts[:, :10] = DARK
-    schedule(clock, tmp_path / "scan.h5", frames)
-    selection = Selection(axis_col=SCAN.axis_col)
-    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
-    said = [str(event.data.get("message")) for event in events]
-    assert sum("stands in the beam of all views" in each for each in said) == 1
-    assert any("of the detector got no beam, or is saturated" in each for each in said)
-    followed = read_reconstruction(tmp_path / "recon.h5").parameters
-    with open_scan(tmp_path / "scan.h5") as source:
-        whole = prepare_projections(source, selection, lambda said: None)
-    assert followed["masked_fraction"] == whole.projections.masked.mean() > 0.2
 
 
 def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
@@ -232,43 +209,3 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     warned = [event.data["message"] for event in events if event.event == "warning"]
     assert sum("resumes a run" in said and "not stopped early" in said for said in warned) == 1
     assert not any("no usable flats" in said or "parts of a scan" in said for said in warned)
-
-
-def test_nothing_is_corrected_twice_where_all_references_came_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    corrected: list[int] = []
-    line_integrals = Correction.line_integrals
-
-    def count(self: Correction, views: Transmission | None, last: bool = True, *told: Any) -> Projections:
-        part = line_integrals(self, views, last, *told)
-        corrected.extend(part.view_ids.tolist())
-        return part
-
-    monkeypatch.setattr(Correction, "line_integrals", count)
-    monkeypatch.setattr(Correction, "provisional", lambda self: None)  # a first look at the newest view apart
-    clock = ScanClock()
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    selection = Selection(axis_col=SCAN.axis_col, steps=(Air("3,3"),))
-    reconstruct_file(options(tmp_path, selection=selection, method=BRIEF), lambda event: None, clock)
-    assert len(corrected) == 30 and len(set(corrected)) == 30
-
-
-@pytest.mark.slow
-def test_the_newest_view_does_not_wait_for_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock, fed, arrived = ScanClock(), dict[int, float](), dict[int, float]()
-    add, append = StreamingFit.add_views, NXtomoWriter.append
-
-    def taken(model: StreamingFit, data: np.ndarray, angles: Any) -> None:
-        add(model, data, angles)
-        fed.update({model.n_views - 1 - k: clock.time for k in range(len(data))})
-
-    def written(writer: NXtomoWriter, frame: Frame, *rest: Any) -> None:
-        append(writer, frame, *rest)
-        arrived[frame.index - 4] = clock.time
-
-    monkeypatch.setattr(StreamingFit, "add_views", taken)
-    monkeypatch.setattr(NXtomoWriter, "append", written)
-    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), period=2.0)
-    reconstruct_file(options(tmp_path), lambda event: None, clock)
-    assert max(fed[view] - arrived[view] for view in range(30)) < RHYTHM.slice + RHYTHM.poll + 10 * TICK

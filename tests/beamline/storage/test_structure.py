@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +15,6 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.storage import datasets, structure
 from beamline.storage.hdf5 import open_hdf5
-from beamline.storage.readers import tiff
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.replacements import load_images
@@ -70,21 +67,6 @@ def test_links_to_nothing_to_folders_to_itself_and_in_circles_do_no_harm(path: P
         assert source.image_key.size == len(frames)
 
 
-@pytest.mark.parametrize(("groups", "deep"), [(1500, True), (300, False)])
-def test_more_groups_than_any_scan_has(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: int, deep: bool
-) -> None:
-    monkeypatch.setattr(structure, "MOST_OBJECTS", 200 if not deep else 50_000)
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w", libver="latest") as file:
-        place = file
-        for n in range(groups):
-            made = place.create_group(f"g{n}")
-            place = made if deep else place
-    with pytest.raises(DataError, match="than 64 deep"):
-        open_hdf5(path)
-
-
 def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[content.index(b"OHDR") + 20] ^= 1
@@ -107,18 +89,6 @@ def test_a_member_of_a_zip_and_angles_without_end(tmp_path: Path, monkeypatch: p
         packed.writestr("p_000.tif", bytes(10_001))
     with pytest.raises(DataError, match="most 10 kB"):
         open_scan(tmp_path / "s.zip")
-
-
-def test_a_list_larger_than_any_scan_has(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
-        chunk = (1, 1024, 1024)
-        item = file.create_dataset("list", (200, 1024, 1024), "i4", chunks=chunk, compression="gzip")
-        packed = zlib.compress(bytes(2**22), 9)
-        for n in range(200):
-            item.id.write_direct_chunk((n, 0, 0), packed)
-        with pytest.raises(DataError, match=r"holds 0\.839 GB"):
-            datasets.values_of(item)
-        assert datasets.first_of(item) == 0
 
 
 def _drawn(name: str, where: str) -> Callable[[h5py.File, str], None]:
@@ -156,40 +126,3 @@ def test_a_pipe_in_a_folder_or_by_its_name(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "p_003.tif"):
         with pytest.raises(DataError, match="a device or a pipe"):
             load_images(place, FrameKind.DARK, (8, 8))
-
-
-def _pages(n: int, after_the_last: int = 0) -> bytes:
-    """A TIFF of so many pages of 4 x 4 pixels; the last leads to page `after_the_last`, if that is not 0."""
-    tags = (256, 4, 4), (257, 4, 4), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1), (278, 4, 4)
-    body = struct.pack("<H", 9) + b"".join(struct.pack("<HHII", t, kind, 1, v) for t, kind, v in (*tags, (279, 4, 32)))
-    places = [40 + (len(body) + 4) * k for k in range(n)]
-    following = [*places[1:], places[after_the_last] if after_the_last else 0]
-    return b"II*\0" + struct.pack("<I", 40) + bytes(32) + b"".join(body + struct.pack("<I", at) for at in following)
-
-
-def test_pages_without_end_and_images_without_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiff, "_MOST_PAGES", 50)
-    path = tmp_path / "s.tif"
-    path.write_bytes(_pages(50))
-    with open_scan(path) as source:
-        assert source.image_key.size == 50
-    for content in (_pages(51), _pages(20, 5)):
-        path.write_bytes(content)
-        with pytest.raises(DataError, match="more than 50 pages"):
-            open_scan(path)
-        with pytest.raises(DataError, match="more than 50 pages"):
-            read_volume(path)
-    huge = _pages(1)
-    for tag in (257, 278):
-        huge = huge.replace(struct.pack("<HHII", tag, 4, 1, 4), struct.pack("<HHII", tag, 4, 1, 2**31 - 1))
-    path.write_bytes(huge)
-    with pytest.raises(DataError, match=r"claims 17\.2 GB in 154 bytes"):
-        open_scan(path)
-
-
-def test_a_zip_whose_image_is_blank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(structure, "_LARGE", 10**6)
-    with zipfile.ZipFile(tmp_path / "s.zip", "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("p_0.tif", bytes(2 * 10**6))
-    with pytest.raises(DataError, match="nearly equal values"):
-        open_scan(tmp_path / "s.zip")

@@ -159,6 +159,6 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
 
 
 def in_even_steps(ascending: NDArray[Any]) -> bool:
-    """Whether the steps of all numbers but a few are alike; some images may be lost."""
+    """Whether the steps of all numbers but a few are equal; some images may be lost."""
     steps = np.diff(ascending)
     return bool(steps.all() and np.mean(np.abs(steps - np.median(steps)) < _ALIKE * np.median(steps)) > _EVEN)
