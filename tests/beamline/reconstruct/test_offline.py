@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
@@ -166,23 +166,6 @@ def test_scale_unknown_means_pixels_and_a_given_one_wins(tmp_path: Path) -> None
         _options(tmp_path, selection=Selection(pixel_size_mm=0.25), target=OutputPaths(tmp_path / "b.h5", None))
     )
     assert (given.length_unit, given.volume.grid.voxel_size) == ("mm", 0.25)
-
-
-@pytest.mark.parametrize(
-    ("changes", "error", "said"),
-    [
-        ({"source": SourceOptions(Path("missing.h5"))}, DataError, "missing.h5"),
-        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
-        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"target": OutputPaths(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
-        ({"quality": "best"}, ConfigError, "r2, r2-published"),  # which FBP would ignore
-        ({**FIT, "device": "abacus"}, ConfigError, "--device abacus"),
-    ],
-)
-def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
-        _made(_options(tmp_path, **changes))
-    assert _names(tmp_path) == {"scan.h5"}
 
 
 @pytest.mark.parametrize("existing", ["out.h5", "out.html"])
