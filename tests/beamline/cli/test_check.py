@@ -48,14 +48,3 @@ def test_violations() -> None:
     event = json.loads(line)
     assert (event["event"], event["exit_code"]) == ("failed", 2)
     assert "period_s 0.02" in event["message"]
-
-
-def test_configuration_faults(tmp_path: Path) -> None:
-    path = tmp_path / "my.yaml"
-    path.write_text(Path(DEMO).read_text(encoding="utf-8").replace("period_s", "perod_s"), encoding="utf-8")
-    result = run(str(path))
-    assert result.exit_code == 2
-    assert f"{path}:7: scan.perod_s is not a known key (did you mean period_s?)" in result.stderr
-    assert result.stdout == ""
-    event = json.loads(run(str(path), "--json").stdout)
-    assert (event["event"], event["exit_code"]) == ("failed", 2)

@@ -56,16 +56,3 @@ def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
         assert ours.quantity == "counts"
         np.testing.assert_array_equal(ours.angles[4:], np.radians(np.degrees(SCAN.angles)))
         assert ours.read([0, 2]).mean(axis=(1, 2)).tolist() == [DARK, DARK + BEAM]
-
-
-@pytest.mark.parametrize("command", ["info", "validate", "monitor", "recon"])
-def test_what_is_wrong_is_said_in_a_line(foreign: Path, command: str) -> None:
-    for arguments, said in (
-        ((), "/p/a (30 x 2 x 40)"),
-        (NAMES, "--angles-unit"),
-        ((*LAYOUT, "--data-path", "/p/b"), "has no dataset /p/b. It has /p/a (30 x 2 x 40)"),
-    ):
-        result = beamline(command, "f.h5", *arguments)
-        assert result.exit_code == 5, result.output
-        assert said in result.output  # validate lists what it finds on stdout
-        assert result.stderr.count("\n") == 1, result.stderr

@@ -126,17 +126,6 @@ def test_several_frames_a_view_are_of_a_step_scan_that_takes_none_again(tmp_path
         load(path, "scan.mode=step", "scan.frames_per_view=3", "monitor.retake=true")
 
 
-def test_angles_that_cannot_be_had(tmp_path: Path) -> None:
-    path = write(tmp_path)
-    with pytest.raises(ConfigError, match=r"scan\.angles: 12"):
-        config.plan_of(load(path, "scan.angles={scheme: interlaced, views: 12, passes: 5}"))
-    with pytest.raises(ConfigError, match=r"absent\.txt"):
-        config.plan_of(load(path, "scan.angles={scheme: file, path: absent.txt}"))
-    (tmp_path / "bad.txt").write_text("0\nx\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"bad\.txt: line 2 holds 'x'"):
-        config.plan_of(load(path, f"scan.angles={{scheme: file, path: '{tmp_path.as_posix()}/bad.txt'}}"))
-
-
 def test_scenes_inline_beside_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed = tmp_path / "installed"
     (installed / "scenes").mkdir(parents=True)

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,7 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.config import load as config
 from beamline.core.quantities import RANGES, doubt, is_impossible, range_of
-from beamline.projections import prepare
-from beamline.projections.selection import Selection
 from beamline.scan.preflight import doubts
-from tests.beamline.array_source import ArraySource
 
 
 def numbers_of(schema: Mapping[str, Any]) -> set[str]:
@@ -112,13 +108,3 @@ def test_check_tells_a_slip(tmp_path: Path, settings: list[str], said: str, code
     done = CliRunner().invoke(main, ["check", str(config.config_folder() / "demo.yaml"), *words])
     assert re.search(said, done.stderr), done.stderr
     assert done.exit_code == code
-
-
-def test_a_reconstruction_warns() -> None:
-    scan = ArraySource(np.ones((12, 8, 8), np.float32), [0] * 12, np.linspace(0, np.pi, 12, endpoint=False))
-    scan.quantity = "line_integrals"
-
-    told: list[str] = []
-    prepare._warn_of_units(scan, replace(Selection(), pixel_size_mm=3e-6), told.append)  # type: ignore[arg-type]
-    (sentence,) = told
-    assert "3 um (0.003 mm)" in sentence

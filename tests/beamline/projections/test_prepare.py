@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import recon
-from beamline.core.errors import DataError
 from beamline.projections import axis as axis_module
 from beamline.projections.corrections.air import Air
 from beamline.projections.selection import Selection
@@ -164,30 +163,6 @@ def test_line_integrals_pass_as_they_are(tmp_path: Path) -> None:
     assert prepared.projections.data[3, 1, 20] in (data[3, 0, 20], data[3, 2, 20], left, right)
     data[3, 1, 20] = prepared.projections.data[3, 1, 20]
     np.testing.assert_array_equal(prepared.projections.data, data)
-
-
-_SHAPE = (45, 4, 40)
-BAD_SCANS = {
-    "no flats": ({"data_white": None}, "flats"),
-    "no darks": ({"data_dark": None}, "darks"),
-    "no beam": ({"data_white": np.full((2, 4, 40), DARK, np.uint16)}, "beam"),
-    "one view": ({"data": np.full((1, 4, 40), 9000, np.uint16), "theta": np.zeros(1)}, "at least 2"),
-    "one angle": ({"theta": np.zeros(45)}, "0 degrees"),
-    "angles not known": ({"theta": np.full(45, np.nan)}, "--angles"),
-    "all NaN": ({"data": np.full(_SHAPE, np.nan, np.float32)}, "finite"),
-    "unknown": ({"data_white": None, "data_dark": None}, "--quantity counts, --quantity"),
-    "flat of another shape": ({"data_white": np.full((2, 4, 30), 9000, np.uint16)}, "shape"),
-    "too few angles": ({"theta": np.zeros(3)}, "3 angles"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_SCANS)
-def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
-    changes, said = BAD_SCANS[case]
-    path = write_exchange(tmp_path / "scan.h5", SCAN, changes)
-    quantity = "counts" if case in ("no flats", "no darks") else None
-    with pytest.raises(DataError, match=said):
-        prepare(path, Selection(), quantity=quantity)
 
 
 def _estimate(value: float, confident: bool) -> AxisEstimate:

@@ -128,14 +128,6 @@ def test_a_dark_that_was_never_written_is_left_out() -> None:
     assert line.startswith("The darks 0: every pixel is 0") and found > clean(1, 3) - 0.1
 
 
-def test_darks_and_flats_swapped_are_refused() -> None:
-    blocks = Blocks(1, 3)
-    dark, flat = blocks.of(DARK)[0], blocks.of(FLAT)[0]
-    dark[:], flat[:] = flat.copy(), dark.copy()
-    with pytest.raises(DataError, match="flats 3-5:"):
-        decibels(blocks.source())
-
-
 @pytest.mark.parametrize("scale", [0.05, 1.0])
 @pytest.mark.parametrize("drift", [0.05, 0.15])
 def test_a_beam_that_drifts_is_no_sample_in_the_flats(scale: float, drift: float) -> None:

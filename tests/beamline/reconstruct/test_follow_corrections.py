@@ -208,4 +208,4 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
     warned = [event.data["message"] for event in events if event.event == "warning"]
     assert sum("resumes a run" in said and "not stopped early" in said for said in warned) == 1
-    assert not any("flats of their own" in said or "parts of a scan" in said for said in warned)
+    assert not any("no usable flats" in said or "parts of a scan" in said for said in warned)

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
@@ -168,6 +168,7 @@ def test_scale_unknown_means_pixels_and_a_given_one_wins(tmp_path: Path) -> None
     assert (given.length_unit, given.volume.grid.voxel_size) == ("mm", 0.25)
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
@@ -184,6 +185,8 @@ def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], erro
     assert _names(tmp_path) == {"scan.h5"}
 
 
+=======
+>>>>>>> w_tests2
 @pytest.mark.parametrize("existing", ["out.h5", "out.html"])
 def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> None:
     (tmp_path / existing).write_text("precious")

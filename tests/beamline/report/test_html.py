@@ -61,16 +61,6 @@ def test_the_live_picture_is_a_link_where_there_is_one() -> None:
     assert links(_report(live_picture="a #1.live.png")) == ["a%20%231.live.png"]
 
 
-def test_contents_lead_to_what_is_folded() -> None:
-    shown = [Picture(title, "what it shows", b"\x89PNG fake") for title in ("Slices", "Sinogram")]
-    parsed = parsed_page(to_html(_report(pictures=shown, flags=["beam low"])))
-    links = [(attrs["href"] or "")[1:] for tag, attrs in parsed.seen if tag == "a"]
-    assert links == ["remarks", "picture1", "scan", "settings", "repeat"]
-    assert set(links) <= {attrs.get("id") for _, attrs in parsed.seen}
-    tags = [tag for tag, _ in parsed.seen]
-    assert tags.index("img") < tags.index("table") < tags.index("details")  # slices and figures of merit are not folded
-
-
 def test_metrics_stand_in_their_method_column() -> None:
     page = to_html(_report())
     row = re.search(r'<tr><th scope="row">PSNR.*?</tr>', page)

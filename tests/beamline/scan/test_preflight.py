@@ -17,7 +17,7 @@ from beamline.scan.preflight import disk_of, dry_run, refuse_violations
 from beamline.scan.run import run_scan
 from tests.beamline.ball_scan import shipped
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import SMALL, Ran, small
+from tests.beamline.ran import SMALL, small
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -75,15 +75,6 @@ def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    ran = Ran(tmp_path / "runs", FakeInstrument(), "scan.period_s=0.021")
-    assert isinstance(ran.error, ConfigError)
-    assert "nothing was started" in str(ran.error)
-    assert not (tmp_path / "runs").exists()
-    assert ran.instrument.log == []
-    assert ran.events == []
 
 
 @pytest.mark.parametrize("preview_bin", [1, 3])

@@ -154,24 +154,6 @@ def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_ke
     assert Path("out/scan/recon.h5").is_file()
 
 
-@pytest.mark.usefixtures("in_this_process")
-@pytest.mark.parametrize(
-    ("recipe", "sentence"),
-    [
-        ("axis: try:19:20:0.5", "beamline sweep FILE axis=19:20:0.5"),
-        ("method: fbp\niterations: 5", "--iterations is of fista-tv, os-sirt-tv, pnp-dct, sirt"),
-        ("method: fpb", "did you mean fbp?"),
-        ("methd: fbp", "did you mean method?"),
-        ("method: r2\nset: fit.magic=1", "'fit.magic' is unknown"),
-    ],
-)
-def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sentence: str) -> None:
-    Path("recipe.yaml").write_text(recipe + "\n")
-    result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
-    assert result.exit_code == 2 and sentence in result.output and " batch [OPTIONS] SCANS" in result.output
-    assert not (folder / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("paths", "names"),
     [

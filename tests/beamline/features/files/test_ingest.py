@@ -117,18 +117,6 @@ def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
     assert left(tmp_path) == {"lab.tif"}
 
 
-@pytest.mark.parametrize(
-    ("angles", "said"),
-    [(None, "the angles of 9 of its 9 projections"), (ANGLES[:4], "4 angles"), (ANGLES * np.nan, "angles")],
-)
-def test_projections_need_angles(
-    stack: tuple[Path, np.ndarray], tmp_path: Path, angles: np.ndarray | None, said: str
-) -> None:
-    with pytest.raises(DataError, match=said):
-        ingest(SourceOptions(stack[0], angles=angles), tmp_path / "out.h5")
-    assert left(tmp_path) == {"lab.tif"}
-
-
 def test_memory_does_not_grow_with_the_stack(tmp_path: Path, rng: np.random.Generator) -> None:
     page = rng.normal(size=(256, 256)).astype(np.float32)
     peaks = []

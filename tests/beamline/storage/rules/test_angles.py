@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
-from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, angles_stand, coarse_views
+from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, coarse_views
 from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
@@ -128,36 +128,3 @@ ORDERS = [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, tur
 )
 def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: NDArray[np.float64]) -> None:
     assert ordered(scan(balls, true, true)) == []
-
-
-@pytest.mark.parametrize("balls", [WITHIN, WIDER], ids=["within", "wider"])
-@pytest.mark.parametrize(
-    ("true", "stated"),
-    [
-        (np.roll(EVEN, 32), EVEN),
-        (np.roll(EVEN, 3), EVEN),
-        (GOLDEN % 360, GOLDEN % 180),
-    ],
-    ids=["halves exchanged", "from the fourth on", "golden, modulo half a turn"],
-)
-def test_neighbours_that_are_mirror_images_are_named(
-    balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64]
-) -> None:
-    (hit,) = ordered(scan(balls, true, stated))
-    assert hit.severity == "warning" and "are mirror images" in hit.message
-
-
-@pytest.mark.parametrize("stands", [4, 8, 12])
-def test_a_read_back_that_stands_while_the_stage_turns(stands: int) -> None:
-    true = turn(180, 120)
-    source = scan(WITHIN, true, np.repeat(true[::stands], stands))
-    (finding,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
-    assert (
-        f"Angles stand for {stands} frames each, which differ (frames 8 and {7 + stands}, both stated at 0"
-        in finding.message
-    )
-    assert "--angles FILE" in finding.message
-    assert f"--frames 0::{stands} takes" in finding.message
-    source.angles[source.image_key == 0] = np.concatenate([true[:1], np.repeat(true[1::stands], stands)])[:120]
-    (uneven,) = angles_stand(coarse_views(source))  # type: ignore[arg-type]
-    assert "--angles FILE" in uneven.message and "--frames" not in uneven.message

@@ -7,8 +7,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections.selection import Selection
-from beamline.storage.rules.light import BRIGHTER, WARN, views_scaled
-from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.array_source import scan_of
 from tests.beamline.prepared_views import prepare
 
 ANGLES, SHAPE, LIGHT = np.linspace(0, np.pi, 45, endpoint=False), (24, 64), 3000.0
@@ -55,38 +54,8 @@ def test_transmission_in_whole_numbers_that_is_clipped_at_all_light_does_not_end
     assert "counts end" not in told(0 * full, full, 65535 * through.clip(0, 1))
 
 
-@pytest.mark.parametrize("level", [1 - 0.9 * (1 - np.exp(-WARN)), np.exp(0.9 * BRIGHTER)])
-def test_a_beam_that_drifts_is_not_told_of(level: float) -> None:
-    darks, flats, views = counts(20.0)
-    rng = np.random.default_rng(2)
-    assert "as the flats" not in told(darks, flats, rng.poisson((views - 100) * level) + 100)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_views_that_were_scaled_each_by_itself(dtype: type) -> None:
-    _, _, views = counts(20.0)
-    low, high = views.min((1, 2), keepdims=True), views.max((1, 2), keepdims=True)
-    whole = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
-    scaled = ((views - low) / (high - low) * whole).round(5 if whole == 1 else 0).astype(dtype)
-    (finding,) = views_scaled(ArraySource(scaled, [0] * len(scaled), ANGLES))  # type: ignore[arg-type]
-    assert finding.severity == "error"
-    assert "scaled by itself" in finding.message
-    one_scale = (views / views.max() * whole).astype(dtype)
-    assert not list(views_scaled(ArraySource(one_scale, [0] * len(one_scale), ANGLES)))  # type: ignore[arg-type]
-
-
 def test_whole_numbers_that_stand_for_transmission() -> None:
     """A full scale of 16 bits for all light, as documented, is written and not saturated."""
     full = np.full((1, *SHAPE), 65535.0)
     said = told(0 * full, full, 65535 * np.exp(-lines(20.0)))
     assert said == ""
-
-
-def test_a_beam_that_flickers_or_drifts_has_no_lights_in_turn() -> None:
-    darks, flats, views = counts(20.0)
-    for factors in (
-        np.linspace(1, 0.8, 45),
-        np.where(np.arange(45) < 20, 1, 0.7),
-        1 - 0.3 * np.random.default_rng(2).random(45),
-    ):
-        assert "in turn" not in told(darks, flats, 100 + (views - 100) * factors[:, None, None])

@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamline.core.text import spans
 from beamline.features.files.validate import describe, source_findings, validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
@@ -53,37 +52,6 @@ def angles_told(scan: SourceOptions) -> list[Finding]:
 
 def test_a_good_scan_has_no_finding(path: Path) -> None:
     assert validate(path) == []
-
-
-@pytest.mark.parametrize("level", [0, 100])
-def test_darks_of_one_number_are_named(tmp_path: Path, level: int) -> None:
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        for name, n in (("data", 4), ("data_white", 3), ("data_dark", 3)):
-            file[f"exchange/{name}"] = np.random.default_rng(n).integers(900, 999, (n, 8, 9)).astype(np.uint16)
-        file["exchange/theta"] = np.arange(4) * 45.0
-    with h5py.File(tmp_path / "s.h5", "a") as file:
-        file["exchange/data_dark"][:, :, :8] = level
-    assert "The darks are" not in "; ".join(describe(tmp_path / "s.h5")["findings"])
-    with h5py.File(tmp_path / "s.h5", "a") as file:
-        file["exchange/data_dark"][:] = level
-    assert f"The darks are {level} in every pixel" in "; ".join(describe(tmp_path / "s.h5")["findings"])
-
-
-def test_exposures_that_do_not_go_together_are_told(write: Write, frames: list[Frame]) -> None:
-    def told(seconds: dict[FrameKind, float], last: float = 0.05) -> list[str]:
-        changed = [replace(frame, exposure=seconds.get(frame.kind, 0.05)) for frame in frames]
-        changed[-1] = replace(changed[-1], exposure=last)
-        path = write(changed)
-        said = [finding.message for finding in validate(path) if finding.rule == "exposures"]
-        path.unlink()
-        return said
-
-    assert told({FrameKind.FLAT: 0.01}) == []
-    assert told({FrameKind.DARK: 0.05000001}) == []
-    (darks,) = told({FrameKind.DARK: 0.2})
-    assert "darks were exposed for 0.2 s and the projections for 0.05 s" in darks
-    (views,) = told({}, last=0.1)
-    assert "exposed for 0.05 to 0.1 s" in views
 
 
 Spoil = Callable[[h5py.File], None]
@@ -220,24 +188,6 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
     assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
 
 
-@pytest.mark.parametrize(
-    ("theta", "severity", "said"),
-    [
-        (np.arange(0, 180, 3.0), "error", "28.2 turns, or 177 in radians: these look like degrees"),
-        (np.linspace(-90, 90, 61), "error", "28.6 turns, or 180 in radians"),
-        (np.arange(0, 360, 360 / 61), "error", "under a label of radians"),
-        (2.399963229728653 * np.arange(200), "", ""),  # golden angles
-        (np.radians(np.arange(0, 7200, 1.8)), "", ""),  # twenty turns
-        (np.linspace(0, 1.8e4, 60), "error", "up to 1.03e+06 degrees; expected at most 1e+06"),
-        (np.linspace(0, 1e300, 60), "error", "Are their units right"),
-    ],
-)
-def test_radians_that_are_degrees(tmp_path: Path, theta: np.ndarray, severity: str, said: str) -> None:
-    hits = angles_told(SourceOptions(with_theta(tmp_path, theta, "rad")))
-    assert [hit.severity for hit in hits] == [severity] * bool(severity)
-    assert not hits or said in hits[0].message
-
-
 DEGREES = np.arange(0, 180, 2.0)
 
 
@@ -262,11 +212,6 @@ def test_angles_that_cannot_be_degrees(tmp_path: Path, theta: np.ndarray, said: 
     path = with_theta(tmp_path, np.full(theta.size, np.nan))
     (hit,) = angles_told(SourceOptions(path, angles=tmp_path / "a.txt"))
     assert hit.severity == "error" and said in hit.message and "--angles FILE" in hit.message
-
-
-def test_angles_that_count_the_frames_are_doubted(tmp_path: Path) -> None:
-    (hit,) = angles_told(SourceOptions(with_theta(tmp_path, np.arange(90.0), "deg")))
-    assert hit.severity == "warning" and "do they count the frames?" in hit.message
 
 
 @settings(max_examples=60, deadline=None)
@@ -397,19 +342,3 @@ def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantit
             np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], frames[-1])
     with open_scan(replace(upright, cols=(5, 30))) as source:
         np.testing.assert_array_equal(source.read(views[:2], slice(2, 4)), frames[:2, 2:4, 5:30])
-
-
-@pytest.mark.parametrize("unlit", [[8], [5, 6, 7]])
-def test_views_without_light_are_named(tmp_path: Path, unlit: list[int]) -> None:
-    rng = np.random.default_rng(2)
-    counts = np.concatenate([np.full((2, 8, 24), 100.0), np.full((2, 8, 24), 5e3), np.full((16, 8, 24), 3e3)])
-    frames = rng.poisson(counts).astype(np.uint16)
-    frames[[4 + view for view in unlit]] = 0
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        for name, part in (("data_dark", frames[:2]), ("data_white", frames[2:4]), ("data", frames[4:])):
-            file[f"exchange/{name}"] = part
-        file["exchange/theta"] = np.arange(16) * 11.25
-    (hit,) = [hit for hit in validate(tmp_path / "s.h5") if hit.rule == "unlit"]
-    rows = spans([4 + view for view in unlit])
-    assert hit.severity == "warning"
-    assert f"{len(unlit)} of 16 views looked at (frames {rows}) have no light" in hit.message
