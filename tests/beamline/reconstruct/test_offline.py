@@ -168,25 +168,6 @@ def test_scale_unknown_means_pixels_and_a_given_one_wins(tmp_path: Path) -> None
     assert (given.length_unit, given.volume.grid.voxel_size) == ("mm", 0.25)
 
 
-<<<<<<< HEAD
-@pytest.mark.parametrize(
-    ("changes", "error", "said"),
-    [
-        ({"source": SourceOptions(Path("missing.h5"))}, DataError, "missing.h5"),
-        ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
-        ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
-        ({"target": OutputPaths(Path("no/such/folder/out.h5"), None)}, DataError, "does not exist"),
-        ({**FIT, "device": "abacus"}, ConfigError, "--device abacus"),
-    ],
-)
-def test_failures_leave_nothing(tmp_path: Path, changes: dict[str, object], error: type[Exception], said: str) -> None:
-    with pytest.raises(error, match=said):
-        _made(_options(tmp_path, **changes))
-    assert _names(tmp_path) == {"scan.h5"}
-
-
-=======
->>>>>>> w_tests2
 @pytest.mark.parametrize("existing", ["out.h5", "out.html"])
 def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> None:
     (tmp_path / existing).write_text("precious")

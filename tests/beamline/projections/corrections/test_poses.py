@@ -140,7 +140,6 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path
     np.savez(tmp_path / "others.npz", vectors=cone)
     with pytest.raises(ValueError, match=r"parallel3d_vec and cone_vec"):
         read_poses(str(tmp_path / "others.npz"))
-<<<<<<< HEAD
     np.savez(tmp_path / "complex.npz", parallel3d_vec=cone * 1j)
     with pytest.raises(ValueError, match=r"complex\.npz: parallel3d_vec is complex128.*; expected numbers"):
         read_poses(str(tmp_path / "complex.npz"))
@@ -150,8 +149,6 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path
     (tmp_path / "damaged.npz").write_bytes(damaged)
     with pytest.raises(ValueError, match=r"damaged\.npz"):
         read_poses(str(tmp_path / "damaged.npz"))
-=======
->>>>>>> w_tests2
 
 
 def shadow_of_pixels(views: Geometry, n: int) -> np.ndarray:
@@ -214,7 +211,6 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
     ("text", "match"),
     [
         ("", "first line is ''"),
-<<<<<<< HEAD
         ("view,x\n0,1\n", "first line is 'view,x'"),
         ("view,shift_col_px\n", "header and no rows"),
         ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
@@ -227,15 +223,6 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
         ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
         ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected whole numbers"),
         ("angle_deg,roll_deg\ninf,1\n", r"angle_deg holds \[inf\]; expected finite angles"),
-=======
-        ("view,shift_col_px\n", "has 0 rows of poses"),
-        ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
-        ("view,shift_col_px,shift_col_px\n0,1,2\n", "there twice"),
-        ("view,shift_col_px\n0,a\n", "'0,a' are not 2 numbers"),
-        ("view,shift_col_px\n0,nan\n", "expected finite numbers"),
-        ("view,shift_col_px\n0,1\n0,2\n", "view 0 has 2 rows"),
-        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
->>>>>>> w_tests2
         ("view,tilt_deg\n3,86\n", "view 3 has a roll of 0 and a tilt of 86 degrees"),
     ],
 )
