@@ -85,9 +85,8 @@ def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
     n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
     if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
         return
-    chunk = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else ()
-    piece, stored = math.prod(chunk) * dataset.dtype.itemsize, dataset.get_storage_size()
-    if n > PACKED * stored or is_blank(n, stored, piece):
+    stored = dataset.get_storage_size()
+    if n > PACKED * stored:
         raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
@@ -109,18 +108,8 @@ def plain_name(written: str) -> str:
 
 PACKED = 1e5
 """No file of images holds so many times its own size: zeros come to 1000 times (deflate), and 20 000 (Zstandard)."""
-_BLANK, _LARGE = 500, 2**28
 _REAL = re.compile(r"[<>=|]?(u1|i1|[uif][248])|u?int(8|16|32|64)|float(16|32|64)")
 _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far beyond any volume
-
-
-def is_blank(unpacked: int, stored: int, piece: int) -> bool:
-    """Whether so many bytes of images, of which a large piece is unpacked at once, take less than a 500th of them.
-
-    Shot noise of one count in a hundred pixels takes 0.08 of their 16 bits, a 200th: what is packed closer than that
-    holds no image, and may be made to fill the memory.
-    """
-    return piece > _LARGE and unpacked > _BLANK * stored
 
 
 def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:

@@ -20,7 +20,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 from beamline.storage.hdf5 import ALTERED
 from beamline.storage.readers.base import NotUsed
-from beamline.storage.structure import PACKED, is_blank
+from beamline.storage.structure import PACKED
 
 _MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
@@ -137,7 +137,7 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
         raise ValueError(f"it has more than {_MOST_PAGES} pages")
     first, stored = tif.pages.first, tif.filehandle.size
     claimed = first.nbytes * len(tif.pages)
-    if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
+    if not first.nbytes or claimed > min(most, PACKED * stored):
         raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
 
 

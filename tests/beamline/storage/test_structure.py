@@ -185,11 +185,3 @@ def test_pages_without_end_and_images_without_pixels(tmp_path: Path, monkeypatch
     path.write_bytes(huge)
     with pytest.raises(DataError, match=r"claims 17\.2 GB in 154 bytes"):
         open_scan(path)
-
-
-def test_a_zip_whose_image_is_blank(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(structure, "_LARGE", 10**6)
-    with zipfile.ZipFile(tmp_path / "s.zip", "w", zipfile.ZIP_DEFLATED) as packed:
-        packed.writestr("p_0.tif", bytes(2 * 10**6))
-    with pytest.raises(DataError, match="all alike"):
-        open_scan(tmp_path / "s.zip")
