@@ -117,7 +117,6 @@ def _watched(
     request: MonitorRequest, checks: Sequence[Check], limits: ReferenceLimits | None, sink: Sink, clock: Clock
 ) -> _Watched:
     """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
-    from beamline.projections.flagged_frames import worst_frames
     from beamline.projections.replay import replay, verdict
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
@@ -140,6 +139,8 @@ def _watched(
         summed = verdict(source, frames, limits)
         ended = [finding.message for finding in scan_ended(source)]
         if request.sheet is not None:
+            from beamline.reconstruct.scan_facts import worst_frames
+
             worst = worst_frames(source, FrameFlags.of_flags([judged.flags for judged in frames]))
             if worst:
                 from beamline.report.sheets import contact_sheet

@@ -24,7 +24,7 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, config_option, heading
 from beamline.cli.selection_options import selection_options
-from beamline.storage.volumes.registry import suffixes_text
+from beamline.storage.volumes import suffixes_text
 from recon.base.choices import AUTO
 from recon.base.registry import in_folders
 from recon.methods import names

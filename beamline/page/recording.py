@@ -104,10 +104,7 @@ class Recording:
             for i, check in enumerate(frame_flags.legend):
                 if not bits >> check.bit & 1:
                     continue
-                score = float(frame_flags.scores[frame, i]) if frame_flags.scores is not None else np.nan
-                region = (
-                    [int(edge) for edge in frame_flags.regions[frame, i]] if frame_flags.regions is not None else [-1]
-                )
+                score, region = float(frame_flags.scores[frame, i]), frame_flags.regions[frame, i].tolist()
                 listed.append(
                     {
                         "frame": int(frame),

@@ -260,11 +260,9 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
         return 0.0
     triggers = [retake.trigger for retake in spread_retakes([Retake(i, i) for i in range(views.n)], plan.retakes)]
     block = retake_block(views, np.array(triggers, np.int64))
-    return block_seconds(block, stage, camera, plan.settle) + _return(views, stage)
-
-
-def _return(last: Block, stage: StageLimits) -> float:
-    return move_seconds(_end(last), stage.max_speed, stage.acceleration)
+    return block_seconds(block, stage, camera, plan.settle) + move_seconds(
+        _end(views), stage.max_speed, stage.acceleration
+    )
 
 
 def _end(block: Block) -> float:

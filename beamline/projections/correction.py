@@ -22,8 +22,8 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import ViewLight
 from beamline.storage.rules.scan import altered_sentence
-from beamline.storage.rules.unlit import ViewLight
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons

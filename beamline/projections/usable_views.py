@@ -161,8 +161,6 @@ def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
     """The regions of warnings and alarms in frames of this shape; rays in an alarm region have weight 0."""
     from beamline.storage.rules.treatment import boxes_of, flagged_in_part
 
-    if flags.regions is None:
-        return Regions(local=np.zeros(flags.bits.size, np.bool_))
     boxes = [
         (frame, box, 0.0 if flags.bits[frame] >> entry.alarm_bit & 1 else WARNED_SHARE)
         for i, entry in enumerate(flags.legend)

@@ -329,10 +329,6 @@ def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_]
     return np.asarray(lit.any(axis=1))
 
 
-def _wants_fbp(volume: MeasuredVolume) -> bool:
-    return volume.fitted and volume.target.report is not None and has_direct_method(volume.prepared.geometry)
-
-
 _CHECKS = (
     _Check(_sample_radius, lambda volume: SAMPLE in volume.made.settings),
     _Check(_residual),
@@ -349,7 +345,14 @@ _CHECKS = (
         "the look for views that do not fit the volume",
         lambda volume: 1.5,
     ),
-    _Check(_fbp, _wants_fbp, "FBP for comparison", lambda volume: 2.5),
+    _Check(
+        _fbp,
+        lambda volume: (
+            volume.fitted and volume.target.report is not None and has_direct_method(volume.prepared.geometry)
+        ),
+        "FBP for comparison",
+        lambda volume: 2.5,
+    ),
     _Check(_contrast),
     _Check(_air),
     _Check(_lost_matter, lambda volume: volume.fitted and BASELINE in volume.volumes),

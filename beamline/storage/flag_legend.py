@@ -84,14 +84,14 @@ class FrameFlags:
     Attributes:
         bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
-        scores: [frame, check] as in `Mark`; None of frames that no monitor looked at.
+        scores: [frame, check] as in `Mark`.
         regions: [frame, check, 4], likewise.
     """
 
     bits: NDArray[np.uint64]
     legend: tuple[FlagBit, ...]
-    scores: NDArray[np.float32] | None = None
-    regions: NDArray[np.int32] | None = None
+    scores: NDArray[np.float32]
+    regions: NDArray[np.int32]
 
     @classmethod
     def of_marks(cls, marks: Sequence[Mark]) -> FrameFlags:
@@ -107,7 +107,6 @@ class FrameFlags:
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
         """Marks [row] of the frames of a file with these flags; a flag for earlier rows marks these, too."""
         flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
-        assert flags.scores is not None and flags.regions is not None
         for flag in chain.from_iterable(found):
             rows, at = flag.frames, place_of(flag)
             flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
@@ -125,8 +124,7 @@ class FrameFlags:
             if (at := _PLACES.get(entry.name)) is None or not row >> entry.bit & 1:
                 continue
             bits |= 1 << TODAY[at].bit | (row >> entry.alarm_bit & 1) << TODAY[at].alarm_bit
-            if self.scores is not None and self.regions is not None:
-                mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
+            mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
@@ -146,18 +144,16 @@ class FrameFlags:
 
     def of(self, frames: NDArray[np.integer] | NDArray[np.bool_]) -> FrameFlags:
         """The flags of some frames."""
-        scores = None if self.scores is None else self.scores[frames]
-        regions = None if self.regions is None else self.regions[frames]
-        return FrameFlags(self.bits[frames], self.legend, scores, regions)
+        return FrameFlags(self.bits[frames], self.legend, self.scores[frames], self.regions[frames])
 
     def of_groups(self, groups: Sequence[Sequence[int]]) -> FrameFlags:
         """The combined flags of the frames of each group: scores farthest from 0, regions as the box around theirs."""
         each = (("bits", np.bitwise_or.reduce), ("scores", _greatest), ("regions", _box_around))
-        columns: dict[str, Any] = {
-            name: np.array([of_group(known[rows]) for rows in groups], known.dtype).reshape(-1, *known.shape[1:])
-            for name, of_group in each
-            if (known := getattr(self, name)) is not None
-        }
+        columns: dict[str, Any] = {}
+        for name, of_group in each:
+            known = getattr(self, name)
+            columns[name] = np.array([of_group(known[rows]) for rows in groups], known.dtype)
+            columns[name] = columns[name].reshape(-1, *known.shape[1:])
         return replace(self, **columns)
 
     @classmethod
@@ -175,9 +171,10 @@ class FrameFlags:
             blank = np.full((n, len(legend)), np.nan, np.float32), np.full((n, len(legend), 4), -1, np.int32)
             own = cls(np.zeros(n, np.uint64), legend, *blank) if flags is None else flags
             parts.append(own if own.legend == legend else own.of_today())
-        bits, *others = ([getattr(part, name) for part in parts] for name in ("bits", "scores", "regions"))
-        whole = all(column is not None for other in others for column in other)
-        return cls(np.concatenate(bits), legend, *(map(np.concatenate, others) if whole else ()))
+        bits, scores, regions = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("bits", "scores", "regions")
+        )
+        return cls(bits, legend, scores, regions)
 
     def without(self, bit: int) -> FrameFlags:
         """The flags without those of one check."""

@@ -108,10 +108,6 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats) -> Ax
     return AxisEstimate(value, candidates, curve, confident, "opposite views")
 
 
-def _opposite_candidates(cols: int) -> Floats:
-    return np.arange(2 * cols // _EDGE, 2 * (cols - 1) - 2 * cols // _EDGE) / 2
-
-
 def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
     """Slopes along the columns [pair, row, col - 1] of some rows of views, and of opposite views, negated."""
     first, opposite = _opposite_pairs(np.asarray(angles, np.float64), projections.shape[2])
@@ -207,7 +203,8 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
         ValueError: see `axis_from_opposites`.
     """
     a, b = _opposites(data, theta)
-    candidates = _opposite_candidates(data.shape[2])
+    cols = data.shape[2]
+    candidates = np.arange(2 * cols // _EDGE, 2 * (cols - 1) - 2 * cols // _EDGE) / 2
     rows = range(data.shape[1])
     return candidates, np.stack([mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
 

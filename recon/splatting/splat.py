@@ -44,7 +44,8 @@ def project(
     g = turned_by_rows(gaussians, chosen, -1)
     chosen = chosen.at_row(0)
     cut = truncation or Truncation()
-    return Project.apply(*_raw(g), chosen, (_faint(cut, g, chosen), cut.sigmas, model or RayModel()))
+    faint = cut.faint * g.density_unit * chosen.sample_pitch * chosen.detector_shape[1]  # line integral of a cut
+    return Project.apply(*_raw(g), chosen, (faint, cut.sigmas, model or RayModel()))
 
 
 def voxelize(gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None) -> Tensor:
@@ -87,8 +88,3 @@ def _raw(g: Gaussians) -> tuple[Any, ...]:
     device = g.means.device
     backend = backend_for("cpu" if device.type == "cpu" else str(device))
     return g.means, g.log_scales, g.quaternions, g.raw_densities, Renderer(g.density_unit, g.kernel, backend)
-
-
-def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
-    """Line integral below which a footprint is cut off."""
-    return truncation.faint * gaussians.density_unit * geometry.sample_pitch * geometry.detector_shape[1]

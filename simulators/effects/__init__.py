@@ -1,1 +1,39 @@
 """Effects: one departure from Beer-Lambert a file; a scene computes only those that it names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Domain(IntEnum):
+    """The quantity that an effect acts on, in the order of physics."""
+
+    MOTION = 0
+    OPTICAL_DEPTH = 1
+    PHOTONS = 2
+    ELECTRONS = 3
+    COUNTS = 4
+
+    @property
+    def words(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True)
+class EffectRow:
+    """An effect of the catalogue.
+
+    Attributes:
+        domain: what it acts on.
+        summary: what happens, in half a sentence.
+        follows: effects of the same domain that must come before it, because another order changes the frame.
+        reason: why they come before it.
+        module: with its class, which has its name in capitals: PhotonNoise for photon_noise.
+    """
+
+    domain: Domain
+    summary: str
+    follows: frozenset[str] = frozenset()
+    reason: str = ""
+    module: str = ""

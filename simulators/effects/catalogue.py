@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from recon.base.registry import Registry, in_folders
-from simulators.effects.domain import Domain, EffectRow
+from simulators.effects import Domain, EffectRow
 
 __all__ = ["CATALOGUE", "FINAL", "Domain", "EffectRow", "load_effect", "order_error"]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from recon.base.jit import njit
 from simulators.frame.shot import CannotExposeError
 from simulators.pixels.bands import share_rows
-from simulators.pixels.streams import STEP, begin, mix, normal
+from simulators.pixels.pattern import STEP, begin, mix, normal
 
 LEAST = 2.0
 """Least expectation for the expansion. Below it, a uniform number is looked up in the distribution from 0 up."""

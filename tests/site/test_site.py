@@ -100,7 +100,7 @@ with warnings.catch_warnings(record=True) as told:
     from beamline.monitor.checks import CHECKS
     from beamline.storage.readers.open import SourceOptions, open_scan
     from beamline.storage.volumes.files import opened_volume, write_volume
-    from beamline.storage.volumes.registry import suffixes_text
+    from beamline.storage.volumes import suffixes_text
     from recon import methods
     from simulators.effects.catalogue import CATALOGUE
     from simulators.scenes.scene import load_scene

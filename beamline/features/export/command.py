@@ -26,7 +26,7 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, size
-from beamline.storage.volumes.registry import suffixes_text
+from beamline.storage.volumes import suffixes_text
 from recon.base.views import spread
 
 if TYPE_CHECKING:

@@ -1,7 +1,5 @@
 """Checks for objects beside the sample: fog, and crumbs far from the axis."""
 
-from __future__ import annotations
-
 CHECKS = {
     "FloaterCheck": "beamline.monitor.foreign.floater",
     "GhostCheck": "beamline.monitor.foreign.ghost",

@@ -49,8 +49,8 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
 
     def moved(flags: FrameFlags | None) -> FrameFlags | None:
-        if flags is None or flags.regions is None:
-            return flags
+        if flags is None:
+            return None
         there = flags.regions[..., :1] >= 0  # below 0: no region
         return replace(flags, regions=flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32))
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.references import VIEWS, reference_groups, seen_frame
-from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
+from beamline.storage.rules.references import LEAST, VIEWS, ViewLight, brightness, reference_groups, seen_frame
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.align import mirror_mismatch

@@ -74,8 +74,6 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
 def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
     """Whether each frame [frame] is flagged only in some regions."""
     whole = np.zeros(flags.bits.size, np.bool_)
-    if flags.regions is None:
-        return whole
     for i, entry in enumerate(flags.legend):
         for frame, box in boxes_of(flags, i, entry, shape):
             whole[frame] |= box is None
@@ -90,7 +88,6 @@ def boxes_of(
     A view that a check marked when it had seen later ones has no region in the file. It takes the region to which these
     lead on a straight line.
     """
-    assert flags.regions is not None
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)
     for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
         boxes = flags.regions[run, check].astype(np.float64)

@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from recon.base.registry import Registry, in_folders
+
+if TYPE_CHECKING:
+    from beamline.storage.volumes.base import VolumeFormat
 
 
 @dataclass(frozen=True)
@@ -18,3 +26,42 @@ class FormatEntry:
     cls: str
     suffixes: tuple[str, ...]
     note: str = ""
+
+
+_HERE = "beamline.storage.volumes."
+REGISTRY = {
+    "hdf5": FormatEntry(_HERE + "files", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
+    **in_folders("beamline.storage.volumes", "FORMATS"),
+    "npy": FormatEntry(_HERE + "files", "Npy", (".npy",)),
+    "nrrd": FormatEntry(_HERE + "files", "Nrrd", (".nrrd",)),
+}
+
+
+@cache
+def entries() -> Registry[FormatEntry]:
+    """The formats of this package and of other packages, by name."""
+    taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
+
+    def made(name: str, kind: type[Any]) -> FormatEntry:
+        suffixes = tuple(kind().suffixes)
+        if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
+            raise ValueError(f"its suffixes are {suffixes}; expected such as '.xyz', none of {sorted(taken)}")
+        if getattr(import_module(kind.__module__), kind.__name__, None) is not kind:
+            raise ValueError(f"its class {kind.__qualname__} is not at the top of the module {kind.__module__}")
+        taken.update(suffixes)
+        return FormatEntry(kind.__module__, kind.__name__, suffixes)
+
+    return Registry("volume_format", REGISTRY, made)
+
+
+@cache
+def formats() -> tuple[VolumeFormat, ...]:
+    """Every format in which volumes are written."""
+    return tuple(getattr(import_module(entry.module), entry.cls)() for entry in entries().values())
+
+
+def suffixes_text() -> str:
+    """The usual suffixes, for help."""
+    named = [entry for entry in entries().values() if entry.suffixes[0]]
+    folders = [f"or no suffix: {entry.note}" for entry in entries().values() if not entry.suffixes[0]]
+    return ", ".join([e.suffixes[0] + (f" ({e.note})" if e.note else "") for e in named] + folders)

@@ -24,8 +24,8 @@ from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.volume_file import axes_of, read_volume
+from beamline.storage.volumes import REGISTRY, formats
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, facts_of, marked, record_of
-from beamline.storage.volumes.registry import REGISTRY, formats
 from beamline.storage.writers.recon_file import (
     DEFINITION,
     SUFFIXES,
@@ -144,7 +144,8 @@ class Nrrd:
             f"encoding: raw\n{units}space origin: ({x!r},{y!r},{z!r})\n"
         ).encode("ascii")
         with path.open("xb") as file:
-            file.write(header + _KEY + _escaped(facts) + b"\n\n")
+            escaped = facts.replace("\\", "\\\\")  # JSON has no line ends, which NRRD would escape, too
+            file.write(header + _KEY + escaped.encode("ascii") + b"\n\n")
             for values in slices:
                 file.write(values.data)
 
@@ -158,7 +159,7 @@ class Nrrd:
         notes = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
         kinds = {name.encode(): bits for bits, name in _TYPES.items()}
         try:
-            facts = marked(_unescaped(notes[0])) if len(notes) == 1 else None
+            facts = marked(notes[0].decode("ascii").replace("\\\\", "\\")) if len(notes) == 1 else None
             if facts is None:
                 raise ValueError(f"its field {_KEY.decode()} is not that of this program")
             shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])
@@ -207,15 +208,6 @@ def _header(path: Path) -> tuple[bytes, int]:
         head = file.read(_LONGEST_HEADER)
     end = head.find(b"\n\n")
     return (head[:end], end + 2) if head.startswith(b"NRRD") and end >= 0 else (b"", 0)
-
-
-def _escaped(text: str) -> bytes:
-    """JSON has no line ends; the other thing that NRRD escapes are backslashes."""
-    return text.replace("\\", "\\\\").encode("ascii")
-
-
-def _unescaped(text: bytes) -> str:
-    return text.decode("ascii").replace("\\\\", "\\")
 
 
 def format_of(path: Path) -> VolumeFormat:

@@ -1,7 +1,5 @@
 """Iterative methods that others are compared with: SIRT, SART, CGLS and ASD-POCS."""
 
-from __future__ import annotations
-
 from recon.base.registry import Lengths, MethodEntry
 
 METHODS = {

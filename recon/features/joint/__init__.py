@@ -1,7 +1,5 @@
 """Several volumes that all views determine together: at times of a scan of a sample that changes, or of materials."""
 
-from __future__ import annotations
-
 from recon.base.registry import MethodEntry
 
 METHODS = {

@@ -1,7 +1,5 @@
 """R²-Gaussian as published, beside our own. Its 30 000 steps would take a trade-off hours."""
 
-from __future__ import annotations
-
 from recon.base.registry import Lengths, MethodEntry
 
 METHODS = {

@@ -1,10 +1,8 @@
 """What a beam does that is not steady, even, wide enough and of one energy."""
 
-from __future__ import annotations
-
 from functools import partial
 
-from simulators.effects.domain import Domain, EffectRow
+from simulators.effects import Domain, EffectRow
 
 _energies, _open_beam = (partial(EffectRow, module=f"{__name__}.{name}") for name in ("energies", "open_beam"))
 EFFECTS = {

@@ -1,10 +1,8 @@
 """Faults of scintillator, optics and sensor."""
 
-from __future__ import annotations
-
 from functools import partial
 
-from simulators.effects.domain import Domain, EffectRow
+from simulators.effects import Domain, EffectRow
 
 _optics, _pixels = (partial(EffectRow, module=f"{__name__}.{name}") for name in ("optics", "pixels"))
 EFFECTS = {

@@ -1,10 +1,8 @@
 """What light does beside being absorbed by the sample: it is refracted and scattered, and meets crumbs on its way."""
 
-from __future__ import annotations
-
 from functools import partial
 
-from simulators.effects.domain import Domain, EffectRow
+from simulators.effects import Domain, EffectRow
 
 _deflected, _phase_fringes = (
     partial(EffectRow, module=f"{__name__}.{name}") for name in ("deflected", "phase_fringes")

@@ -1,10 +1,8 @@
 """Errors of the stage, and of the sample on it."""
 
-from __future__ import annotations
-
 from functools import partial
 
-from simulators.effects.domain import Domain, EffectRow
+from simulators.effects import Domain, EffectRow
 
 _Row = partial(EffectRow, module=f"{__name__}.errors")
 EFFECTS = {

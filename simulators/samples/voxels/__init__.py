@@ -1,5 +1,3 @@
 """Samples of voxels: volumes and meshes that are read from files."""
 
-from __future__ import annotations
-
 PHANTOMS = dict.fromkeys(("volume", "mesh"), f"{__name__}.files")

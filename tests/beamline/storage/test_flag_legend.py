@@ -122,7 +122,9 @@ LEVELS = (Level.WARN, Level.ALARM)
 @given(st.lists(st.dictionaries(st.sampled_from(NAMES), st.sampled_from(LEVELS)), max_size=20))
 def test_counting_undoes_the_bitmask(found: list[dict[str, Level]]) -> None:
     each = [bitmask(Flag(name, level, 0, 1, 0, "") for name, level in frame.items()) for frame in found]
-    flags = FrameFlags(np.array(each, np.uint64), tuple(FlagBit(check.name, check.bit) for check in CHECKS))
+    n, k = len(each), len(CHECKS)
+    nothing = np.full((n, k), np.nan, np.float32), np.full((n, k, 4), -1, np.int32)
+    flags = FrameFlags(np.array(each, np.uint64), tuple(FlagBit(check.name, check.bit) for check in CHECKS), *nothing)
     for name in NAMES:
         for level in LEVELS:
             n = sum(frame.get(name) is level for frame in found)

@@ -13,8 +13,7 @@ from scipy import stats
 
 from drivers.orca_quest import SENSOR_SHAPE
 from recon.base.jit import njit
-from simulators.pixels.pattern import binned, normals, places
-from simulators.pixels.streams import STEP, TAIL, begin, mix, normal, uniform
+from simulators.pixels.pattern import STEP, TAIL, begin, binned, mix, normal, normals, places, uniform
 from tests.simulators import chance, shots
 
 N = 400_000

@@ -1,7 +1,5 @@
 """Scans of images: a folder or .zip of TIFFs, or one TIFF with a page a frame."""
 
-from __future__ import annotations
-
 FORMATS = {
     "tiff_series": "beamline.storage.readers.images.tiff_series",
     "tiff_stack": "beamline.storage.readers.images.tiff_stack",

@@ -1,7 +1,5 @@
 """Volumes as TIFF: one file with a page a slice, or a folder with a file a slice."""
 
-from __future__ import annotations
-
 from beamline.storage.volumes import FormatEntry
 
 _MODULE = "beamline.storage.volumes.images.tiff"

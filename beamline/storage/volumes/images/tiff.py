@@ -18,8 +18,8 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, shape_of
+from beamline.storage.volumes import REGISTRY
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
-from beamline.storage.volumes.registry import REGISTRY
 
 CLASSIC_TIFF_BYTES = 4_000_000_000  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
 _UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them

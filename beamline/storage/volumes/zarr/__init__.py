@@ -1,7 +1,5 @@
 """Volumes as OME-Zarr."""
 
-from __future__ import annotations
-
 from beamline.storage.volumes import FormatEntry
 
 FORMATS = {"ome_zarr": FormatEntry("beamline.storage.volumes.zarr.ome_zarr", "OmeZarr", (".zarr",))}

@@ -21,8 +21,8 @@ from beamline.core.files import SETTINGS, bytes_below
 from beamline.storage.foreign_zarr import open_zarr, zarr_library
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.volumes import REGISTRY
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
-from beamline.storage.volumes.registry import REGISTRY
 
 _CHUNK = 16, 256, 256  # voxels
 _SMALLEST = 256  # voxels along a side, below which no further scale is made

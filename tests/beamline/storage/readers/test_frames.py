@@ -20,7 +20,8 @@ def test_rows_count_from_the_first_frame_of_all() -> None:
     one, other = _of(2), _of(3, 12)
     one.damaged, other.damaged, other.altered = frozenset({1}), frozenset({0}), frozenset({2})
     other.replaces, other.part_starts = np.array([-1, 0, -1]), np.array([0, 1])
-    other.flags = FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY)
+    nothing = np.full((3, len(TODAY)), np.nan, np.float32), np.full((3, len(TODAY), 4), -1, np.int32)
+    other.flags = FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY, *nothing)
     both = Frames(one, other)
     assert (both.damaged, both.altered) == ({1, 2}, {4})
     assert both.replaces is not None and both.replaces.tolist() == [-1, -1, -1, 2, -1]

@@ -16,7 +16,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings
 from tests.recon.kernels.gpu.on_gpu import UNIT
 
-fused = importlib.import_module("recon.kernels.gpu.fused")
+fused = importlib.import_module("recon.kernels.gpu.engine")
 SETTINGS = FitSettings(policy=None, tv_size=5, tv_weight=0.05, views_per_step=2)
 
 
