@@ -95,9 +95,9 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedPr
 @pytest.mark.parametrize(
     ("kept", "wanted", "words"),
     [
-        (0, 0, "of a fit over a time, as this one is:"),
-        (100, 0, "of a fit over 100 steps, this one is over a time:"),
-        (0, 200, "of a fit over a time, this one is over 200 steps:"),
+        (0, 0, "from a fit over a time, as this one is:"),
+        (100, 0, "from a fit over 100 steps, this one is over a time:"),
+        (0, 200, "from a fit over a time, this one is over 200 steps:"),
     ],
 )
 def test_a_plan_without_steps_is_told(

@@ -24,9 +24,9 @@ from tests.recon.helpers import as_leaves, run_steps
 from tests.recon.kernels.gpu.on_gpu import DEVICE
 from tests.recon.kernels.reference import project, projection_loss
 
-engine, images, parameters, tiles, voxels = (
+engine, passes, parameters, tiles, voxels = (
     importlib.import_module(f"recon.kernels.gpu.{name}")
-    for name in ("engine", "images", "parameters", "tiles", "voxels")
+    for name in ("engine", "passes", "parameters", "tiles", "voxels")
 )
 # where the interpreter stands in, which is numpy and warns of an infinity; tests/recon/kernels/gpu is quick
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
@@ -61,9 +61,9 @@ def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(tiles, "PROGRAMS", 1)
     groups, weight = 200, 1 + 0.9 * 2.0**-17
     one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
-    pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)
+    pile = as_leaves(one.select(torch.zeros(groups * passes._GROUP, dtype=torch.int64)), DEVICE)
     shown = project(pile, Geometry.parallel([0.0], (1, 1), pixel_pitch=1.0), truncation=WHOLE, gpu=True)
-    off = abs(float(shown.detach()) / (groups * images._GROUP * weight) - 1)
+    off = abs(float(shown.detach()) / (groups * passes._GROUP * weight) - 1)
     assert off < 16 * STEP  # of it the weight's own: a dozen roundings
     one_by_one = np.cumsum(np.full(groups, weight, np.float32), dtype=np.float32)[-1]
     assert abs(float(one_by_one) / (groups * weight) - 1) > 32 * STEP
