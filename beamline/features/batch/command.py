@@ -298,7 +298,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
 def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:
     """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
 
-    Each scan gets a folder in --output with its volume, report and log; batch.csv says what became of it, and why it
+    Each scan gets a folder in --output with its volume and report; batch.csv says what became of it, and why it
     failed. Called again, only scans without a volume are reconstructed. Ctrl-C keeps the scans that are done (exit
     code 4). Exit code 5: a scan failed.
     """
