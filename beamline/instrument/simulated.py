@@ -47,12 +47,20 @@ from simulators.frame.shot import CannotExposeError
 from simulators.scenes.scene import Scene, load_scene
 from simulators.wires.wire import Build, Controller, register
 
+
+def _fitting(name: str, build: type[Build]) -> type[Build]:
+    """The class, if a controller can be built of it."""
+    _ = build.matching
+    return build
+
+
 WIRES: Registry[type[Build]] = Registry(
     "wire",
     {
         kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name)
         for kind, name in in_folders("simulators.wires", "CONTROLLERS").items()
     },
+    _fitting,
 )
 """Kind -> how its simulated controller is built."""
 

@@ -42,7 +42,7 @@ _MODULES = {
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.report report.figures",
     "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",
-    "study": "features.trials.command features.trials.study",
+    "study": "features.trials.command features.trials.tradeoff",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 

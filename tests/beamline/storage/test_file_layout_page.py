@@ -104,7 +104,6 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
         events += [json.loads(line) for line in done.stdout.splitlines()]
     record = read_reconstruction(tmp_path / "bars.h5")
     assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
-    write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
     fitted, centres = read_reconstruction(tmp_path / "r2.h5"), np.ones((SCAN.angles.size, 3))
     rest = {"view_centres_mm": centres, "roi": "0:4,0:4,0:4", "roi_found": "4 of 8 slices", "frames_per_view": 2}
     parameters = {**fitted.parameters, **rest}
@@ -112,7 +111,7 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     write_reconstruction(tmp_path / "free.h5", replace(fitted, parameters=parameters, model=model))
     series = VolumeSeries(np.zeros(2), np.stack([record.volume.data] * 2))
     write_reconstruction(tmp_path / "series.h5", replace(record, series=series))
-    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful", "free", "series")))
+    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "free", "series")))
     assert unmatched(volumes, names("Volume file")) == (set(), set())
     assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
     assert_on_the_page(events)

@@ -110,7 +110,7 @@ def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None
     np.testing.assert_array_equal(np.load(folder / "v.npy"), data)
     tifffile.imwrite(folder / "slices/rec_12.tif", data[0, :4])
     assert (
-        "rec_12.tif is float32 (4, 9); expected slices [y, x] alike"
+        "rec_12.tif is float32 (4, 9); expected slices [y, x] of one type and shape"
         in beamline("export", "slices", "-o", "w.npy").stderr
     )
     (folder / "empty").mkdir()

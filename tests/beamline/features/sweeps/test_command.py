@@ -85,7 +85,7 @@ def test_a_grid_of_two_options_finds_the_axis_with_a_method_that_explains_views(
         ("scan.h5 tv-weight=1,2", "is of fista-tv, os-sirt-tv; give --method"),
         ("scan.h5 filter=hann,ram-lak -m sirt", "filter changes nothing of a slice by sirt"),
         ("scan.h5 rings=none,vo --rings vo", "--rings is swept"),
-        ("scan.h5 rings=none,vo --truth t.npz", "--truth is of a volume"),
+        ("scan.h5 rings=none,vo --truth t.npz", "--truth belongs to a volume"),
         ("scan.h5 allow-negative=no,yes -m sirt", "expected allow-negative=false,true"),
         ("scan.h5 rings=none,vo -o sheet.pdf", "give a name such as sheet.png"),
     ],

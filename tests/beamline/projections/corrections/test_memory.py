@@ -39,7 +39,6 @@ ON_ALL = {
     "vo": Rings("vo"),
     "auto": Air("auto"),
     "surface": Air("surface:1"),
-    "background": pytest.param(Calibrate(("background",)), marks=pytest.mark.slow),
     "gains": pytest.param(Calibrate(("gains",)), marks=pytest.mark.slow),
     "fit": Hardening("fit"),
     "aluminium": Hardening("Al:60kV,Al=1"),

@@ -55,12 +55,12 @@ def _compile_all() -> None:
     from recon.kernels.cpu.losses import L1, L2, POISSON
     from recon.kernels.gpu import (
         back_project,
+        engine,
         footprints,
-        fused,
-        images,
         joseph,
         losses,
         parameters,
+        passes,
         rays,
         tiles,
         voxels,
@@ -70,8 +70,8 @@ def _compile_all() -> None:
     of_a_kernel = [
         (footprints, "_footprints", 4, block | {"CONE": False}),
         (footprints, "_footprints", 4, block | {"CONE": True}),
-        (images, "_render", 2, {"EDGE": images._EDGE, "GROUP": images._GROUP, "MANY": images._MANY}),
-        (images, "_moments", 1, {"HIGH": images._BLOCK[0], "WIDE": images._BLOCK[1]}),
+        (passes, "_render", 2, {"EDGE": passes._EDGE, "GROUP": passes._GROUP, "MANY": passes._MANY}),
+        (passes, "_moments", 1, {"HIGH": passes._BLOCK[0], "WIDE": passes._BLOCK[1]}),
         (rays, "_terms", 4, block),
         (rays, "_render", 2, {"EDGE": rays._EDGE, "GROUP": rays._GROUP}),
         (rays, "_sums", 1, {"HIGH": rays._PIXELS[0], "WIDE": rays._PIXELS[1]}),
@@ -112,7 +112,7 @@ def _compile_all() -> None:
             for edge, deep, rows, is_cone in ((16, 1, 1, True), (4, 16, 1, False), (4, 64, 3, False), (4, 64, 3, True))
         ),
         *((back_project, "_back_project", 4, {"EDGE": edge, "DEEP": deep}) for edge, deep in ((16, 1), (4, 64))),
-        *((fused, "_tally", 4, {"VIEWS": 2, "LISTS": 2 + boxed, "BOXED": boxed}) for boxed in (False, True)),
+        *((engine, "_tally", 4, {"VIEWS": 2, "LISTS": 2 + boxed, "BOXED": boxed}) for boxed in (False, True)),
     ]
     modules = {module for module, *_ in wanted}
     kernels = {
