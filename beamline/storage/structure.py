@@ -81,7 +81,10 @@ def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
     """DataError for a dataset that claims more than any compression makes of what is stored of it, or whose values are
     the bytes of another file, which may be any file that the reader can open."""
     if made.get_external_count():
-        raise DataError(f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5. Copy it.")
+        raise DataError(
+            f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5 and is not read. Copy "
+            "them into the dataset. Nothing was read."
+        )
     n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
     if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
         return
