@@ -12,6 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, TrialDone, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
@@ -20,7 +22,7 @@ from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
-from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load
+from beamline.features.trials.worker import DATA, VOLUME, TrialData, TrialJob, add_references
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
@@ -132,7 +134,7 @@ def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf
         nonlocal event
         event = json_object(line) or event
 
-    dump(work / JOB, (trial, seed, keep))
+    TrialJob(trial, seed, keep).save(work)
     ending, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line, seconds=max_seconds)
     if event.pop("event", None) == "result":
         return Outcome(trial, "done", **event)
@@ -168,7 +170,7 @@ class _Run:
         outcome = run_trial(trial, self.work, self.seed, self.end - self.now(), keep=shown)
         if not path.exists():
             return outcome, None
-        volume = load(path)
+        volume: F32 = np.load(path)
         path.unlink()
         if trial.choice is None:
             self.slices.add(by_name(trial.method).label, volume)
@@ -264,9 +266,9 @@ def run_comparison(
     data, table, references = planned.data, planned.table, planned.references
     with _result_folder(scan.folder) as work:
         run = _Run(work, scan.folder, scan.seed, end, now, emit, slices)
-        dump(work / DATA, data)
-        if table.name == "study":
-            dump(work / DATA, _with_references(data, references, run))
+        data.save(work / DATA)
+        if references:
+            _add_references(work / DATA, data.truth, references, run)
         if data.truth is not None:
             slices.add("truth", data.truth)
         del planned, data
@@ -277,8 +279,8 @@ def run_comparison(
     return table
 
 
-def _with_references(data: TrialData, references: Sequence[Trial], run: _Run) -> TrialData:
-    """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
+def _add_references(folder: Path, truth: F32 | None, references: Sequence[Trial], run: _Run) -> None:
+    """Add the volumes of these trials to the data, and the dense and empty regions of the truth or of the first one.
 
     Raises:
         DataError: a reference could not be made.
@@ -289,10 +291,10 @@ def _with_references(data: TrialData, references: Sequence[Trial], run: _Run) ->
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
-    contrast = data.truth if data.truth is not None else next(iter(volumes.values()))
+    contrast = next(iter(volumes.values())) if truth is None else truth
     with suppress(ValueError):  # it has no dense and empty regions
         regions = metrics.kmeans_mask(metrics.sampled(contrast), run.seed)
-    return replace(data, references=volumes, regions=regions)
+    add_references(folder, volumes, regions)
 
 
 @contextmanager

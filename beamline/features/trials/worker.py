@@ -9,17 +9,18 @@ from __future__ import annotations
 import json
 import math
 import os
-import pickle
 import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy import ndimage
 from scipy.special import logsumexp
 
@@ -34,17 +35,20 @@ from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import binned, run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
-from recon.base.geometry import Geometry
-from recon.base.method import RunControl
+from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.base.method import RunControl, SampleRadius
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
+from recon.prep.correct import Projections
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution
 from recon.warm_up import warm_up
 
-DATA, JOB, VOLUME = "data", "job", "volume"
-"""Files of a folder of trials: the `TrialData`; trial, seed and whether to write the volume; that volume [z, y, x]."""
+DATA, VOLUME = "data", "volume.npy"
+"""Files of a folder of trials: a folder with the `TrialData`, and the volume [z, y, x] of the last trial."""
+_JOB = "job.json"
+_SMALL = 4096  # bytes of a file that is read at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,24 +73,91 @@ class TrialData:
         """Geometry of the views that may be used."""
         return self.prepared.geometry
 
+    def save(self, folder: Path) -> None:
+        """Write each array, number and word to a .npy file of a new folder, without how the views were prepared.
 
-def dump(path: Path, value: object) -> None:
-    """Write a value for another process of this program; of the views of a `TrialData` what their use needs.
+        Raises:
+            DataError: the disk did not take it.
+        """
+        views = self.prepared
+        parts: dict[str, Any] = {"data": self, "prepared": views, "projections": views.projections}
+        if isinstance(views.sample_radius, SampleRadius):
+            parts["sample"] = views.sample_radius
+        values = {f"{part}.{each.name}": getattr(of, each.name) for part, of in parts.items() for each in fields(of)}
+        values |= {f"geometry.{name}": value for name, value in arrays_of(self.geometry).items()}
+        if views.held_out is not None:
+            values["held_out.lines"] = views.held_out[0]
+            values |= {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
+        with named_on_failure(folder):
+            folder.mkdir()
+        for name, value in values.items():
+            if isinstance(value, np.ndarray | np.generic | str | float | int):
+                write_array(folder / f"{name}.npy", np.asarray(value))
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """What `save` and `add_references` wrote; large arrays stay in their files until they are used."""
+
+        def arrays(part: str) -> dict[str, Any]:
+            return {
+                path.stem.partition(".")[2]: np.load(path, "r" if path.stat().st_size > _SMALL else None)
+                for path in folder.glob(f"{part}.*.npy")
+            }
+
+        def values(part: str) -> dict[str, Any]:
+            return {name: each if each.ndim else each.item() for name, each in arrays(part).items()}
+
+        of_views, held, sample = values("prepared"), arrays("held_out"), values("sample")
+        if sample:
+            of_views["sample_radius"] = SampleRadius(**sample)
+        prepared = PreparedProjections(
+            Projections(**values("projections")),
+            geometry_of_arrays(arrays("geometry")),
+            axis=None,
+            held_out=(held["lines"], geometry_of_arrays(arrays("unseen"))) if held else None,
+            **of_views,
+        )
+        return cls(prepared, **{"truth": None, **values("data")}, references=arrays("reference"))
+
+
+def add_references(folder: Path, volumes: Mapping[str, F32], regions: NDArray[np.int8] | None) -> None:
+    """Add volumes by method, and regions, to a folder of `TrialData`; DataError: the disk did not take them."""
+    for method, volume in volumes.items():
+        write_array(folder / f"reference.{method}.npy", volume)
+    if regions is not None:
+        write_array(folder / "data.regions.npy", regions)
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write a .npy file. `np.save` of a path loses the last 4 kB where the disk is full, and says nothing.
 
     Raises:
         DataError: the disk did not take it.
     """
-    if isinstance(value, TrialData):
-        bare = replace(value.prepared, axis=None, flags=None, done={}, laws={})
-        value = replace(value, prepared=bare)
     with named_on_failure(path), path.open("wb") as file:
-        pickle.dump(value, file, protocol=5)
+        np.save(SimpleNamespace(write=file.write), array, allow_pickle=False)
 
 
-def load(path: Path) -> Any:
-    """What `dump` of the same program wrote."""
-    with path.open("rb") as file:
-        return pickle.load(file)  # noqa: S301 - of this program's own temporary folder
+@dataclass(frozen=True)
+class TrialJob:
+    """A trial to run in a separate process; `keep`: its volume is written to `VOLUME`."""
+
+    trial: Trial
+    seed: int
+    keep: bool
+
+    def save(self, folder: Path) -> None:
+        """Write the job into a folder of trials. DataError: the disk did not take it."""
+        with named_on_failure(folder / _JOB):
+            (folder / _JOB).write_bytes(_JOBS.dump_json(self))
+
+    @staticmethod
+    def load(folder: Path) -> TrialJob:
+        """The job in a folder of trials."""
+        return _JOBS.validate_json((folder / _JOB).read_bytes())
+
+
+_JOBS = TypeAdapter(TrialJob)
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
@@ -206,12 +277,12 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
 
 def main(folder: Path) -> int:
     """Do the job in the folder, and print an event; the exit code."""
-    (trial, seed, keep), code = load(folder / JOB), 0
+    job, code = TrialJob.load(folder), 0
     try:
-        fields, volume = run(trial, load(folder / DATA), seed)
-        if keep:
-            dump(folder / VOLUME, volume)
-        event = {"event": "result", **fields}
+        figures, volume = run(job.trial, TrialData.load(folder / DATA), job.seed)
+        if job.keep:
+            write_array(folder / VOLUME, volume)
+        event = {"event": "result", **figures}
     except (ValueError, DataError) as error:  # DataError: the disk
         code = error.exit_code if isinstance(error, DataError) else 1
         event = {"event": "failed", "message": str(error)}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import math
-import pickle
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +23,7 @@ from beamline.features.trials.runner import ComparedScan, run_comparison, run_tr
 from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, dump
+from beamline.features.trials.worker import DATA, VOLUME, TrialData, write_array
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
@@ -54,7 +53,7 @@ def run_tradeoff(
 def _made_up(trial: Trial, work: Path | None = None, *_: object, keep: bool = False) -> Outcome:
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
     if keep and work is not None:
-        dump(work / VOLUME, np.zeros((4, 40, 40), np.float32))
+        write_array(work / VOLUME, np.zeros((4, 40, 40), np.float32))
     amount = float((trial.settings.get("steps") or 20) * trial.views / trial.binning)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
     return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics)
@@ -125,7 +124,7 @@ def _full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")  # as a write reports it: without a name
 
 
-@pytest.mark.parametrize(("where", "name"), [((pickle, "dump"), "data"), ((Path, "write_bytes"), "tradeoff.csv")])
+@pytest.mark.parametrize(("where", "name"), [((np, "save"), r"data/.*\.npy"), ((Path, "write_bytes"), "tradeoff.csv")])
 def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: object, where: tuple[object, str], name: str
 ) -> None:
@@ -197,7 +196,7 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
     views = Geometry.parallel(SCAN.angles, SCAN.shape)
     prepared = prepared_views(SCAN.line_integrals().astype(np.float32), views)
-    dump(tmp_path / DATA, TrialData(prepared, SCAN.truth(Grid.matching(views))))
+    TrialData(prepared, SCAN.truth(Grid.matching(views))).save(tmp_path / DATA)
     ballast = np.ones(90_000_000)  # 720 MB
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
     assert outcome.status == "done", outcome.message

@@ -14,7 +14,7 @@ import pytest
 
 from beamline.features.trials import runner
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, averaged, dump, load, measured
+from beamline.features.trials.worker import DATA, VOLUME, TrialData, averaged, measured, write_array
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
@@ -30,10 +30,10 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
     found: list[tuple[Trial, TrialData]] = []
 
     def trial(trial: Trial, work: Path, seed: int, limit: float, *, keep: bool) -> Outcome:
-        data: TrialData = load(work / DATA)
+        data = TrialData.load(work / DATA)
         grid = Grid.matching(data.geometry)
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
-        dump(work / VOLUME, volume)
+        write_array(work / VOLUME, volume)
         figures, _ = measured(trial.method, volume, data, grid)
         assert trial.choice is not None
         found.append((trial, replace(data, prepared=averaged(data.prepared, trial.choice))))

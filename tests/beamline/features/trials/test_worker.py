@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ import pytest
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import worker as module
 from beamline.features.trials.trial import Trial
-from beamline.features.trials.worker import DATA, JOB, VOLUME, TrialData, dump, load, main
+from beamline.features.trials.view_choices import ViewChoice
+from beamline.features.trials.worker import DATA, VOLUME, TrialData, TrialJob, add_references, main
 from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.method import SampleRadius
 from recon.base.volume import Grid, Volume
 from recon.methods import by_name, names_of_one_volume
 from recon.voxels.fbp import fbp
@@ -48,8 +50,8 @@ def run(trial: Trial, data: TrialData, seed: int, *clocks: Any) -> dict[str, Any
 def done(data: TrialData, folder: Path, trial: Trial, keep: bool = False) -> int:
     """The exit code of a process that runs the trial."""
     folder.mkdir(exist_ok=True)
-    dump(folder / DATA, data)
-    dump(folder / JOB, (trial, 0, keep))
+    data.save(folder / DATA)
+    TrialJob(trial, 0, keep).save(folder)
     return main(folder)
 
 
@@ -93,7 +95,7 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
 def test_a_volume_that_is_written_is_the_one_measured(data: TrialData, tmp_path: Path, capsys: Any) -> None:
     assert done(data, tmp_path, Trial("method", "fbp", 27), keep=True) == 0
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
-    np.testing.assert_array_equal(load(tmp_path / VOLUME), expected)
+    np.testing.assert_array_equal(np.load(tmp_path / VOLUME), expected)
     assert data.truth is not None
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
@@ -135,3 +137,37 @@ def test_as_a_process_it_speaks_lines_of_json(
     assert done(TrialData(empty, None), tmp_path / "two", trial) == 1
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert last["event"] == "failed" and "no matter" in last["message"]
+
+
+def test_data_and_job_come_through_their_folder(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    views = Geometry.cone(
+        rng.random(9), (40, 60), 0.5, 60.0, 120.0, shifts=rng.random((9, 2)), roll=0.1, tilt=rng.random(9)
+    )
+    images = rng.random((9, 40, 60)).astype(np.float32)
+    whole = replace(prepared_views(images, views, weights=images / 2), sample_radius=SampleRadius(3.0, 2.0, 4.0, 0.1))
+    prepared = replace(whole.of_views(np.arange(3)), held_out=(images[3:], views.select(range(3, 9))))
+    TrialData(prepared, images).save(tmp_path / "data")
+    add_references(tmp_path / "data", {"os-sirt-tv": images[:1]}, np.ones((1, 2, 3), np.int8))
+    back = TrialData.load(tmp_path / "data")
+    assert prepared.held_out is not None and back.prepared.held_out is not None
+    for one, other in ((back.geometry, prepared.geometry), (back.prepared.held_out[1], prepared.held_out[1])):
+        for each in fields(Geometry):
+            np.testing.assert_array_equal(getattr(one, each.name), getattr(other, each.name))
+    np.testing.assert_array_equal(back.prepared.projections.weights, images[:3] / 2)
+    np.testing.assert_array_equal(back.prepared.held_out[0], images[3:])
+    np.testing.assert_array_equal(back.truth, images)
+    np.testing.assert_array_equal(back.references["os-sirt-tv"], images[:1])
+    assert back.regions is not None and back.regions.shape == (1, 2, 3) and list(back.references) == ["os-sirt-tv"]
+    for name in ("stretch", "length_unit", "n_projections", "axis_col", "sample_radius", "inside"):
+        assert getattr(back.prepared, name) == getattr(prepared, name)
+    assert isinstance(back.prepared.projections.data, np.memmap)  # read where it is used
+    settings = {"steps": 3, "weight": 3.0, "start": "tv"}
+    job = TrialJob(Trial("method", "r2", 3, 2, settings, 1.5, ViewChoice("means", [[0, 1], [2, 3]])), 7, True)
+    job.save(tmp_path)
+    again = TrialJob.load(tmp_path)
+    assert again.trial.choice is not None and again.trial.choice.groups == [[0, 1], [2, 3]]
+    assert replace(again, trial=replace(again.trial, choice=None)) == replace(
+        job, trial=replace(job.trial, choice=None)
+    )
+    assert [type(value) for value in again.trial.settings.values()] == [int, float, str]
