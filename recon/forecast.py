@@ -36,20 +36,20 @@ class Forecast(NamedTuple):
     """Seconds of a reconstruction.
 
     Attributes:
-        choice: of the trials that choose a method or the weight of a prior.
+        choice_seconds: of the trials that choose a method or the weight of a prior.
         volumes: after them, by the name of the method whose volume it may become; the data decide among them.
     """
 
-    choice: float
+    choice_seconds: float
     volumes: Mapping[str, float]
 
     @property
     def least(self) -> float:
-        return self.choice + min(self.volumes.values())
+        return self.choice_seconds + min(self.volumes.values())
 
     @property
     def most(self) -> float:
-        return self.choice + max(self.volumes.values())
+        return self.choice_seconds + max(self.volumes.values())
 
 
 class Pace(NamedTuple):
@@ -63,7 +63,7 @@ class Pace(NamedTuple):
     def total(self) -> float:
         return self.fixed + self.planned * self.each
 
-    def times(self, fixed: float, each: float) -> Pace:
+    def scaled(self, fixed: float, each: float) -> Pace:
         return Pace(fixed * self.fixed, each * self.each, self.planned)
 
 
@@ -100,22 +100,22 @@ class Timing:
         if (limit := getattr(method, "seconds", None)) is not None:
             return Forecast(0.0, {method.name: limit})
         if method.traits.direct:
-            return Forecast(0.0, {method.name: self.direct(method)})
+            return Forecast(0.0, {method.name: self.direct_seconds(method)})
         if isinstance(method, FitMethod):
             return self._of_fit(method)
-        return Forecast(self.trials(method), {method.name: self.pace(method).total})
+        return Forecast(self.trial_seconds(method), {method.name: self.pace(method).total})
 
-    def whole(self, method: Method) -> Pace:
+    def whole_pace(self, method: Method) -> Pace:
         """All seconds beside the steps, without trials of a finish, and those of each step."""
         if method.traits.direct:
-            return Pace(self.direct(method), 0.0, 0)
+            return Pace(self.direct_seconds(method), 0.0, 0)
         if isinstance(method, FitMethod):
-            pace = self.fit(method)
+            pace = self.fit_pace(method)
             return pace._replace(fixed=pace.fixed + self._smooth.fixed + FINISH_SWEEPS * self._smooth.each)
         pace = self.pace(method)
-        return pace._replace(fixed=pace.fixed + self.trials(method))
+        return pace._replace(fixed=pace.fixed + self.trial_seconds(method))
 
-    def direct(self, method: Method) -> float:
+    def direct_seconds(self, method: Method) -> float:
         """Seconds of a direct method, whose kernels depend on the number of columns."""
         straight = self._geometry.is_straight and not self._geometry.is_cone
         part = part_of(self._geometry, self._grid, None) if straight else self._part
@@ -132,14 +132,14 @@ class Timing:
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # Steps that are not over all views take as long whatever their number, by samples along rays.
             along = max(self._grid.shape) / max(part.grid.shape)
-            self._paces[key] = pace.times(scale, scale if hasattr(method, "iterations") else along)
+            self._paces[key] = pace.scaled(scale, scale if hasattr(method, "iterations") else along)
         return self._paces[key]
 
     @property
     def _smooth(self) -> Pace:
         return self.pace(FistaTv())
 
-    def trials(self, method: Method) -> float:
+    def trial_seconds(self, method: Method) -> float:
         """Seconds of the trials that choose its prior."""
         sweeps: int = getattr(method, "trial_sweeps", 0)
         if not (self._trial_share and sweeps):
@@ -150,7 +150,7 @@ class Timing:
             return self._trial_share * ((CHOICE_SWEEPS + TRIAL_SWEEPS) * smooth + patches)
         return self._trial_share * sweeps * smooth
 
-    def fit(self, method: FitMethod) -> Pace:
+    def fit_pace(self, method: FitMethod) -> Pace:
         """Forecast of a fit without its finish."""
         field = Grid.for_fit(self._geometry, self._grid)
         given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
@@ -164,16 +164,16 @@ class Timing:
         short = replace(short, gaussians=some, finish=0, fit=replace(method.fit, joined_pixels=joined))
         grown = ((1 + growth(method.fit)) / 2) ** (1 / 3)  # Gaussians are added as it goes on
         covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), some)
-        return _timed(short, part, self._now, _FIT_STEPS).times(self._scale, grown * covers)
+        return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
     def _of_fit(self, method: FitMethod) -> Forecast:
         usual = method.as_candidate()
-        pace = self.fit(usual)
+        pace = self.fit_pace(usual)
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})
         rendered = 2 * _RENDER * self._geometry.n_views * pace.each / method.fit.views_per_step
         finish = rendered + self._smooth.fixed + method.finish_sweeps * self._smooth.each
-        choice = self.trials(FistaTv() if method.finish is not None else PnpDct())
+        choice = self.trial_seconds(FistaTv() if method.finish is not None else PnpDct())
         if method.finish is None:
             finish += PnpDct.iterations * self.pace(PnpDct()).each
         volumes = {method.name: pace.total + finish}
@@ -191,8 +191,10 @@ class Timing:
             return each[-1]
         volumes = {name: seconds for one in reversed(each) for name, seconds in one.volumes.items()}
         if isinstance(candidates[-1], FitMethod):
-            return Forecast(each[-1].choice, volumes)
-        return Forecast(sum(one.choice + self._trial_share * max(one.volumes.values()) for one in each), volumes)
+            return Forecast(each[-1].choice_seconds, volumes)
+        return Forecast(
+            sum(one.choice_seconds + self._trial_share * max(one.volumes.values()) for one in each), volumes
+        )
 
 
 def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.method_options import FOR_TIME, IN_MEMORY, RUNNING, SLABS_RESUMED, method_options
+from beamline.cli.method_options import NOT_WITH_ERROR_BARS, NOT_WITH_SLABS, RUNNING, SLABS_RESUMED, method_options
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -76,7 +76,7 @@ unfinished_option = option(
 )
 memory_option = option(
     "--memory",
-    excludes=IN_MEMORY,
+    excludes=NOT_WITH_SLABS,
     metavar="SIZE",
     callback=parsed(memory_size),
     help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
@@ -118,7 +118,7 @@ recon_options = together(
     heading(OUTPUT),
     option(
         "--uncertainty",
-        excludes=FOR_TIME,
+        excludes=NOT_WITH_ERROR_BARS,
         is_flag=True,
         help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv "
         "and fbp, into an .h5.",
@@ -174,7 +174,7 @@ recon_options = together(
     memory_option,
     option(
         "--cluster",
-        excludes=IN_MEMORY,
+        excludes=NOT_WITH_SLABS,
         of_one_call=True,
         metavar="local:N|tcp://HOST:PORT",
         callback=parsed(cluster_of),

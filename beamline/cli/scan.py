@@ -131,12 +131,12 @@ def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> N
 
     file, run = request.file, request.run
     config = None if file is None else load(file, request.settings, rehearse=request.rehearse)
-    of_energies = _config_of_energies(config, run, request.documents)
-    if of_energies is not None and not request.dry:
-        _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
+    frames_by_energy = _config_of_energies(config, run, request.documents)
+    if frames_by_energy is not None and not request.dry:
+        _show_energies(take_energies(frames_by_energy, request, [json_sink], StopRequest()), request, json_sink)
         return
-    if of_energies is not None:
-        run, config = None, of_energies
+    if frames_by_energy is not None:
+        run, config = None, frames_by_energy
     try:
         series = None if run is None else held.enter_context(open_for_resume(run, config))
     except NotJoined:

@@ -80,7 +80,7 @@ class Finding:
         rule: its name.
         message: in words, with what to do.
         frames: their rows in the file; empty: of all, or of none in particular.
-        score, limit: the figure and the limit that it violates; NaN where there is none.
+        score, limit: the figure, and the limit that it violates; NaN without a figure.
     """
 
     severity: Severity

@@ -17,13 +17,14 @@ from recon.base.noise import deviation_between_frames, deviation_between_neighbo
 
 LEAST_NOISE = 0.5  # counts: what rounding hides
 BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
+DRIFT = 0.02  # of the light: so much a beam may drift within a scan (as in the check `beam`)
 UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
 LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
 ZINGER = 12.0  # times the median change: more is not noise
 
 
 @dataclass(frozen=True, eq=False)
-class SeenFrame:
+class FrameStatistics:
     """Statistics of a dark, a flat or a view.
 
     Attributes:
@@ -48,7 +49,7 @@ class SeenFrame:
     cells: F32 | None = None
 
     @classmethod
-    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> SeenFrame:
+    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> FrameStatistics:
         """The frame of a running scan, by its digest."""
         return cls(row, kind, exposure, digest.saturated_fraction, np.array(thinned(digest.preview)), block)
 
@@ -73,21 +74,21 @@ class SeenFrame:
         return bool(np.isnan(self.blocks).all())
 
     @property
-    def even(self) -> bool:
+    def constant(self) -> bool:
         """Whether all blocks hold one number."""
         known = self.blocks[np.isfinite(self.blocks)]
         return not (known.size and np.ptp(known) > 0)
 
     @property
     def places(self) -> F32:
-        """The cells, or the blocks where there are none."""
+        """The cells; without cells, the blocks."""
         return self.blocks if self.cells is None else self.cells
 
 
-Group = Sequence[SeenFrame]
+Group = Sequence[FrameStatistics]
 
 
-class Odd(NamedTuple):
+class BadFrames(NamedTuple):
     """Frames of a group that cannot be used: the figure, the limit that it violates, and both in words, with advice.
 
     Without frames it is said of all.
@@ -99,7 +100,7 @@ class Odd(NamedTuple):
     sentence: str
 
 
-def figures(scores: Iterable[float]) -> str:
+def range_in_words(scores: Iterable[float]) -> str:
     """The least and the largest in words."""
     low, high = f"{min(scores):.3g}", f"{max(scores):.3g}"
     return low if low == high else f"{low} to {high}"
@@ -109,14 +110,14 @@ def figures(scores: Iterable[float]) -> str:
 class Evidence:
     """Darks and flats by groups, of one kind each and in the order of the file, and some views."""
 
-    groups: tuple[tuple[SeenFrame, ...], ...] = ()
-    views: tuple[SeenFrame, ...] = ()
+    groups: tuple[tuple[FrameStatistics, ...], ...] = ()
+    views: tuple[FrameStatistics, ...] = ()
 
     def of_kind(self, kind: FrameKind) -> list[Group]:
         """The groups of darks, or of flats."""
         return [group for group in self.groups if group[0].kind is kind]
 
-    def frames(self, kind: FrameKind) -> list[SeenFrame]:
+    def frames(self, kind: FrameKind) -> list[FrameStatistics]:
         """All darks, or all flats."""
         return [frame for group in self.of_kind(kind) for frame in group]
 
@@ -135,7 +136,7 @@ class Evidence:
         dark = level(self.darkest) if self.darkest else 0.0
         return float(np.median([(level([frame]) - dark) / frame.seconds for frame in group]))
 
-    def with_frame(self, frame: SeenFrame, begins: bool) -> Evidence:
+    def with_frame(self, frame: FrameStatistics, begins: bool) -> Evidence:
         """This evidence with the next frame of the scan; a dark or a flat may begin a group."""
         if frame.kind is FrameKind.PROJECTION:
             return replace(self, views=(*self.views, frame))
@@ -155,16 +156,16 @@ class Evidence:
         darks = [frame.places for frame in self.frames(FrameKind.DARK)]
         return np.asarray(np.mean(darks, axis=0), np.float32) if darks else 0.0
 
-    def light(self, frame: SeenFrame) -> F32:
+    def light(self, frame: FrameStatistics) -> F32:
         """Counts of a frame above the darks, at its places."""
         return np.asarray(np.nan_to_num(frame.places - self.base), np.float32)
 
     @cached_property
-    def lit_views(self) -> list[SeenFrame]:
+    def lit_views(self) -> list[FrameStatistics]:
         """The views with more light than with a closed shutter, and more than one value."""
         light = [float(np.percentile(self.light(view), BRIGHT)) for view in self.views]
         least = UNLIT * max(light, default=0.0)
-        return [view for view, bright in zip(self.views, light, strict=True) if bright > least and not view.even]
+        return [view for view, bright in zip(self.views, light, strict=True) if bright > least and not view.constant]
 
 
 def level(group: Group) -> float:

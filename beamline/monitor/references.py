@@ -20,20 +20,20 @@ from beamline.monitor.digest import LARGEST
 from beamline.monitor.evidence import (
     BRIGHT,
     UNLIT,
+    BadFrames,
     Evidence,
-    Odd,
-    figures,
     level,
     lights_in_turn,
     offset,
     pixel_noise,
     place_noise,
+    range_in_words,
 )
 from beamline.monitor.sample_in_flats import (
+    flats_below_views,
     flats_like_views,
-    mass_missing,
-    outshone,
     views_brighter,
+    views_lack_mass,
     views_show_nothing,
 )
 from drivers.base.frame import FrameKind
@@ -105,8 +105,8 @@ def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Fi
     return tuple(judged)
 
 
-def _in_words(name: str, kind: FrameKind, odd: list[Odd], severity: Severity) -> Iterator[Finding]:
-    """One finding for all frames of which one sentence holds."""
+def _in_words(name: str, kind: FrameKind, odd: list[BadFrames], severity: Severity) -> Iterator[Finding]:
+    """One finding for each sentence, with all the frames that it names."""
     for sentence in dict.fromkeys(each.sentence for each in odd):
         alike = [each for each in odd if each.sentence == sentence]
         own = tuple(sorted(frame.row for each in alike for frame in each.frames))
@@ -117,28 +117,28 @@ def _in_words(name: str, kind: FrameKind, odd: list[Odd], severity: Severity) ->
 def _with_holes(kind: FrameKind) -> Rule:
     """Frames with numbers that are not finite, unlike the best of their group; or without any number."""
 
-    def with_holes(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+    def with_holes(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
         for group in evidence.of_kind(kind):
             limit = min(min(frame.invalid for frame in group) + INVALID, 0.5)
             if odd := [frame for frame in group if frame.invalid > limit or frame.blank]:
-                text = figures([frame.invalid for frame in odd])
+                text = range_in_words([frame.invalid for frame in odd])
                 sentence = f"a share of {text} of the pixels is not finite (limit {limit:.3g})."
                 if all(frame.blank for frame in odd):
                     sentence = f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
-                yield Odd(odd, max(frame.invalid for frame in odd), limit, sentence)
+                yield BadFrames(odd, max(frame.invalid for frame in odd), limit, sentence)
 
     return with_holes
 
 
-def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
     """Darks of zeros, unlike most others."""
     frames = evidence.frames(DARK)
     zero = [frame for frame in frames if not np.any(frame.blocks)]
-    if zero and 2 * sum(not frame.even for frame in frames) > len(frames):
-        yield Odd(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
+    if zero and 2 * sum(not frame.constant for frame in frames) > len(frames):
+        yield BadFrames(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
 
 
-def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
+def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
     """Darks above the darkest of their exposure: light only adds to counts."""
     darks = evidence.frames(DARK)
     flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
@@ -150,13 +150,14 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[Odd]:
         limit = max(LIT * light, LIT_SIGMAS * place_noise(base.blocks))
         if (above := levels[levels - lowest > limit] - lowest).size:
             odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
-            yield Odd(odd, float(above.max()), limit, (
-                f"there is light in them, or their offset moved: {figures(above)} counts above the darkest dark, frame "
-                f"{base.row} with {lowest:.6g} (limit {limit:.3g}, by the {light:.6g} of light in the flats)."
+            least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
+            yield BadFrames(odd, float(above.max()), limit, (
+                f"there is light in them, or their offset moved: {range_in_words(above)} counts above {least_dark} "
+                f"(limit {limit:.3g}, by the {light:.6g} of light in the flats)."
             ))  # fmt: skip
 
 
-def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats with many pixels at the end of their counts, or all at one number.
 
     Not those that were written, not exposed: the number that stands for all light, such as 65535 beside 0.
@@ -166,15 +167,15 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
     for group in evidence.of_kind(FLAT):
         shares, limit = np.array([flat.saturated - hot for flat in group]), saturation_limit(group[0].pixels, limits)
         over, most = shares > limit, float(shares.max())
-        if all(frame.even for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
+        if all(frame.constant for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
             continue
         if over.any():
             what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), and their light is not known"
             odd = [group[at] for at in np.flatnonzero(over).tolist()]
-            yield Odd(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
-        elif all(flat.even for flat in group):
+            yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
+        elif all(flat.constant for flat in group):
             what = f"every pixel of them holds {level(group):g}, though those of the darks vary: counts end there"
-            yield Odd(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
+            yield BadFrames(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 
 
 def saturation_limit(pixels: int, limits: ReferenceLimits) -> float:
@@ -182,7 +183,7 @@ def saturation_limit(pixels: int, limits: ReferenceLimits) -> float:
     return max(limits.saturated, (ZINGERS + 0.9) / pixels)
 
 
-def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats at the level of the darks."""
     if not (darks := evidence.darkest):
         return
@@ -190,14 +191,14 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
     for group in evidence.of_kind(FLAT):
         light = level(group) - level(darks)
         if light <= limit * noise:
-            yield Odd(group, light / noise if noise else 0.0, limit, (
+            yield BadFrames(group, light / noise if noise else 0.0, limit, (
                 f"there is no beam in them: their level {level(group):.6g} is {light:.3g} above the darks' "
                 f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limit:g} times it). Was the shutter "
                 "open for them, and closed for the darks?"
             ))  # fmt: skip
 
 
-def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats with much less light than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
@@ -205,23 +206,23 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
         if (gone > limit).any():
             others, most = spans([flat.row for flat in bright]), float(gone.max())
             sentence = f"{most:.0%} of the light of the flats {others} is gone (limit {limit:.0%}): the beam was lost."
-            yield Odd([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
+            yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
-def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats darker than views, if both exposures are known: a sample only takes light."""
     views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
     limit = 1 - limits.light_gone
     for group in evidence.of_kind(FLAT) if views else ():
         share = evidence.light_of(group) / evidence.light_of(views)
         if share < limit and all(flat.exposure > 0 for flat in group):
-            yield Odd(group, share, limit, (
+            yield BadFrames(group, share, limit, (
                 f"they have {share:.2%} of the light of the views (limit {limit:.0%}), though a sample only "
                 "takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
             ))  # fmt: skip
 
 
-def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats with other light than most of their group, as a whole or in places; all, where half of them have."""
     base, limit = offset(evidence.darkest), limits.uneven
     for group in evidence.of_kind(FLAT):
@@ -244,27 +245,27 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
             n = lights_in_turn(levels)
             why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
             sentence = f"their light differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
-            yield Odd(group if whole else odd, changed, limit, sentence)
+            yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
-            yield Odd(group if whole else odd, float(places.max()), limit, (
+            yield BadFrames(group if whole else odd, float(places.max()), limit, (
                 f"in places their light differs by {places.max():.0%} {how} (limit {limit:.0%}): something was in the "
                 "beam. Is the sample out?"
             ))  # fmt: skip
 
 
-def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats that leave most of the frame dark."""
     for group in evidence.of_kind(FLAT):
         light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
         score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
         if score > limit:
-            yield Odd(group, score, limit, (
+            yield BadFrames(group, score, limit, (
                 f"{score:.0%} of the frame has no light in them (limit {limit:.0%}): move beam and detector onto one "
                 "another, or read fewer pixels."
             ))  # fmt: skip
 
 
-def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd]:
+def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Darks with the level and the noise of light."""
     flats = evidence.brightest
     for darks in evidence.of_kind(DARK) if flats else ():
@@ -275,7 +276,7 @@ def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd
         limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
         if min(share, variance) > limit and level(darks) > 0 and not unsure:
-            yield Odd(darks, min(share, variance), limit, (
+            yield BadFrames(darks, min(share, variance), limit, (
                 f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' "
                 f"{level(flats):.6g}"
                 + (f" and their variance {variance:.0%}" if known else "")
@@ -283,7 +284,7 @@ def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Odd
             ))  # fmt: skip
 
 
-Rule = Callable[[Evidence, ReferenceLimits], Iterator[Odd]]
+Rule = Callable[[Evidence, ReferenceLimits], Iterator[BadFrames]]
 RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("not_finite", DARK, _with_holes(DARK)),
     ("unwritten", DARK, _unwritten),
@@ -297,10 +298,10 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("uneven", FLAT, _uneven),
     ("mostly_unlit", FLAT, _mostly_unlit),
     ("sample_in", FLAT, flats_like_views(single=True)),
-    ("sample_in", FLAT, outshone),
+    ("sample_in", FLAT, flats_below_views),
     ("sample_in", FLAT, flats_like_views(single=False)),
-    ("sample_in", FLAT, mass_missing),
+    ("sample_in", FLAT, views_lack_mass),
     ("views_alike", FLAT, views_show_nothing),
     ("views_brighter", FLAT, views_brighter),
 )
-"""What is found, on frames of which kind, and how; in their order."""
+"""Each rule: its name, the kind of frames that it judges, and the predicate; in the order in which they are asked."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamline.monitor.evidence import BRIGHT, Evidence, Odd, lit_places, place_noise
+from beamline.monitor.evidence import BRIGHT, DRIFT, BadFrames, Evidence, lit_places, place_noise
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, F64, Mask
 
@@ -21,19 +21,18 @@ LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by
 CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
 BRIGHTER = 0.5  # flats hold the sample where places outshine them by this share of what the views take elsewhere
 LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
-DRIFTS = 0.02  # of the light: a beam may drift by so much (as in the check `beam`), so a weaker sample is not judged
 AIR = 0.1  # line integral at the edges of the field from which they are no air
 EDGE = 16  # one column in so many, at each edge, is taken for air
 FEWEST, SHALLOW = 8, 10.0  # lit views at least, and percent of them that may be taken for the emptiest at a place
 OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further below
 
 
-def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[Odd]]:
+def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[BadFrames]]:
     """The rule that flats differ less from a view than from other flats: each from those of its group, or groups."""
     return partial(_like_views, single=single)
 
 
-def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[Odd]:
+def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]:
     views, groups = evidence.lit_views, evidence.of_kind(FrameKind.FLAT)
     if len(views) < FEWEST:
         return
@@ -48,11 +47,11 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[Odd]:
     else:
         means = [np.mean(own, axis=0) for own in light]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
-    beside, odd = "others of their group" if single else "other flats", list[Odd]()
+    beside, odd = "others of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
         if others and (found := _nearest_view(image, others, seen)) is not None:
             off, like, nearest = found
-            odd.append(Odd(frames, off, like / LIKER, (
+            odd.append(BadFrames(frames, off, like / LIKER, (
                 f"they differ from the {beside} by {off:.3g} of line integral, and by {like:.2g} only from the view in "
                 f"frame {views[nearest].row}: the sample was in the beam."
             )))  # fmt: skip
@@ -70,23 +69,23 @@ def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tu
     return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
 
 
-class Emptiest(NamedTuple):
+class ViewsAboveFlats(NamedTuple):
     """How much brighter than each group of flats [group] views are where they are emptiest, as line integrals.
 
     Attributes:
-        tops: in their brightest places; an open beam: 0.
-        edges: at the edge of the field where it is least.
-        unlike: by which each group differs in places from that with the least top, but for a factor.
+        brightest: in the places where views are brightest; an open beam: 0.
+        at_edges: the lesser of both edges of the field.
+        mismatch: by how much each group differs in places from the group with the least `brightest`, factors aside.
         limit: what noise does not reach.
     """
 
-    tops: F64
-    edges: F64
-    unlike: F64
+    brightest: F64
+    at_edges: F64
+    mismatch: F64
     limit: float
 
 
-def _emptiest(evidence: Evidence) -> Emptiest | None:
+def _emptiest(evidence: Evidence) -> ViewsAboveFlats | None:
     views = [evidence.light(view) for view in evidence.lit_views]
     light = [
         np.asarray(np.mean([evidence.light(flat) for flat in group], axis=0), np.float32)
@@ -96,16 +95,18 @@ def _emptiest(evidence: Evidence) -> Emptiest | None:
     if len(views) < FEWEST or not lit.any():
         return None
     over = [np.percentile([log_ratio(view, each, lit) for view in views], 100 - SHALLOW, axis=0) for each in light]
-    tops = np.percentile(over, WORST, axis=1)
+    brightest = np.percentile(over, WORST, axis=1)
     columns, n = np.nonzero(lit)[1], max(1, lit.shape[1] // EDGE)
     sides = [columns < columns.min() + n, columns > columns.max() - n]
-    edges = np.min([np.median(np.array(over)[:, side], axis=1) for side in sides], axis=0)
-    changes = [log_ratio(each, light[int(np.argmin(tops))], lit) for each in light]
-    unlike = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
-    return Emptiest(tops, edges, unlike, max(AIR, SIGMAS * max(place_noise(change) for change in changes)))
+    at_edges = np.min([np.median(np.array(over)[:, side], axis=1) for side in sides], axis=0)
+    changes = [log_ratio(each, light[int(np.argmin(brightest))], lit) for each in light]
+    mismatch = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
+    return ViewsAboveFlats(
+        brightest, at_edges, mismatch, max(AIR, SIGMAS * max(place_noise(change) for change in changes))
+    )
 
 
-def outshone(evidence: Evidence, _: Any) -> Iterator[Odd]:
+def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """Groups of flats that are darker than views in places where other flats are not: an object was in the beam.
 
     Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
@@ -113,30 +114,30 @@ def outshone(evidence: Evidence, _: Any) -> Iterator[Odd]:
     groups = evidence.of_kind(FrameKind.FLAT)
     if len(groups) < 2 or (seen := _emptiest(evidence)) is None:
         return
-    least = float(seen.tops.min())
-    for group, top, unlike in zip(groups, seen.tops.tolist(), seen.unlike.tolist(), strict=True):
-        if min(top, top - least, unlike) > seen.limit:
-            yield Odd(group, top, seen.limit, (
+    least = float(seen.brightest.min())
+    for group, top, mismatch in zip(groups, seen.brightest.tolist(), seen.mismatch.tolist(), strict=True):
+        if min(top, top - least, mismatch) > seen.limit:
+            yield BadFrames(group, top, seen.limit, (
                 f"in places the views are brighter than they by {top:.3g} of line integral (limit {seen.limit:.2g}), "
                 f"and than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
                 "something else, was in the beam."
             ))  # fmt: skip
 
 
-def views_brighter(evidence: Evidence, _: Any) -> Iterator[Odd]:
+def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """Views are brighter than flats in places, and less at the edges."""
     if (seen := _emptiest(evidence)) is not None:
-        most = int(np.argmax(seen.tops))
-        top = float(seen.tops[most])
-        if min(top, top - float(seen.edges[most])) > seen.limit:
-            yield Odd((), top, seen.limit, (
+        most = int(np.argmax(seen.brightest))
+        top = float(seen.brightest[most])
+        if min(top, top - float(seen.at_edges[most])) > seen.limit:
+            yield BadFrames((), top, seen.limit, (
                 f"In places the views are brighter than the flats by {top:.2g} of line integral, though a sample only "
                 "takes light. Was the sample, or something else, in the beam for the flats, or did the beam change its "
                 "shape?"
             ))  # fmt: skip
 
 
-def mass_missing(evidence: Evidence, _: Any) -> Iterator[Odd]:
+def views_lack_mass(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """All flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
@@ -149,7 +150,7 @@ def mass_missing(evidence: Evidence, _: Any) -> Iterator[Odd]:
     mean = depth.mean(axis=0)
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
-        yield Odd(flats, brighter, limit, (
+        yield BadFrames(flats, brighter, limit, (
             f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
             "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
             "shape between flats and views."
@@ -159,14 +160,14 @@ def mass_missing(evidence: Evidence, _: Any) -> Iterator[Odd]:
     deepest = -np.percentile(turning, SHALLOW, axis=0) - OF_SHALLOW * place_noise(turning)
     masses, least = depth.mean(axis=(1, 2)), float(deepest.mean())
     seen = float(masses.mean())
-    if np.percentile(deepest, WORST) > DRIFTS and LIGHTER * least - seen > SIGMAS * float(masses.std()):
-        yield Odd(flats, seen, LIGHTER * least, (
+    if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
+        yield BadFrames(flats, seen, LIGHTER * least, (
             f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but "
             f"against these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
         ))  # fmt: skip
 
 
-def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[Odd]:
+def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """Views differ from flats and from one another by noise alone."""
     if (depth := _depth_over_air(evidence)) is None:
         return
@@ -174,7 +175,7 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[Odd]:
     limits = [SIGMAS * place_noise(part) for part in (mean, depth - mean)]
     shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
     if all(most < limit for most, limit in zip(shown, limits, strict=True)):
-        yield Odd((), max(shown), max(limits), (
+        yield BadFrames((), max(shown), max(limits), (
             f"No view looked at differs from the flats by more than noise (line integrals below {max(shown):.2g}). "
             "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
             "all sides."

@@ -79,11 +79,11 @@ def paces_of(methods: Iterable[Method], geometry: Geometry, grid: Grid, now: Clo
     for method in methods:
         if method.name in USEFUL:
             try:
-                paces[method.name] = timing.whole(method)
+                paces[method.name] = timing.whole_pace(method)
             except ValueError as error:
                 refused.append(f"{method.name}: {error}")
     if not paces:
-        raise ValueError("; ".join(refused) or "none of the methods has a length that a time could choose")
+        raise ValueError("; ".join(refused) or "no method has steps or iterations that the seconds could limit")
     return paces
 
 

@@ -129,7 +129,7 @@ def _seconds(
         raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}.") from error
     if expected is None:
         return None
-    choice = 0.0 if options.partial is not None else expected.choice  # it was made before
+    choice = 0.0 if options.partial is not None else expected.choice_seconds  # it was made before
     share = sum(slab.slices.stop - slab.slices.start for slab in missing) / grid.shape[0]  # slabs overlap
     bars = 1 + options.uncertainty  # error bars take at most as long
     least, most = (bars * (choice + share * each(expected.volumes.values())) for each in (min, max))

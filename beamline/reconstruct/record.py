@@ -16,9 +16,9 @@ from beamline.core.events import Sink, VolumeDone, Warned
 from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
-from beamline.reconstruct.measured import MeasuredVolume, measured
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.scan_facts import ReportContext, label_of
+from beamline.reconstruct.volume_checks import CheckedVolume, check_volume
 from beamline.report.history import history_arrays
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
@@ -76,11 +76,11 @@ def write_result(
     """
     phases = context.phases
     phases.enter("measuring the volume")
-    found = measured(made, prepared.ordinary, truth, target, context, sink, clock)
-    remarks = [*found.warnings, *([found.left_out_text] if found.left_out_text else [])]
-    stray = found.stray.map if found.stray is not None and found.stray.share > 0 else None
+    checked = check_volume(made, prepared.ordinary, truth, target, context, sink, clock)
+    remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
+    stray = checked.stray.map if checked.stray is not None and checked.stray.share > 0 else None
     context = replace(context, warnings=remarks, stray=stray)
-    record, volumes = _record(found, prepared, context, clock.now())
+    record, volumes = _record(checked, prepared, context, clock.now())
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
@@ -88,7 +88,7 @@ def write_result(
     if (page := target.report) is not None:
         phases.enter("report")
         try:
-            timed = _report(page, found, volumes, record.parameters, context)
+            timed = _report(page, checked, volumes, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
@@ -104,7 +104,7 @@ def write_result(
 
 def _report(
     page: Path,
-    found: MeasuredVolume,
+    checked: CheckedVolume,
     volumes: Mapping[str, Volume],
     parameters: Mapping[str, Value],
     context: ReportContext,
@@ -113,8 +113,10 @@ def _report(
     from beamline.reconstruct.report import compose  # here: matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
-    made, target = found.made, found.target
-    report = compose(made, found.prepared, found.truth, volumes, found.metrics, parameters, context, found.unexplained)
+    made, target = checked.made, checked.target
+    report = compose(
+        made, checked.prepared, checked.truth, volumes, checked.metrics, parameters, context, checked.unexplained
+    )
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(page, report, replace=target.replace)
     return partial(write_timed, page, report, label_of(made.method))
@@ -125,15 +127,15 @@ def _nothing(elapsed: float) -> None:
 
 
 def _record(
-    found: MeasuredVolume, prepared: PreparedProjections, context: ReportContext, now: float
+    checked: CheckedVolume, prepared: PreparedProjections, context: ReportContext, now: float
 ) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
-    made, target = found.made, found.target
+    made, target = checked.made, checked.target
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))
 
-    volumes = {method: written(volume) for method, volume in found.volumes.items()}
+    volumes = {method: written(volume) for method, volume in checked.volumes.items()}
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
@@ -142,14 +144,14 @@ def _record(
         sample=context.facts.sample or "not stated",
         time=now,
         parameters=parameters_of(made, prepared, context),
-        metrics=found.metrics[made.method],
+        metrics=checked.metrics[made.method],
         history=history_arrays(made.history),
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
         deviation=None if made.deviation is None else written(made.deviation).data,
         series=made.series,
-        compared=found.metrics.get(BASELINE) if len(found.metrics) > 1 else None,
-        warnings=tuple(found.warnings),
-        hiding=found.hiding,
+        compared=checked.metrics.get(BASELINE) if len(checked.metrics) > 1 else None,
+        warnings=tuple(checked.warnings),
+        hiding=checked.hiding_warning,
         chosen=made.chosen,
         output=target.output,
         report=target.report,
@@ -293,7 +295,7 @@ def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
 
 
 def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
-    """How the axis was found, from the parameters of a reconstruction; None if the user gave it."""
+    """How the axis was checked, from the parameters of a reconstruction; None if the user gave it."""
     if "axis_curve" not in parameters:
         return None
     return AxisEstimate(

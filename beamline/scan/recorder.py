@@ -121,7 +121,7 @@ class Recorder:
         self._monitor_off = False
         self._unjudged: list[int] = []  # frames that the monitor did not look at
         self._check_name = ""  # that looks, or looked last
-        self._handing = threading.Lock()  # of the two values below: whoever takes the frame out hands it on
+        self._handing = threading.Lock()  # for the next two values: one thread alone hands the frame on
         self._under_checks: tuple[Frame, float] | None = None  # what the first thread works on, and since when
         self._alone = False  # the second thread goes on without the first
         self._compiled: set[FrameKind] = set()  # kinds of frames that were checked

@@ -8,7 +8,7 @@ from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest, check_block
-from beamline.monitor.evidence import Evidence, SeenFrame, photons
+from beamline.monitor.evidence import Evidence, FrameStatistics, photons
 from beamline.monitor.references import ReferenceLimits, judge
 from beamline.plan.plan import Block
 from drivers.base.frame import Frame, FrameKind
@@ -27,7 +27,7 @@ class ReferenceLog:
     def add(self, frame: Frame, digest: FrameDigest) -> None:
         """The next frame, in the order of the file. `digest`: that of the checks."""
         if frame.kind in REFERENCES or (frame.kind is FrameKind.PROJECTION and len(self.evidence.views) < VIEWS):
-            seen = SeenFrame.of(frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape))
+            seen = FrameStatistics.of(frame.index, frame.kind, frame.exposure, digest, check_block(frame.counts.shape))
             self.evidence = self.evidence.with_frame(seen, begins=frame.kind is not self._before)
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
         if frame.replaces >= 0:

@@ -141,8 +141,8 @@ def record_sink(file: RecordFile) -> Sink:
 def record_of(part: Path) -> RunRecord:
     """The record of a part; frames of one that died, and all of a part without a record, by its file.
 
-    Where the file cannot be read, as when a kill came while it was created, the record's last number of frames is
-    returned. Flags are the record's where it has some, since the file holds none of the level `info`.
+    If the file cannot be read, as after a kill while it was created, the number of frames is the record's last one.
+    Flags come from the record if it has any, since the file does not hold those of level `info`.
     """
     record = read_record(part)
     if record is not None and record.state != DIED:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import to_disk
 from beamline.core.text import size
-from beamline.storage.superblock import Superblock, make_whole
+from beamline.storage.superblock import Superblock, mend_checksum
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
 _ENDLESS = 2**60  # bytes, more than any file grows to
@@ -94,7 +94,7 @@ class GrowingFile(UnderHdf5):
         super()._read(at, out)
         head = self._head[at : at + len(out)]
         out[: len(head)] = head
-        make_whole(at, out)
+        mend_checksum(at, out)
 
 
 class DiskFile(UnderHdf5):

@@ -151,7 +151,7 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
             require_ours(path, file)
             committed, frames = int(file[layout.COMMITTED][()]), _frames_there(file)
             if frames == 0 < committed:
-                raise ValueError(f"none of its {committed} frames is whole")
+                raise ValueError(f"all of its {committed} frames are damaged")
             ending, lost = ending_in(file), tuple(range(frames, committed))
             with hdf5.created(target, layout.LIBVER) as made:
                 damaged = copy_rows(file, frames, made)

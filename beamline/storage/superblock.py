@@ -73,7 +73,7 @@ def superblock(path: Path) -> Superblock | None:
     return Superblock(head, path.stat().st_size) if head[_CHECKSUM] == lookup3(head[: _CHECKSUM.start]) else None
 
 
-def make_whole(at: int, read: memoryview) -> None:
+def mend_checksum(at: int, read: memoryview) -> None:
     """Repair the checksum of a block in `read`, the bytes from `at` on that HDF5 asked for, that a kill or a loss of
     power left half written: across the end of a page of memory, each field is the new or the old one."""
     size = block_size(read)

@@ -107,7 +107,7 @@ def tradeoff(request: TradeoffRequest) -> None:
 
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses.
     Writes a folder with tradeoff.csv, pictures and an HTML page.
-    Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
+    Ctrl-C keeps the trials that are done (exit code 4); before the first one it writes nothing (130).
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.features.trials.tradeoff import planned_tradeoff

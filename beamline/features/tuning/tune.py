@@ -22,7 +22,7 @@ from beamline.core.stop import StopRequest
 from beamline.core.text import degrees, rounded
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.digest import digest
-from beamline.monitor.evidence import Evidence, SeenFrame
+from beamline.monitor.evidence import Evidence, FrameStatistics
 from beamline.monitor.references import ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
@@ -187,7 +187,7 @@ def evaluate(
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
     references = [
-        SeenFrame.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
+        FrameStatistics.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
     groups = tuple(references[: len(darks)]), tuple(references[len(darks) :])

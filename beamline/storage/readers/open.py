@@ -39,11 +39,11 @@ from beamline.storage.readers.transforms import (
     as_unsigned,
     cropped,
     in_parts,
-    keyed,
     kinds_and_views,
     selected,
     turned,
     type_wrapped,
+    with_kinds,
 )
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
@@ -177,7 +177,7 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
         if options.earlier:
             base = in_parts([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
         if kinds is not None:
-            base = keyed(base, kinds)
+            base = with_kinds(base, kinds)
         opened.pop_all()
     return base
 

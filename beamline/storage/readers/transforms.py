@@ -86,7 +86,7 @@ def turned(base: ScanSource) -> ScanSource:
     )
 
 
-def keyed(base: ScanSource, kinds: str) -> ScanSource:
+def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
     """A scan whose kinds of frames are assigned by the caller, or which has only the frames of one energy.
 
     Args:
@@ -167,13 +167,13 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
 
 def in_words(energies: NDArray[np.float64]) -> str:
     """How many frames have which energy, such as "45 at 20 keV and 45 at 30 keV"."""
-    parts = of_energies(energies)
+    parts = frames_by_energy(energies)
     listed = [f"{n} at {kev:.6g} keV" for kev, n in parts[:_LISTED]]
     listed += [f"and more up to {parts[-1][0]:.6g} keV"] if len(parts) > _LISTED else []
     return ", ".join(listed)
 
 
-def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
+def frames_by_energy(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
     """(keV, number of frames) of each energy; energies within a part in ten thousand are the same."""
     known = np.sort(energies[np.isfinite(energies)])
     parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import Finding
-from beamline.monitor.evidence import BRIGHT, lights_in_turn, lit_places, place_noise
+from beamline.monitor.evidence import BRIGHT, DRIFT, lights_in_turn, lit_places, place_noise
 from beamline.monitor.references import LIT, LIT_SIGMAS, ReferenceLimits
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
-from beamline.storage.readers.transforms import in_words, of_energies, selected
+from beamline.storage.readers.transforms import frames_by_energy, in_words, selected
 from beamline.storage.rules.references import (
     EXPOSURE_TOLERANCE,
     ReferenceGroups,
@@ -276,7 +276,6 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
 
 
 _IN_A_ROW, _BESIDE = 12, np.radians(20.0)  # views looked at; between them: a wide sample differs from farther sides
-_DRIFT = 0.02  # share of the light by which views may exceed their flats
 _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
 
 
@@ -300,7 +299,7 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
         "error" if lights_in_turn(_light_levels(source, flats[:_IN_A_ROW])) else "warning",
         "light",
         f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
-        f"apart): thresholds, exposures or energies, of which a volume takes one. {_way_of_steps(source, n, most)}",
+        f"apart): thresholds, exposures or energies. A volume can use only one. {_way_of_steps(source, n, most)}",
     )
 
 
@@ -329,7 +328,7 @@ def _share_of_flats(source: ScanSource, step: slice, most: float) -> float:
         for kind in (FrameKind.FLAT, FrameKind.PROJECTION)
     )
     share = math.exp(np.median(views) - np.median(flats))
-    return share if np.ptp(flats) < most and share <= 1 + _DRIFT else 0.0
+    return share if np.ptp(flats) < most and share <= 1 + DRIFT else 0.0
 
 
 def one_energy(source: ScanSource) -> Iterator[Finding]:
@@ -337,7 +336,7 @@ def one_energy(source: ScanSource) -> Iterator[Finding]:
     if (energies := source.energies) is None:
         return
     of_views = energies[source.image_key == FrameKind.PROJECTION]
-    if len(parts := of_energies(of_views)) > 1:
+    if len(parts := frames_by_energy(of_views)) > 1:
         yield Finding(
             "error",
             "energies",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.flag import Finding
 from beamline.monitor.digest import block_means, check_block, is_valid, thinned
-from beamline.monitor.evidence import BRIGHT, LEAST_NOISE, Evidence, SeenFrame, full_scale, lit_places
+from beamline.monitor.evidence import BRIGHT, DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
 from beamline.monitor.references import ReferenceLimits, judge
 from beamline.storage.readers.base import ScanSource, read_known
 from drivers.base.frame import FrameKind
@@ -23,7 +23,6 @@ from recon.base.views import spread
 from recon.prep.references import dark_at
 
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-BRIGHTER = 0.02  # share of the light by which views may exceed flats: the drift of a beam
 CELLS = 32  # across the frame, about, by which flats are compared with views
 WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
@@ -100,7 +99,7 @@ def _findings(source: ScanSource, taken: ReferenceGroups, limits: ReferenceLimit
     )
 
 
-def _views_beside(source: ScanSource, views: I64, flats: list[I64]) -> tuple[SeenFrame, ...]:
+def _views_beside(source: ScanSource, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
     """Views of the whole part, and next to its flats."""
     chosen = set(spread(views, VIEWS).tolist())
     for group in flats:
@@ -109,7 +108,7 @@ def _views_beside(source: ScanSource, views: I64, flats: list[I64]) -> tuple[See
     return _readable(source, np.array(sorted(chosen), np.int64))
 
 
-def _readable(source: ScanSource, rows: I64) -> tuple[SeenFrame, ...]:
+def _readable(source: ScanSource, rows: I64) -> tuple[FrameStatistics, ...]:
     """The frames, of these rows, that can be read; all, where none can."""
     read = tuple(seen_frame(source, int(row)) for row in rows)
     return tuple(frame for frame in read if frame.row not in source.unreadable) or read
@@ -141,10 +140,10 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
 
 
 # What was seen of frames, whose pixels do not change while the scan is open, by their rows.
-_seen: WeakKeyDictionary[ScanSource, dict[int, SeenFrame]] = WeakKeyDictionary()
+_seen: WeakKeyDictionary[ScanSource, dict[int, FrameStatistics]] = WeakKeyDictionary()
 
 
-def seen_frame(source: ScanSource, row: int) -> SeenFrame:
+def seen_frame(source: ScanSource, row: int) -> FrameStatistics:
     """Statistics of a frame of any kind, with its cells, which is read once.
 
     They are those with the dark of the shortest exposure and, of projections that differ, at the usual exposure.
@@ -163,7 +162,7 @@ def seen_frame(source: ScanSource, row: int) -> SeenFrame:
     return replace(frame, blocks=levelled("blocks"), cells=levelled("cells"), exposure=usual)
 
 
-def _as_it_is(source: ScanSource, row: int) -> SeenFrame:
+def _as_it_is(source: ScanSource, row: int) -> FrameStatistics:
     seen = _seen.setdefault(source, {})
     if row not in seen:
         seen[row] = look_at(read_known(source, [row])[0], row)
@@ -171,13 +170,13 @@ def _as_it_is(source: ScanSource, row: int) -> SeenFrame:
     return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
 
 
-def look_at(image: NDArray[Any], row: int) -> SeenFrame:
+def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
     """Statistics of an image, with its cells."""
     counts, block = image.dtype.kind in "ui", check_block(image.shape)
     saturated = float(np.mean(image >= full_scale(float(image.max())))) if counts else 0.0
     blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS)))
     invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
-    return SeenFrame(
+    return FrameStatistics(
         row,
         FrameKind.INVALID,
         np.nan,
@@ -242,7 +241,7 @@ def exposures_of(source: ScanSource) -> F64:
     most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
     of_views = source.exposures[views]
     for each in (of_views.max(), np.median(of_views), of_views.min()):
-        if each <= (1 + BRIGHTER) * most:
+        if each <= (1 + DRIFT) * most:
             return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
     return source.exposures
 

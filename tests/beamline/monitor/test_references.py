@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.flag import Finding
 from beamline.monitor.digest import digest
-from beamline.monitor.evidence import Evidence, SeenFrame, full_scale
+from beamline.monitor.evidence import Evidence, FrameStatistics, full_scale
 from beamline.monitor.references import ReferenceLimits, judge
 from drivers.base.frame import FrameKind
 
@@ -34,26 +34,26 @@ def frames(n: int, photons: float | NDArray[np.float64], seed: int, gain: float 
     ]
 
 
-def group(images: Images, kind: FrameKind, first: int = 0, exposure: float = 0.1) -> list[SeenFrame]:
+def group(images: Images, kind: FrameKind, first: int = 0, exposure: float = 0.1) -> list[FrameStatistics]:
     return [
-        SeenFrame.of(first + i, kind, exposure, digest(image.astype(np.uint16), FULL), 4)
+        FrameStatistics.of(first + i, kind, exposure, digest(image.astype(np.uint16), FULL), 4)
         for i, image in enumerate(images)
     ]
 
 
-def darks(photons: float = 0.0, n: int = 5) -> list[SeenFrame]:
+def darks(photons: float = 0.0, n: int = 5) -> list[FrameStatistics]:
     return group(frames(n, photons, 1), FrameKind.DARK)
 
 
-def flats(images: Images, first: int = 10) -> list[SeenFrame]:
+def flats(images: Images, first: int = 10) -> list[FrameStatistics]:
     return group(images, FrameKind.FLAT, first)
 
 
-def found(*groups: list[SeenFrame], limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
+def found(*groups: list[FrameStatistics], limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
     return judge(Evidence(tuple(map(tuple, groups))), limits)
 
 
-def rules(*groups: list[SeenFrame], limits: ReferenceLimits | None = None) -> list[str]:
+def rules(*groups: list[FrameStatistics], limits: ReferenceLimits | None = None) -> list[str]:
     return [finding.rule for finding in found(*groups, limits=limits)]
 
 

@@ -19,10 +19,10 @@ from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measured import measured
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import views_for
+from beamline.reconstruct.volume_checks import check_volume
 from beamline.scan.preflight import dry_run
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan
@@ -234,9 +234,9 @@ def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
 
     def noted(made: Reconstruction, views: PreparedProjections, *more: Any) -> Any:
         judged.append(views.geometry.n_views)
-        return measured(made, views, *more)
+        return check_volume(made, views, *more)
 
-    monkeypatch.setattr("beamline.reconstruct.record.measured", noted)
+    monkeypatch.setattr("beamline.reconstruct.record.check_volume", noted)
     used = []
     for method in (Fbp(), FistaTv(iterations=2, tv_weight=0.01)):
         target = OutputPaths(tmp_path / f"{method.name}.h5", None)

@@ -187,7 +187,7 @@ def test_a_block_that_a_kill_left_half_written_is_made_whole(
         for torn in _torn(before, path.read_bytes()) if k else ():
             died.write_bytes(torn)
             with monkeypatch.context() as patched, pytest.raises(DataError, match="checksum"):
-                patched.setattr("beamline.storage.disk_file.make_whole", lambda at, read: None)
+                patched.setattr("beamline.storage.disk_file.mend_checksum", lambda at, read: None)
                 recover(_aged(died))
             with open_scan(died) as source:  # while HDF5 itself would wait for ever for a writer to end the block
                 assert source.image_key.size == k

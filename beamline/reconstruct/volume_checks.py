@@ -42,17 +42,17 @@ _COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
 
 
 @dataclass(eq=False)
-class MeasuredVolume:
+class CheckedVolume:
     """A volume with what its views and FBP say of it.
 
     Attributes:
         volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
         metrics: figures of merit of each, by method.
         warnings: those of the context first.
-        left_out: checks for which there was no time.
+        skipped: checks for which there was no time.
         unexplained: what the volume leaves in the views; None where that is not known.
         stray: mass where views show nothing; None where it was not looked for.
-        hiding: the warning that the volume may hide structure; empty without one.
+        hiding_warning: the warning that the volume may hide structure; empty without one.
         seconds_of_views: to project all views, about.
     """
 
@@ -65,10 +65,10 @@ class MeasuredVolume:
     volumes: dict[str, Volume] = field(init=False)
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     warnings: list[str] = field(init=False)
-    left_out: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
     unexplained: Unexplained | None = None
     stray: StrayMass | None = None
-    hiding: str = ""
+    hiding_warning: str = ""
     seconds_of_views: float = 0.0
 
     def __post_init__(self) -> None:
@@ -91,13 +91,13 @@ class MeasuredVolume:
         return bool(FieldEdges.of(data, geometry).beyond())
 
     @property
-    def left_out_text(self) -> str:
+    def skipped_text(self) -> str:
         """A sentence on the checks left out and the reason; empty if none was."""
-        if not self.left_out:
+        if not self.skipped:
             return ""
         stopped = self.made.ending.early
         why = "the reconstruction was stopped" if stopped else "the seconds asked for were nearly over"
-        return f"Left out, as {why}: {', '.join(self.left_out)}."
+        return f"Left out, as {why}: {', '.join(self.skipped)}."
 
     def figures_of(self, volume: Volume, seconds: float) -> dict[str, float]:
         """Figures of merit; without residuals where the views show more than the volume."""
@@ -109,19 +109,19 @@ class _Check(NamedTuple):
     """A check of a volume.
 
     Attributes:
-        made: completes the figures, and returns a warning; empty: nothing speaks against the volume.
+        run: completes the figures, and returns a warning; empty: nothing speaks against the volume.
         concerns: whether it says anything of this volume.
         name: in the sentence on what was left out.
-        work: projections of all views that take as long, about; 0: it is always made.
+        projections: of all views that take as long, about; 0: it is always made.
     """
 
-    made: Callable[[MeasuredVolume], str]
-    concerns: Callable[[MeasuredVolume], bool] = lambda volume: True
+    run: Callable[[CheckedVolume], str]
+    concerns: Callable[[CheckedVolume], bool] = lambda volume: True
     name: str = ""
-    work: Callable[[MeasuredVolume], float] = lambda volume: 0.0
+    projections: Callable[[CheckedVolume], float] = lambda volume: 0.0
 
 
-def measured(
+def check_volume(
     made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
@@ -129,31 +129,31 @@ def measured(
     context: ReportContext,
     sink: Sink,
     clock: Clock,
-) -> MeasuredVolume:
+) -> CheckedVolume:
     """Compare a volume with its views and with FBP, and send each warning to `sink`.
 
     Checks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
     """
-    volume = MeasuredVolume(made, prepared, truth, target, context, clock)
+    volume = CheckedVolume(made, prepared, truth, target, context, clock)
     if made.series is not None:  # each view shows a volume of its own time
         volume.metrics[made.method] = {"residual": made.series.residual, "seconds": made.seconds}
         return volume
     for check in _CHECKS:
         if not check.concerns(volume):
             continue
-        work = check.work(volume)
+        work = check.projections(volume)
         if work and (made.ending.early or not context.leaves(work * volume.seconds_of_views)):
-            volume.left_out.append(check.name)
+            volume.skipped.append(check.name)
             continue
-        if sentence := check.made(volume):
+        if sentence := check.run(volume):
             sink(event_of_sentence(sentence, clock.now()))
             volume.warnings.append(sentence)
-    if volume.left_out_text:
-        sink(StateEntered("left_out", volume.left_out_text, time=clock.now()))
+    if volume.skipped_text:
+        sink(StateEntered("left_out", volume.skipped_text, time=clock.now()))
     return volume
 
 
-def _sample_radius(volume: MeasuredVolume) -> str:
+def _sample_radius(volume: CheckedVolume) -> str:
     """How far the sample reaches beside the field, and what that leaves open."""
     settings, prepared = volume.made.settings, volume.prepared
     radius, low, high, density = (settings[name] for name in SampleRadius(1, 1, 1, 1).settings)
@@ -170,7 +170,7 @@ def _sample_radius(volume: MeasuredVolume) -> str:
     )
 
 
-def _residual(volume: MeasuredVolume) -> str:
+def _residual(volume: CheckedVolume) -> str:
     """The figures of merit, and whether the volume shows anything of the sample."""
     made, prepared, clock = volume.made, volume.prepared, volume.clock
     before = clock.now()
@@ -200,7 +200,7 @@ def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     )
 
 
-def _structure(volume: MeasuredVolume) -> str:
+def _structure(volume: CheckedVolume) -> str:
     """Structure in the residual of the views."""
     made, prepared = volume.made, volume.prepared
     views, rng = prepared.projections.data, np.random.default_rng(volume.context.seed)
@@ -210,15 +210,15 @@ def _structure(volume: MeasuredVolume) -> str:
     share = volume.metrics[made.method]["unexplained"] = volume.unexplained.share
     if share > UNEXPLAINED_LIMIT:
         others = " and ".join(name for name in _COMPARED if name != made.method)
-        volume.hiding = (
+        volume.hiding_warning = (
             f"{share:.1%} of the matter leaves structure in the residual of the views (at most {UNEXPLAINED_LIMIT:.1%} "
             f"is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look at 'What the volume "
             f"leaves in the views' in the report, and compare with --method {others}."
         )
-    return volume.hiding
+    return volume.hiding_warning
 
 
-def _stray_mass(volume: MeasuredVolume) -> str:
+def _stray_mass(volume: CheckedVolume) -> str:
     """Mass where views show none."""
     made, prepared = volume.made, volume.prepared
     volume.stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
@@ -233,7 +233,7 @@ def _stray_mass(volume: MeasuredVolume) -> str:
     )
 
 
-def _needles(volume: MeasuredVolume) -> str:
+def _needles(volume: CheckedVolume) -> str:
     """Gaussians of a model that are needle-shaped."""
     model = volume.made.gaussians
     share = needles(model, volume.prepared.geometry).share if model is not None and model.n else 0.0
@@ -245,7 +245,7 @@ def _needles(volume: MeasuredVolume) -> str:
     )
 
 
-def _odd_views(volume: MeasuredVolume) -> str:
+def _odd_views(volume: CheckedVolume) -> str:
     """Views with a part that the volume does not explain."""
     prepared, selection, progress = volume.prepared, volume.context.selection, volume.context.phases.progress
     views, factors = prepared.projections.data, prepared.ray_factors()
@@ -271,7 +271,7 @@ def odd_views_warning(odd: Sequence[odd_views.OddView], frames: NDArray[np.int64
     )
 
 
-def _fbp(volume: MeasuredVolume) -> str:
+def _fbp(volume: CheckedVolume) -> str:
     """Put FBP of the same views first among the volumes."""
     prepared, context, grid = volume.prepared, volume.context, volume.made.volume.grid
     context.phases.enter("FBP for comparison", "slices")
@@ -285,7 +285,7 @@ def _fbp(volume: MeasuredVolume) -> str:
     return ""
 
 
-def _contrast(volume: MeasuredVolume) -> str:
+def _contrast(volume: CheckedVolume) -> str:
     """SNR and CNR of all volumes in regions of one reference: the truth, else FBP of the views, else none.
 
     Regions of the volume itself would give each method others.
@@ -298,7 +298,7 @@ def _contrast(volume: MeasuredVolume) -> str:
     return ""
 
 
-def _air(volume: MeasuredVolume) -> str:
+def _air(volume: CheckedVolume) -> str:
     """The level of air in each volume, if the views show air, relative to the noise of FBP there."""
     if volume.stray is not None and BASELINE in volume.volumes:
         _, noise = volume.stray.level(volume.volumes[BASELINE])
@@ -307,7 +307,7 @@ def _air(volume: MeasuredVolume) -> str:
     return ""
 
 
-def _lost_matter(volume: MeasuredVolume) -> str:
+def _lost_matter(volume: CheckedVolume) -> str:
     """Weakly absorbing matter that FBP shows."""
     made, fbp = volume.made, volume.volumes[BASELINE]
     beside_fbp = lost_matter(made.volume.data, fbp.data, _slices_seen(volume.prepared, fbp.grid))
@@ -336,7 +336,7 @@ _CHECKS = (
     _Check(
         _stray_mass,
         name="the look for mass where views show nothing",
-        work=lambda volume: stray_mass_share(volume.prepared.geometry, volume.made.volume.grid),
+        projections=lambda volume: stray_mass_share(volume.prepared.geometry, volume.made.volume.grid),
     ),
     _Check(_needles),
     _Check(
