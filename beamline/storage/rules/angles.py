@@ -90,7 +90,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "angle-spread",
             f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
+            + (_COUNTED if not source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 

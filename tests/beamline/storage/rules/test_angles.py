@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
+from beamline.storage.rules.angles import angles_spread
 from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, coarse_views
 from tests.beamline.array_source import ArraySource, scan_of
 
@@ -128,3 +129,11 @@ ORDERS = [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, tur
 )
 def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: NDArray[np.float64]) -> None:
     assert ordered(scan(balls, true, true)) == []
+
+
+def test_views_that_count_up_are_asked_about_unless_a_plan_of_ours_states_them() -> None:
+    source = scan(WITHIN, turn(60, 60), np.arange(60.0))
+    (asked,) = angles_spread(source)  # type: ignore[arg-type]
+    source.plan = {"angles_deg": np.arange(180.0)}
+    (known,) = angles_spread(source)  # type: ignore[arg-type]
+    assert "do they count the frames?" in asked.message and "count" not in known.message
