@@ -159,17 +159,6 @@ def new_folder_option(default: str) -> Decorator:
     return option("-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in this folder.")
 
 
-dry_option = option(
-    "--dry-run", "dry", is_flag=True,
-    help="Print what would run, the time and memory it will take and what would be written, and end.",
-)  # fmt: skip
-
-
-def names_in(value: str) -> tuple[str, ...]:
-    """Split names at commas."""
-    return tuple(name.strip() for name in value.split(",")) if value else ()
-
-
 def together(*options: Decorator) -> Decorator:
     """A decorator that adds these options, in this order."""
 

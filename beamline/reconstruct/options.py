@@ -28,8 +28,6 @@ from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
-_ROOM = 3.0  # times a volume: free disk from which on a second one is kept
-
 
 def report_beside(output: Path) -> Path:
     """The report of an output: report.html beside a run's recon.h5, else the output's own name with .html."""

@@ -22,8 +22,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.activation import OPTIONS
-from recon.kernels.cpu.engine import Active, Gradients, grid_layout, view_table
-from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
+from recon.kernels.cpu.engine import Active, Gradients, camera, footprint_table, grid_layout, seen_from
+from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W, footprints
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
@@ -36,6 +36,15 @@ F32 = NDArray[np.float32]
 N, SIDE = 50_000, 256
 RENDER_OPERATIONS, MOMENTS_OPERATIONS = 3, 7  # two products of the recurrence and the sums
 Timing = tuple[float, ...]
+
+
+def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
+    """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
+    table = footprint_table(active.densities.shape[0])
+    a = seen_from(active, geometry, view)
+    parameters = (a.means, a.scales, a.rotations, a.densities)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=a.kernel)
+    return table
 
 
 def _times(call: Callable[[], object], repeats: int = 21) -> Timing:

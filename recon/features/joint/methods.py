@@ -17,7 +17,6 @@ from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
-_OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
 _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
 
 

@@ -81,15 +81,6 @@ def seen_from(active: Active, geometry: Geometry, view: int) -> Active:
     return replace(active, means=active.means - centre.astype(np.float32)) if centre.any() else active
 
 
-def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
-    """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
-    table = footprint_table(active.densities.shape[0])
-    a = seen_from(active, geometry, view)
-    parameters = (a.means, a.scales, a.rotations, a.densities)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=a.kernel)
-    return table
-
-
 @dataclass(frozen=True, eq=False)
 class Scratch:
     """Scratch buffers for a view of n Gaussians; views rendered one after the other may share one.

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from recon.prep.correct import Projections
 
 _AUTO = "auto"
-_UNUSED = "Without a filter --unsharp is not used; give --phase paganin:RATIO."
 _NO_FILTER = "No filter predicts views held out (of 16 or more) better; give --phase paganin:RATIO for delta/beta."
 
 
