@@ -161,7 +161,7 @@ def test_findings_are_those_that_were_recorded(case: str) -> None:
     if case.startswith("real: ") and not (SHARED_DATA / REAL[case[6:]]).is_file():
         pytest.skip(f"{REAL[case[6:]]} is not beside this checkout (../shared/data)")
     if case.startswith("shared: ") and not (SHARED_CASES / case[8:]).is_dir():
-        pytest.skip(f"case {case[8:]} is not beside this checkout (../shared/cases)")
+        pytest.skip(f"case {case[8:]} is not in a folder beside the real scans")
     now, then = CASES[case](), recorded()[case]
     assert alike(now, then), "\n".join(
         [*(f"- {row}" for row in then if row not in now), *(f"+ {row}" for row in now if row not in then)]
