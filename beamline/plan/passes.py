@@ -1,0 +1,59 @@
+"""Passes: the parts of a scan's views, and what can be measured after each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from beamline.plan.plan import Block
+
+
+class Choice(StrEnum):
+    """What is measured next."""
+
+    NEXT = "next"  # the next pass of the plan
+    AGAIN = "again"  # the angles of the last pass once more, in place of the last pass still to come
+    WIDE = "wide"  # the wide views of the plan, now
+    RETAKE = "retake"  # views that were flagged, or gave no frame, now
+    ENOUGH = "enough"  # no further view
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """A scan at the end of a pass.
+
+    Attributes:
+        done: passes of views so far, oldest first; those taken again count once more.
+        to_come: passes of the plan that are left.
+        wide: blocks of wide views that were not taken yet.
+        retakes: views that can be taken again now.
+    """
+
+    done: tuple[Block, ...]
+    to_come: tuple[Block, ...]
+    wide: tuple[Block, ...] = ()
+    retakes: int = 0
+
+    @property
+    def n_views(self) -> int:
+        """Views so far."""
+        return sum(block.left for block in self.done)
+
+
+def pass_blocks(views: Block, step_views: int) -> tuple[Block, ...]:
+    """The passes of a block of views: its trains, or, of a step scan, so many views each.
+
+    Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
+    """
+    every = range(views.n)
+    passes = (replace(views, stored=views.stored | frozenset(every) - frozenset(one)) for one in _spans(views, step_views))
+    return tuple(block for block in passes if block.left)
+
+
+def _spans(views: Block, step_views: int) -> Iterator[range]:
+    first = 0
+    sizes = [train.n for train in views.trains] or [step_views or views.n] * -(-views.n // (step_views or views.n))
+    for n in sizes:
+        yield range(first, min(first + n, views.n))
+        first += n

@@ -1,0 +1,49 @@
+"""Error law: how the error of a volume falls with further views, and the gain in dB that follows for each kind.
+
+The mean square error of a volume of n views has three shares: `offset`, an unknown density beside the field that adds a
+constant in the middle and falls only with wide views; `noise`, which falls with the light, at the same angles too; and the
+rest, by gaps between the angles. The last two together fall as n^-exponent when views at new angles come.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Gain:
+    """A predicted gain in dB of PSNR, and the ends of what is likely (two standard errors)."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class ErrorLaw:
+    """The error of a volume of `n_views`, as measured without a truth; see the module.
+
+    Attributes:
+        n_views: of the volume.
+        exponent: of the fall of the mean square error with the number of views.
+        exponent_error: its standard error.
+        noise, offset: shares of the mean square error, each 0 to 1.
+    """
+
+    n_views: int
+    exponent: float
+    exponent_error: float
+    noise: float
+    offset: float = 0.0
+
+    def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
+        """dB by so many views at new angles, at the same angles again, and by wide views."""
+
+        def of(exponent: float) -> float:
+            noise = self.noise * self.n_views / (self.n_views + again)
+            left = (1 - self.noise - self.offset + noise) * (1 + views / self.n_views) ** -exponent
+            return -10 * math.log10(left + (0.0 if wide else self.offset))
+
+        low, high = (max(0.0, self.exponent + sign * 2 * self.exponent_error) for sign in (-1, 1))
+        return Gain(of(self.exponent), of(low), of(high))
