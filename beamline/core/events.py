@@ -238,6 +238,65 @@ class SlicesDrawn(Event, event="slices"):
     degrees: float
 
 
+class LawMeasured(Event, event="error_law"):
+    """How the error of the volume falls with further views, by the live reconstruction at the end of a pass.
+
+    Attributes:
+        n_views, exponent, exponent_error, noise, offset: as of `recon.assess.error_law.ErrorLaw`.
+        gained: dB by the last pass, as views held out measure it; None: not known.
+        seconds: that it took.
+    """
+
+    n_views: int
+    exponent: float
+    exponent_error: float
+    noise: float
+    offset: float
+    gained: float | None = None
+    seconds: float = math.nan
+
+
+class PassEnded(Event, event="pass_ended"):
+    """A pass of views is over. What is next is being chosen, or the operator is asked.
+
+    Attributes:
+        number: of the pass, from 1; n_views: so far.
+        options: what can be measured next, `beamline.plan.choose.Option` by their values: choice, frames, seconds, dose
+            (share of the plan's), bytes, and gain, low, high in dB (None: not known yet).
+        recommended: the choice that the program takes or would take.
+        wait: real s for which the operator is asked; 0: nobody is.
+        remark: a sentence, where no prediction is there.
+    """
+
+    number: int
+    n_views: int
+    options: Sequence[Mapping[str, Any]]
+    recommended: str
+    wait: float = 0.0
+    remark: str = ""
+
+
+class NextChosen(Event, event="next_chosen"):
+    """What is measured after a pass.
+
+    Attributes:
+        number: of the pass that ended, from 1; n_views: so far.
+        choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
+        reason: a sentence.
+        options: as of `PassEnded`.
+        predicted, gained: dB by the last choice, as predicted then and as measured now; None: not known.
+    """
+
+    number: int
+    n_views: int
+    choice: str
+    by: str
+    reason: str
+    options: Sequence[Mapping[str, Any]]
+    predicted: float | None = None
+    gained: float | None = None
+
+
 class EnoughReached(Event, event="enough"):
     """The views so far suffice: further views would add `mean` dB, between `low` and `high`."""
 

@@ -47,7 +47,8 @@ def pass_blocks(views: Block, step_views: int) -> tuple[Block, ...]:
     Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
     """
     every = range(views.n)
-    passes = (replace(views, stored=views.stored | frozenset(every) - frozenset(one)) for one in _spans(views, step_views))
+    others = (frozenset(every) - frozenset(one) for one in _spans(views, step_views))
+    passes = (replace(views, stored=views.stored | other) for other in others)
     return tuple(block for block in passes if block.left)
 
 
