@@ -184,7 +184,8 @@ class PassLaws:
         """Measure and report the law of the newest pass, if it is over and was not looked at yet.
 
         The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
-        depend on the ratio alone. What prevents a law becomes a warning.
+        depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
+        known. What prevents a law becomes a warning.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -216,5 +217,7 @@ class PassLaws:
             self._warn(f"The law of the error is not known, so that no gain by further views is predicted: {why}.")
             return
         law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
+        if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
+            law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
         now = self._clock.now()
         self._sink(LawMeasured(**vars(law), gained=measured.gained, seconds=now - begin, time=now))

@@ -38,6 +38,7 @@ class Laws:
 
     asked: list[tuple[np.ndarray, Geometry, list[int]]] = field(default_factory=list)
     error: Exception | None = None
+    offset: float = 0.0
 
     def __call__(
         self, data: np.ndarray, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator
@@ -45,7 +46,7 @@ class Laws:
         self.asked.append((data, geometry, list(sizes)))
         if self.error is not None:
             raise self.error
-        return SimpleNamespace(law=ErrorLaw(sizes[-1], 1.5, 0.1, 0.25), gained=0.5 * len(sizes))
+        return SimpleNamespace(law=ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), gained=0.5 * len(sizes))
 
     @property
     def sizes(self) -> list[list[int]]:
@@ -188,12 +189,27 @@ def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
     wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0) for frame in views[:3]]
     order = [*FRAMES[:14], *wide, *views]
     passes(scan=(14, 27))
+    laws.offset = 0.2
     scan = follow([replace(frame, index=i) for i, frame in enumerate(order)], flags=alarms(6, 13), wide_views=True)
     for n in (14, 13):
         scan.seconds(n)
     assert laws.sizes == [[8], [8, 18]]
     angles = np.delete(INTERLACED.angles[:10], (2, 9))
     np.testing.assert_allclose(laws.asked[1][1].angles, [*angles, *INTERLACED.angles[:10]], atol=1e-6)
+    shares = [(law["noise"], law["offset"]) for law in scan.of("error_law")]
+    assert shares == [(0.25, 0.2), (0.25 / 0.8, 0.0)]  # wide views make known what lies beside the field
+
+
+def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=(14, 15))
+    scan = follow([*FRAMES[:14], replace(FRAMES[5], index=14, replaces=5)])
+    for n in (14, 1):
+        scan.seconds(n)
+    assert laws.sizes == [[10], [9, 10]]
+    angles = INTERLACED.angles
+    np.testing.assert_allclose(laws.asked[1][1].angles, [angles[0], *angles[2:10], angles[1]], atol=1e-6)
 
 
 def test_a_selection_of_views_stands_for_all(
