@@ -16,6 +16,7 @@ from beamline.core.events import Event, LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.reconstruct import live_fit
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.nxtomo import NXtomoSource
@@ -141,6 +142,18 @@ def test_a_pass_that_the_next_one_overtakes_is_left_out_and_later_views_have_no_
     passes(scan=ENDS)
     follow().seconds(28)
     assert laws.sizes == [[10, 20]] and len(laws.asked[0][0]) == laws.asked[0][1].n_views == 20
+
+
+def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_fit, "BATCH_VIEWS", 8)
+    passes(scan=ENDS)
+    scan, asked = follow(), []
+    for n in (28, 0, 0):
+        scan.seconds(n)
+        asked.append(len(laws.asked))
+    assert asked == [0, 0, 1] and laws.sizes == [[10, 20]]
 
 
 def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> None:
