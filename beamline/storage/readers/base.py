@@ -167,6 +167,12 @@ class ScanSource(ABC):
         return None
 
     @property
+    def decisions(self) -> tuple[Mapping[str, Any], ...]:
+        """What was chosen after each pass: the values of the event `next_chosen`, oldest first; empty where nothing
+        was."""
+        return ()
+
+    @property
     def part_starts(self) -> NDArray[np.int64]:
         """int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted.
 

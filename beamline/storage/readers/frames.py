@@ -113,6 +113,7 @@ _JOINED: dict[str, Callable[[Any, _Sizes], Any]] = {
         ("altered", "damaged"), lambda each, sizes: frozenset(r + n for s, n in _after(each, sizes) for r in s)
     ),
     "flags": FrameFlags.joined,
+    "decisions": lambda each, sizes: sum(each, ()),
     "checksummed": lambda each, sizes: all(each),
 }
 """How what several sources say becomes one value; else it is that of the last."""
