@@ -37,7 +37,7 @@ from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
-NO_LIVE = ("recon.live=false", "recon.stop_when=null")
+NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
 

@@ -228,7 +228,7 @@ class _Run:
         with ExitStack() as ending:
             follower = None
             if command is not None:
-                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink, self.stop.stop_as_enough)
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink)
                 ending.callback(follower.close)
             return self._acquire_and_follow(writer, follower, release)
 
