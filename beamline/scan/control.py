@@ -54,7 +54,7 @@ NEXT: Mapping[State, frozenset[State]] = {
     State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
     **{state: (_TAKING - {state}) | {State.ASKING, State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
     State.ASKING: _TAKING | {State.PAUSED, State.FINISHING, State.FAILED},
-    State.PAUSED: _TAKING | {State.ASKING, State.FINISHING, State.FAILED},
+    State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
     State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
     **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
 }
