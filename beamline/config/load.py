@@ -185,6 +185,7 @@ def plan_of(config: Config) -> ScanPlan:
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,
+        pass_views=scan.pass_views,
         retake_share=config.monitor.retake_share if config.monitor.retake else 0.0,
     )
 
