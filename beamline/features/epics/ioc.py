@@ -74,10 +74,10 @@ class RunServer:
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
+        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))  # kept: a PV alone loses its handler
+        self._decide.put(self._take_answer)
         if control:
-            answer = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))
-            answer.put(self._take_answer)
-            provider.add(prefix + "Decide", answer)
+            provider.add(prefix + "Decide", self._decide)
         try:
             self._server = Server(providers=[provider], conf={"EPICS_PVAS_INTF_ADDR_LIST": address})
         except RuntimeError as error:
