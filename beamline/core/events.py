@@ -300,16 +300,6 @@ class NextChosen(Event, event="next_chosen"):
     judged: int | None = None
 
 
-class EnoughReached(Event, event="enough"):
-    """The views so far suffice: further views would add `mean` dB, between `low` and `high`."""
-
-    n_views: int
-    planned: int
-    mean: float
-    low: float
-    high: float
-
-
 class Counted(Event, event="progress"):
     """n of so many frames, slices, views or axes are done; `stage` names the work."""
 

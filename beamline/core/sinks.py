@@ -14,7 +14,6 @@ from beamline.core.events import (
     BlockDone,
     BlockStarted,
     Done,
-    EnoughReached,
     Event,
     Failed,
     FrameFlagged,
@@ -66,9 +65,6 @@ def sentence(event: Event) -> str | None:
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
             return f"Volume from {n_views} views so far: {path}"
-        case EnoughReached(n, planned, mean, low, high):
-            spread = f"{mean:.2f} dB ({low:.2f} to {high:.2f})"
-            return f"Enough views: {n} of {planned}; the others would add {spread}"
         case PassEnded():
             return "\n".join(_options(event))
         case NextChosen():
@@ -187,7 +183,8 @@ def _decision(chosen: NextChosen) -> str:
     if chosen.gained is None:
         return said
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
-    return f"{said.rstrip('.')}. The choice before: {predicted}measured {chosen.gained:+.2f} dB"
+    which = "before" if chosen.judged is None else f"after pass {chosen.judged}"
+    return f"{said.rstrip('.')}. The choice {which}: {predicted}measured {chosen.gained:+.2f} dB"
 
 
 def _missing(block: BlockDone) -> str | None:

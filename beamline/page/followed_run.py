@@ -76,8 +76,8 @@ class RunValues:
     recommended: str = published("Recommended", "the one of Options that the program takes or would take", "")
     wait: float = published("AnswerWithin", "for which the operator is asked what is next; 0: nobody is", 0.0, "s")
     decision: str = published("Decision", "what was chosen last, by whom, and why", "")
-    predicted_gain: float = published("PredictedGain", "by the choice before, as predicted then", math.nan, "dB")
-    measured_gain: float = published("MeasuredGain", "by the choice before, as measured", math.nan, "dB")
+    predicted_gain: float = published("PredictedGain", "by an earlier choice, as predicted then", math.nan, "dB")
+    measured_gain: float = published("MeasuredGain", "by an earlier choice, as measured", math.nan, "dB")
 
 
 def answer_of(values: RunValues, word: str) -> Verb:

@@ -421,7 +421,7 @@ class _Run:
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
                 next_pass=None if self.config.scan.decide == "off" else decider,
                 pass_ended=recorder.end_pass,
-                may_retake=lambda missing: min(len(self._bad(recorder, missing)), self._may_retake(recorder)),
+                may_retake=lambda missing: len(self._to_retake(recorder, missing)[0]),
             ),
         )  # fmt: skip
 
@@ -460,32 +460,29 @@ class _Run:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged for it or gave no frame; of more than the plan allows, an even spread."""
-        bad, most = self._bad(recorder, missing), self._may_retake(recorder)
-        chosen = spread_retakes(bad, most)
+        """Views that were flagged for it or gave no frame, which are announced."""
+        chosen, n = self._to_retake(recorder, missing)
         if not chosen:
             return ()
-        if len(chosen) < len(bad):
+        if len(chosen) < n:
             message = (
-                f"{len(bad)} views were flagged or gave no frame, and {most} may be taken again "
-                f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
+                f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
+                f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
             )
             self.sink(Warned(message))
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
 
-    def _bad(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged or gave no frame, by trigger; none where none may be taken again."""
-        if not self._may_retake(recorder):
-            return ()
+    def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
+        """Views that were flagged or gave no frame, and their number; of more than the plan allows, an even spread."""
+        most = self.ready.plan.retakes - recorder.announced
+        if not most:
+            return (), 0
         recorder.wait()
-        lost = [] if self.stop.stopping else [*recorder.views_to_retake, *(Retake(-1, trigger) for trigger in missing)]
-        return sorted(lost, key=lambda view: view.trigger)
-
-    def _may_retake(self, recorder: Recorder) -> int:
-        """Views that may still be taken again by the plan."""
-        return self.ready.plan.retakes - recorder.announced
+        lost = [Retake(-1, trigger) for trigger in missing]
+        bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
+        return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
 
 
 def wait_in_pause(recorder: Recorder) -> bool:

@@ -234,7 +234,6 @@ function onRun(event) {
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
     case "progress": if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
-    case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
     case "pass_ended": passes.end(data); log(data, `Pass ${data.number} is over, ${data.n_views} views so far`); break;
     case "next_chosen": passes.choose(data); log(data, `After pass ${data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;

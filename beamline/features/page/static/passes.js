@@ -12,10 +12,10 @@ export class Passes {
   /** A pass is over. */
   end(data) { this.ended = data; this.asks = (data.wait ?? 0) > 0; this.draw(); }
 
-  /** What was chosen; what the choice before has brought stands in this event. */
+  /** What was chosen; what an earlier choice has brought stands in this event. */
   choose(data) {
-    const before = this.decisions[this.decisions.length - 1], own = data.options.find((each) => each.choice === data.choice);
-    if (before) { before.predicted = data.predicted ?? before.predicted; before.gained = data.gained ?? null; }
+    const before = this.decisions.find((each) => each.number === data.judged) ?? this.decisions[this.decisions.length - 1], own = data.options.find((each) => each.choice === data.choice);
+    if (before) { before.predicted = data.predicted ?? before.predicted; before.gained = data.gained ?? before.gained; }
     this.decisions.push({ ...data, predicted: own?.gain ?? null, gained: null });
     this.asks = false;
     this.draw();
