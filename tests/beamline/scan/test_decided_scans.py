@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
 from beamline.config.load import Config
@@ -21,6 +22,8 @@ from beamline.scan import preflight
 from beamline.scan.control import State, Verb, ask, state_of
 from beamline.scan.live_process import LiveCommand
 from beamline.scan.preflight import scan_info
+from beamline.scan.resume import open_for_resume
+from beamline.scan.run import run_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import ScanInfo
 from tests.beamline.fakes import FakeInstrument
@@ -182,3 +185,21 @@ def test_a_stop_or_an_abort_ends_the_question(tmp_path: Path, verb: str) -> None
     assert isinstance(ran.error, ScanStopped) and not ran.of("next_chosen")
     assert ran.states[-1] == ("stopped" if verb == "stop" else "aborted")
     ran.assert_safe()
+
+
+def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_took(tmp_path: Path) -> None:
+    laws = live((1.0, 0.1, None), (1.0, 0.1, None), (1.0, 0.1, None))
+    stop, words = StopRequest(), (*PASSES, "scan.wish={seconds: 28}")
+    ran = Ran(tmp_path, FakeInstrument(at={12: stop.stop}), *words, live=laws, stop=stop)  # in the third pass
+    assert isinstance(ran.error, ScanStopped) and len(written(ran)[1]) == 2
+    instrument, events = FakeInstrument(), list[Event]()
+    instrument.clock.sleep(1000.0)  # which does not count
+    with open_for_resume(ran.folder) as series:
+        with h5py.File(ran.folder / "scan.h5") as file:
+            assert series.seconds == pytest.approx(np.ptp(file[layout.TIME][()]))
+        last = live((1.0, 0.1, None))
+        words_of = lambda scan, output: [word.replace("3 * n", "9") for word in last(scan, output)]  # noqa: E731
+        with pytest.raises(ScanStopped, match="next would end the scan after"):
+            run_scan(series.config, series, [events.append], instrument=instrument.connected(), live=words_of)
+    (chosen,) = [event.data for event in events if event.event == "next_chosen"]
+    assert (chosen["number"], chosen["n_views"], chosen["choice"]) == (3, 9, "enough")
