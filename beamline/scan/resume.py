@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -202,7 +203,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], tuple[str, ...]]:
     """Triggers of the views, and of the wide ones, that need not be taken: those in the files, and those that the scan
     decided against. And what it chose after each pass that ended; where it says nothing, the plan went on."""
-    views, wide, since, chosen, ended, decides = set[int](), set[int](), set[int](), dict[int, str](), 0, False
+    views, wide, since, chosen, ended, decides = set[int](), set[int](), set[int](), dict[Any, Any](), 0, False
     for part in parts:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             decides, ends = layout.PASS_ENDS in file, pass_ends_in(file)
@@ -210,10 +211,10 @@ def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], 
             views |= views_in(file)
             wide |= views_in(file, kind=FrameKind.ALIGNMENT)  # as which wide views are written
             ended += ends.size
-            chosen |= {int(values["number"]): str(values["choice"]) for values in decisions_in(file)}
+            chosen |= {values.get("number"): values.get("choice") for values in decisions_in(file)}
     if not decides:
         return views, wide, ()
-    choices = tuple(chosen.get(number, Choice.NEXT) for number in range(1, ended + 1))
+    choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, ended + 1))
     plan = replace(plan_of(config), choices=choices)
     stage, camera, to_counts = connect.describe(config)
     passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
