@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -47,17 +47,12 @@ class Passes:
 
     def after(self, choice: Choice) -> Passes:
         """The scan at the end of what it chose. A pass that cannot be taken again is the next one instead."""
-        match choice:
-            case Choice.AGAIN if self.may_repeat:
-                return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
-            case Choice.NEXT | Choice.AGAIN:
-                return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
-            case Choice.WIDE:
-                return replace(self, wide=())
-            case Choice.ENOUGH:
-                return replace(self, to_come=(), wide=())
-            case Choice.RETAKE:
-                return self
+        if choice is Choice.AGAIN and self.may_repeat:
+            return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
+        if choice in (Choice.NEXT, Choice.AGAIN):
+            return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
+        to_come = () if choice is Choice.ENOUGH else self.to_come
+        return self if choice is Choice.RETAKE else replace(self, to_come=to_come, wide=())
 
 
 def triggers_of(*blocks: Block) -> frozenset[int]:
@@ -65,12 +60,13 @@ def triggers_of(*blocks: Block) -> frozenset[int]:
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def begun(views: Block, plan: ScanPlan) -> Passes:
-    """A scan at the end of the pass that it begins with, without its wide views; one that goes on is in that pass.
+def begun(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
+    """A scan at the end of the pass that it begins with; one that goes on is in that pass.
 
     Passes are those of the whole plan, whatever is stored.
     """
-    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view))
+    blocks = pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view)
+    passes = Passes((), blocks, (*wide,))
     for choice in (Choice.NEXT, *plan.choices):
         passes = passes.after(Choice(choice))
     return passes
