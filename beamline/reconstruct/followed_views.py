@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -15,12 +16,15 @@ from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.width import Width
+from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import reference_groups, usual_exposure
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
+from recon.base.arrays import median_deviation
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
@@ -117,6 +121,7 @@ _UNKNOWN = (
 )
 
 
+_NOISE_FRAMES, _ODD = 12, 6.0  # flats that tell the noise, at most; deviations from which a pixel is odd
 _NO_AXIS_NO_LAW = "No gain by further views is predicted before the rotation axis is known."
 
 
@@ -169,6 +174,23 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
+def open_beam_noise(source: ScanSource, selection: Selection) -> NDArray[np.float32] | None:
+    """Line integrals [frame, row, col] of flats of one group, binned as the views: noise alone, as large as that of an
+    open beam in the exposure of a view. None: there are no flats, or no darks.
+    """
+    groups, binning = reference_groups(source), selection.binning
+    if not (groups.flats and groups.darks):
+        return None
+    flats, darks = max(groups.flats, key=len)[:_NOISE_FRAMES], np.concatenate(groups.darks)[:_NOISE_FRAMES]
+    rows = slice(0, source.shape[0] // binning * binning)
+    light = read_binned(source, flats, rows, binning) - read_binned(source, darks, rows, binning).mean(axis=0)
+    mean = light.mean(axis=0)
+    lines = -np.log(np.divide(light, mean, out=np.ones_like(light), where=(light > 0) & (mean > 0)))
+    lines *= math.sqrt(float(np.median(source.exposures[flats])) / usual_exposure(source))
+    most = _ODD * median_deviation(lines)  # pixels that a correction replaces
+    return np.clip(lines, -most, most).astype(np.float32)
+
+
 class PassLaws:
     """Measures the law of the error at the end of each pass, once all usable views until then are corrected.
 
@@ -211,7 +233,8 @@ class PassLaws:
         sizes = np.unique(np.searchsorted(rows, ends)).tolist()
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
-            measured = measured_law(np.stack([*images.values()]), geometry, [n for n in sizes if n], self._rng)
+            data, noise = np.stack([*images.values()]), open_beam_noise(self._views.source, self._views.selection)
+            measured = measured_law(data, geometry, [n for n in sizes if n], self._rng, noise)
         except (ValueError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
             self._warn(f"The law of the error is not known, so that no gain by further views is predicted: {why}.")

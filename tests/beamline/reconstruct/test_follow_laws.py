@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit
+from beamline.reconstruct.followed_views import open_beam_noise
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -24,7 +26,7 @@ from drivers.base.frame import Frame, FrameKind
 from recon.assess.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule
-from tests.beamline.scans import frames_of
+from tests.beamline.scans import frames_of, write_nxtomo
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,8 +43,9 @@ class Laws:
     offset: float = 0.0
 
     def __call__(
-        self, data: np.ndarray, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator
-    ) -> SimpleNamespace:
+        self, data: np.ndarray, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator,
+        open_beam: np.ndarray | None,
+    ) -> SimpleNamespace:  # fmt: skip
         self.asked.append((data, geometry, list(sizes)))
         if self.error is not None:
             raise self.error
@@ -240,3 +243,21 @@ def test_a_resumed_run_has_the_passes_of_all_parts(laws: Laws, follow: Callable[
         scan.seconds(0)
     assert laws.sizes == [[10], [10, 20], [10, 20, 30]]
     np.testing.assert_allclose(laws.asked[-1][1].angles, INTERLACED.angles, atol=1e-6)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_the_noise_of_the_open_beam_is_that_of_a_view(tmp_path: Path, binning: int) -> None:
+    rng, photons, shape = np.random.default_rng(0), 2500.0, (16, 64)
+    light = 10.0 + np.concatenate([np.zeros((4, *shape)), rng.poisson(photons, (12, *shape))])
+    light[:, 3, 3] = 10.0  # a dead pixel
+    keys = [2] * 4 + [1] * 10 + [0] * 2
+    path = write_nxtomo(tmp_path / "scan.nx", light.astype(np.uint16), keys, np.zeros(16))
+    with open_scan(SourceOptions(path)) as source:
+        source.exposures = np.where(source.image_key == FrameKind.FLAT, 0.4, 0.1)  # flats four times as long
+        noise = open_beam_noise(source, Selection(binning=binning))
+        source.image_key = np.where(source.image_key == FrameKind.FLAT, FrameKind.PROJECTION, source.image_key)
+        assert open_beam_noise(source, Selection()) is None
+    assert noise is not None and noise.shape == (10, 16 // binning, 64 // binning)
+    usual = 2 * math.sqrt(0.9 / photons) / binning  # a tenth of the variance is in the mean of ten
+    assert np.median(np.abs(noise)) / 0.6745 == pytest.approx(usual, rel=0.1)
+    assert np.abs(noise).max() < 10 * usual
