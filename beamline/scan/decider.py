@@ -94,8 +94,8 @@ class Decider:
             by, (choice, reason) = "program", choose(offered, self.wish, self._spent(passes), rest_gain(passes, law))
         else:
             self._unable = self.unable()
-            by, choice, reason = "plan", Choice.NEXT, self._unable or f"no law of the error within {self.wait:g} s"
-        asks, remark = self.asks and not self._unable, "" if law else f"No gain is predicted: {reason}."
+            by, choice, reason = "plan", Choice.NEXT, self._unable or f"no prediction within {self.wait:g} s"
+        asks, remark = self.asks and not self._unable, "" if law else f"Gains are not known: {reason}."
         facts = len(self._ended), passes.n_views // plan.frames_per_view
         values = [{name: None if value != value else value for name, value in vars(one).items()} for one in offered]
         self.sink(PassEnded(*facts, values, choice, self.wait if asks else 0.0, remark))
