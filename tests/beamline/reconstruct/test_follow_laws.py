@@ -150,7 +150,7 @@ def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
 def _noisy(frames: Sequence[Frame]) -> list[Frame]:
     """The frames after three more flats, with the noise of photons."""
     rng = np.random.default_rng(0)
-    order = [*frames[:4], *[replace(frame, kind=FrameKind.FLAT) for frame in frames[2:3] * 3], *frames[4:]]
+    order = [*frames[:4], *[frames[2]] * 3, *frames[4:]]
     return [
         replace(frame, counts=rng.poisson(frame.counts).astype(np.uint16), index=i) for i, frame in enumerate(order)
     ]
