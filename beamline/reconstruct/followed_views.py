@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -189,7 +190,7 @@ class PassLaws:
 
         The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
         depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
-        known. What prevents a law becomes a warning.
+        known. What prevents a law becomes a warning, and the reason of an event without one.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -218,6 +219,8 @@ class PassLaws:
         except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
             self._warn(f"No gain by further views is predicted: {why}.")
+            none = LawMeasured(len(usable), math.nan, math.nan, math.nan, math.nan, reason=why)
+            self._sink(replace(none, time=self._clock.now()))
             return
         law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:

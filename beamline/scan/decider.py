@@ -56,8 +56,9 @@ class Decider:
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
     _laws: deque[LawMeasured] = field(default_factory=lambda: deque(maxlen=1))  # that came: the newest
-    _law: ErrorLaw | None = None  # the newest that was taken up,
-    _law_of: int = 0  # with the number of its pass,
+    _law: ErrorLaw | None = None  # the newest that was taken up; None: for a reason there is none
+    _reason: str = ""
+    _law_of: int = 0  # the number of its pass,
     _lost: int = 0  # and the frames that it lacks, as flagged ones are not in a law
     _ended: list[tuple[int, float | None]] = field(default_factory=list)  # passes: frames of views, dB of what followed
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # what came of a choice, as `NextChosen` has it
@@ -66,9 +67,8 @@ class Decider:
     _answer: Choice | None = None
 
     def add_law(self, law: LawMeasured) -> None:
-        """Take a law from the live reconstruction; any thread. One without a number is none."""
-        if None not in (law.exponent, law.exponent_error, law.noise, law.offset):
-            self._laws.append(law)
+        """Take a law from the live reconstruction; any thread."""
+        self._laws.append(law)
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not asked for becomes a warning."""
@@ -94,7 +94,9 @@ class Decider:
             by, (choice, reason) = "program", choose(offered, self.wish, self._spent(passes), rest_gain(passes, law))
         else:
             self._unable = self.unable()
-            by, choice, reason = "plan", Choice.NEXT, self._unable or f"no prediction within {self.wait:g} s"
+            why = self._reason if self._law_of == len(self._ended) else ""
+            by, choice = "plan", Choice.NEXT
+            reason = self._unable or why or f"no prediction within {self.wait:g} s"
         asks, remark = self.asks and not self._unable, "" if law else f"Gains are not known: {reason}."
         facts = len(self._ended), passes.n_views // plan.frames_per_view
         values = [{name: None if value != value else value for name, value in vars(one).items()} for one in offered]
@@ -142,7 +144,8 @@ class Decider:
         frames = law.n_views * self.timeline.plan.frames_per_view
         number = min(range(len(self._ended)), key=lambda i: (abs(self._ended[i][0] - frames - self._lost), -i)) + 1
         self._law_of, self._lost = number, self._ended[number - 1][0] - frames
-        self._law = ErrorLaw(frames, law.exponent, law.exponent_error, law.noise, law.offset)
+        self._reason, of_law = law.reason, (law.exponent, law.exponent_error, law.noise, law.offset)
+        self._law = None if law.reason or None in of_law else ErrorLaw(frames, *of_law)
         if law.gained is not None and number > 1:
             self._outcome = {"predicted": self._ended[number - 2][1], "gained": law.gained, "judged": number - 1}
         return number == len(self._ended)

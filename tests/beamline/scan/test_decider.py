@@ -226,6 +226,21 @@ def test_after_a_pause_it_asks_again() -> None:
     assert scan.log == ["close shutter", "asking", "paused", "acquiring", "close shutter", "asking"]
 
 
+@pytest.mark.parametrize("asks", [False, True])
+def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
+    scan = Scan(asks=asks, wait=0.5)
+    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")  # type: ignore[arg-type]
+    assert scan.after(1, none) is Choice.NEXT
+    assert scan.waited == 1 or asks
+    assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: 30 views are few."
+    assert (scan.chosen["by"], scan.chosen["reason"]) == (
+        "plan",
+        "no answer within 0.5 s" if asks else "30 views are few",
+    )
+    scan.decide.asks = False
+    assert scan.after(2, law(24)) is Choice.NEXT and scan.chosen["by"] == "program" and scan.waited == 1
+
+
 def test_a_law_without_its_numbers_is_none() -> None:
     scan = Scan(wait=0.2)
     assert scan.after(1, law(12, exponent=None)) is Choice.NEXT  # type: ignore[arg-type]
