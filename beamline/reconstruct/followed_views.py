@@ -16,19 +16,17 @@ from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.width import Width
-from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import reference_groups, usual_exposure
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
-from recon.base.arrays import median_deviation
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.measured_law import measured_law
 
 
 class FollowState(Enum):
@@ -121,7 +119,6 @@ _UNKNOWN = (
 )
 
 
-_NOISE_FRAMES, _ODD = 12, 6.0  # flats that tell the noise, at most; deviations from which a pixel is odd
 _NO_AXIS_NO_LAW = "No gain by further views is predicted before the rotation axis is known."
 
 
@@ -174,21 +171,7 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
-def open_beam_noise(source: ScanSource, selection: Selection) -> NDArray[np.float32] | None:
-    """Line integrals [frame, row, col] of flats of one group, binned as the views: noise alone, as large as that of an
-    open beam in the exposure of a view. None: there are no flats, or no darks.
-    """
-    groups, binning = reference_groups(source), selection.binning
-    if not (groups.flats and groups.darks):
-        return None
-    flats, darks = max(groups.flats, key=len)[:_NOISE_FRAMES], np.concatenate(groups.darks)[:_NOISE_FRAMES]
-    rows = slice(0, source.shape[0] // binning * binning)
-    light = read_binned(source, flats, rows, binning) - read_binned(source, darks, rows, binning).mean(axis=0)
-    mean = light.mean(axis=0)
-    lines = -np.log(np.divide(light, mean, out=np.ones_like(light), where=(light > 0) & (mean > 0)))
-    lines *= math.sqrt(float(np.median(source.exposures[flats])) / usual_exposure(source))
-    most = _ODD * median_deviation(lines)  # pixels that a correction replaces
-    return np.clip(lines, -most, most).astype(np.float32)
+_OPEN_BEAM = 8  # flats that show the noise of a frame
 
 
 class PassLaws:
@@ -202,12 +185,12 @@ class PassLaws:
         self._rng = np.random.default_rng(seed)
         self._end = 0  # rows of the file at the end of the last pass that was looked at
 
-    def look(self, cursor: Cursor, axis_col: float | None) -> None:
+    def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
         """Measure and report the law of the newest pass, if it is over and was not looked at yet.
 
         The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
         depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
-        known. What prevents a law becomes a warning.
+        known. What prevents a law becomes a warning, and the reason of an event without one.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -216,8 +199,6 @@ class PassLaws:
             self._warn(_NO_AXIS_NO_LAW)
         if axis_col is None or cursor.taken < end:
             return
-        from recon.voxels.measured_law import measured_law  # here: only scans that decide need it
-
         self._end, begin = end, self._clock.now()
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
@@ -228,16 +209,18 @@ class PassLaws:
             if row in usable
         }
         rows = np.array([*images], np.int64)
-        if not rows.size:
+        if not rows.size or correction is None:
             return
-        sizes = np.unique(np.searchsorted(rows, ends)).tolist()
+        sizes = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
-            data, noise = np.stack([*images.values()]), open_beam_noise(self._views.source, self._views.selection)
-            measured = measured_law(data, geometry, [n for n in sizes if n], self._rng, noise)
-        except (ValueError, MemoryError) as error:
+            open_beam = correction.open_beam(_OPEN_BEAM)
+            measured = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
+        except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
-            self._warn(f"The law of the error is not known, so that no gain by further views is predicted: {why}.")
+            self._warn(f"No gain by further views is predicted: {why}.")
+            none = LawMeasured(len(usable), math.nan, math.nan, math.nan, math.nan, reason=why)
+            self._sink(replace(none, time=self._clock.now()))
             return
         law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
