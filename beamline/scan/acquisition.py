@@ -62,7 +62,7 @@ class Acquisition:
         self._devices, self._timeline, self._stop, self._sink, self._clock = devices, timeline, stop, sink, clock
         self._supervision, self._refused = supervision or Supervision(), ""
         self._exposures = Exposures(
-            devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
+            devices, camera_settings, settle, clock, stop, sink, self._supervision, self.wait_while_paused
         )
         self._done: list[RecordedBlock] = []
         self.recovered = 0
@@ -302,7 +302,7 @@ class Acquisition:
         while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
             self._clock.sleep(min(SLICE, left))
 
-    def _wait_while_paused(self) -> None:
+    def wait_while_paused(self) -> None:
         """Wait with a closed shutter while a pause is requested; a stop ends it.
 
         A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
 from beamline.config.load import NO_LIVE, Config, changed, load, plan_of, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
@@ -61,6 +63,7 @@ class ResumableRun:
         planned: views of the whole plan.
         wide: triggers of the wide views in these files, likewise.
         choices: after each pass that ended in them, oldest first.
+        seconds: that they took, from the first frame of each to its last one.
         end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
@@ -77,6 +80,7 @@ class ResumableRun:
     end_references: frozenset[FrameKind] | None = None
     wide: frozenset[int] = frozenset()
     choices: tuple[str, ...] = ()
+    seconds: float = 0.0
 
     @property
     def in_words(self) -> str:
@@ -172,7 +176,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     config = load(run / CONFIG, environment={})
     if given is not None and not config.recon.live:
         given = changed(given, NO_LIVE)
-    planned, last_frame_time, parts, closed = 0, 0.0, list[Path](), True
+    planned, times, parts, closed = 0, list[NDArray[np.float64]](), list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             require_ours(part, file)
@@ -185,7 +189,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
             if file[layout.COMMITTED][()]:
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
-                last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
+                times.append(file[layout.TIME][()])
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     end_references, (views, wide, choices) = None, _stored(parts, config)
@@ -194,9 +198,10 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
             _refuse_whole(run, planned, parts, closed)
+    last, seconds = max(float(each.max()) for each in times), sum(float(np.ptp(each)) for each in times)
     return ResumableRun(
-        run, lock, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references,
-        frozenset(wide), choices,
+        run, lock, config, tuple(parts), frozenset(views), planned, last, tuple(left_out), end_references,
+        frozenset(wide), choices, seconds,
     )  # fmt: skip
 
 
