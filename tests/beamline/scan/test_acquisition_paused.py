@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
+from beamline.plan.passes import Choice
 from beamline.plan.plan import Mode, Place
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import Supervision
@@ -20,6 +21,7 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame
 from drivers.in_beam import ManualShutter
 from tests.beamline.acquired import Run, assert_safe
+from tests.beamline.chosen import Asked, Chooser
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults, assert_true
 
 FIRST = 5  # triggers before the views: 3 darks and 2 flats
@@ -76,8 +78,16 @@ class Paused:
         clock.sleep = on_the_way  # type: ignore[method-assign]
         return self
 
-    def run(self, n: int, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30) -> Run:
-        supervision = Supervision(pause=self.pause, wait_in_pause=lambda: False, states=self.machine)
+    def run(
+        self,
+        n: int,
+        mode: Mode = Mode.FLY,
+        passes: int = 1,
+        at: Place = Place.START,
+        speed: float = 30,
+        choose: Chooser | None = None,
+    ) -> Run:
+        supervision = Supervision(pause=self.pause, wait_in_pause=lambda: False, states=self.machine, next_pass=choose)
         return Run(self.instrument, self.instrument.timeline(n, mode, passes, at, speed), self.stop, supervision)
 
 
@@ -145,6 +155,26 @@ def test_frames_since_the_last_beam_are_taken_again_in_their_place(mode: Mode, p
     )
     assert paused.states.count(State.PAUSED) == 1
     assert_safe(paused.instrument)
+
+
+@pytest.mark.parametrize("number", [6, 10, 16])
+def test_frames_without_beam_are_taken_again_within_their_pass(number: int) -> None:
+    """Of four passes of three views, the first is taken twice: frame 10 is of the second time."""
+    paused, times = Paused(), list[float]()
+
+    def lost(seen: int) -> None:
+        times.append(paused.instrument.clock.now())
+        if len(times) - 1 == number:
+            paused.pause.no_beam("no beam", since=times[number - 2])
+
+    paused.instrument.on_frame = lost
+    script = [Choice.AGAIN, Choice.NEXT]
+    run = paused.run(12, passes=4, speed=20, choose=Asked(script))
+    assert run.error is None and run.scan.missing == []
+    assert {frame.replaces for frame in run.frames} - {-1} == {number - 1, number}
+    kept = [frame for frame in run.frames if frame.index not in (number - 1, number)]
+    expected = Paused().run(12, passes=4, speed=20, choose=Asked(script)).frames
+    assert_same([replace(frame, index=i, replaces=-1) for i, frame in enumerate(kept)], expected)
 
 
 def test_lost_and_ignored_triggers_before_a_pause_are_named_and_those_after_it_are_taken() -> None:

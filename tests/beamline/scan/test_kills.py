@@ -27,7 +27,7 @@ from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.parts import decisions_in, pass_ends_in
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
 from tests.beamline.chosen import Asked, Chooser, choosing
@@ -169,6 +169,10 @@ def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.Monkey
             frames = [frame for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
             assert [values["choice"] for values in source.decisions] == script
             assert [sum(frame.index < end for frame in frames) // PASS for end in source.pass_ends] == [1, 2, 3, 4]
+            of_parts = SourceOptions(run / "part-2" / "scan.h5", earlier=(run / "scan.h5",))
+            with open_scan(of_parts) as followed:  # as a live reconstruction reads them
+                assert followed.pass_ends.tolist() == source.pass_ends.tolist()
+                assert followed.decisions == source.decisions
         assert_true(frames)
         once = [*range(PASS)]
         assert [frame.trigger for frame in frames] == [*once, *once, *(PASS + i for i in (*once, *once))]
