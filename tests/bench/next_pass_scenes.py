@@ -46,7 +46,7 @@ COLS, ROWS, VIEWS, PASSES, WIDE_ANGLES = 128, 8, 720, 8, 4
 PASS = VIEWS // PASSES
 PITCH, FIELD, SUB, EDGE = 4.6e-3, 0.96, 3, 2
 """Pixel in mm, sample over field where it fits, rays a pixel and axis, pixels beyond whose light the fringes move."""
-DRIFT, CRUMBED, CRUMB_DEPTH, CRUMB_SIZE = 0.6, range(200, 224), 0.8, 6.0
+DRIFT, CRUMBED, CRUMB_DEPTH, CRUMB_SIZE = 0.1, range(200, 224), 0.8, 6.0
 PARTICLE, TALL = 6.0, 100.0
 """Of batteries: median radius of a particle, and height of the electrolyte."""
 
@@ -91,7 +91,7 @@ RECIPES = (
     Recipe("cathode", crumb=True),
 )
 DEV, ONCE = range(10), range(10, 20)
-_OPTICS = {"battery": (5.0, 30.0, 8.3485), "cathode": (90.0, 10.0, 25.0)}
+OPTICS = {"battery": (5.0, 30.0, 8.3485), "cathode": (90.0, 10.0, 25.0)}
 """delta/beta, mm behind the sample and keV of the fringes, as of the scenes shipped, the cathode nearer: at 30 mm
 some pixels of its rims would have no light left, whose line integrals mean nothing."""
 
@@ -157,7 +157,7 @@ def made(number: int) -> Scene:
     """Compute the scene of this number."""
     recipe = RECIPES[number]
     sample = build_sample("phantom", mapping_of(recipe, number), Beam(1e5))
-    delta_beta, distance, energy = _OPTICS[recipe.sample]
+    delta_beta, distance, energy = OPTICS[recipe.sample]
     fringes = None
     if recipe.fringes:
         fringes = PhaseFringes(delta_beta, distance, energy, method="transport")  # type: ignore[abstract]
