@@ -155,7 +155,6 @@ _BY_BUDGET = {"budget": "--budget chooses it"}
 _NOT_KEPT = {"budget": "a run within a budget keeps no checkpoints", **_FINISHED}
 _PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
 _BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
-RUNNING = ("follow", "is for a scan that still runs: give --follow.")
 NOT_WITH_SLABS = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
 NOT_WITH_ERROR_BARS = dict.fromkeys(
     ("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits"

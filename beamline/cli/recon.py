@@ -87,13 +87,12 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
             raise DataError(f"{file} does not exist.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
-    from recon.voxels.enough_views import Goal
 
     page = report_beside(path) if values["report"] else None
     files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
     files |= {"--resume": values["resume"], "--write-config": values["write_config"]}
     refuse_shared(files)
-    partial, goal = slabs_resumed(values["resume"]), (values["enough_gain"], values["enough_loss"])
+    partial = slabs_resumed(values["resume"])
     source, selection = chosen(file, values["seed"], values)
     settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
     built = method_with(method, settings, values["any_setting"])
@@ -103,9 +102,8 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     return ReconOptions(**same | {
         "source": source, "target": OutputPaths(path, page), "selection": selection, "method": built,
         "checkpoints": CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
-        "enough": None if goal == (None, None) else Goal(*goal), "partial": partial,
-        "follow": FollowTiming() if values["follow"] else None, "recipe": recipe_text(context, method),
-        "command": typed_line(context),
+        "follow": FollowTiming() if values["follow"] else None, "partial": partial,
+        "recipe": recipe_text(context, method), "command": typed_line(context),
     })  # fmt: skip
 
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.method_options import NOT_WITH_ERROR_BARS, NOT_WITH_SLABS, RUNNING, SLABS_RESUMED, method_options
+from beamline.cli.method_options import NOT_WITH_ERROR_BARS, NOT_WITH_SLABS, SLABS_RESUMED, method_options
 from beamline.cli.options import (
     NOT_NEGATIVE,
-    POSITIVE,
     MethodChoice,
     NameChoice,
     json_option,
@@ -154,20 +153,6 @@ recon_options = together(
         multiple=True,
         metavar="FILE",
         help="With --follow: an earlier part of a resumed run, whose views come first. May be repeated.",
-    ),
-    option(
-        "--enough-loss",
-        needs=RUNNING,
-        type=POSITIVE,
-        metavar="DB",
-        help="With --follow: report when all remaining views together would add at most so many dB of PSNR.",
-    ),
-    option(
-        "--enough-gain",
-        needs=RUNNING,
-        type=POSITIVE,
-        metavar="DB",
-        help="With --follow: report when ten more views would add at most so many dB.",
     ),
     unfinished_option,
     heading(RESOURCES),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from beamline.plan.plan import Block
+from beamline.plan.plan import Block, ScanPlan
 
 
 class Choice(StrEnum):
@@ -39,6 +39,41 @@ class Passes:
     def n_views(self) -> int:
         """Views so far."""
         return sum(block.left for block in self.done)
+
+    @property
+    def may_repeat(self) -> bool:
+        """Whether the last pass can be taken again: a pass is still to come, with at least as many views."""
+        return bool(self.to_come) and self.done[-1].left <= self.to_come[-1].left
+
+    def after(self, choice: Choice) -> Passes:
+        """The scan at the end of what it chose. A pass that cannot be taken again is the next one instead."""
+        match choice:
+            case Choice.AGAIN if self.may_repeat:
+                return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
+            case Choice.NEXT | Choice.AGAIN:
+                return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
+            case Choice.WIDE:
+                return replace(self, wide=())
+            case Choice.ENOUGH:
+                return replace(self, to_come=(), wide=())
+            case Choice.RETAKE:
+                return self
+
+
+def triggers_of(*blocks: Block) -> frozenset[int]:
+    """Frames, counted within their block, that are taken in one of these parts of a block."""
+    return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
+
+
+def begun(views: Block, plan: ScanPlan) -> Passes:
+    """A scan at the end of the pass that it begins with, without its wide views; one that goes on is in that pass.
+
+    Passes are those of the whole plan, whatever is stored.
+    """
+    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view))
+    for choice in (Choice.NEXT, *plan.choices):
+        passes = passes.after(Choice(choice))
+    return passes
 
 
 def pass_blocks(views: Block, step_views: int) -> tuple[Block, ...]:

@@ -52,7 +52,11 @@ class ScanPlan:
         darks, flats: reference frames.
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
-        stored: views that need not be taken: earlier files of the same scan have them.
+        stored: triggers of views, and after them of wide views, that need not be taken: earlier files of the same scan
+            have them, or the scan decided against them.
+        choices: what earlier files of the same scan chose after each pass that ended in them (`passes.Choice`), oldest
+            first. A scan that goes on is in the pass that the last one began.
+        pass_views: views of a pass of a step scan; 0: all. The passes of a fly scan are its trains.
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
         end_references: kinds of references that are still to be taken after the views, where all else but wide views
             is stored. None: all that are planned, before and after the views.
@@ -72,6 +76,8 @@ class ScanPlan:
     scheme: str
     retake_share: float = 0.0
     stored: frozenset[int] = frozenset()
+    choices: tuple[str, ...] = ()
+    pass_views: int = 0
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
     wide_views: int = 0
@@ -146,8 +152,8 @@ class Timeline:
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
+        plan: that it is computed of.
         retake_seconds: for the most views that may be taken again.
-        warm_up, filter, energy: as of the plan.
     """
 
     blocks: tuple[Block, ...]
@@ -160,10 +166,8 @@ class Timeline:
     skew_px: float
     violations: tuple[str, ...]
     remarks: tuple[str, ...]
+    plan: ScanPlan
     retake_seconds: float = 0.0
-    warm_up: float = 0.0
-    filter: str | None = None
-    energy: float | None = None
 
     @property
     def n_frames(self) -> int:

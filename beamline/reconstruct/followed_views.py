@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import EnoughReached, Sink, StateEntered
+from beamline.core.events import LawMeasured, Sink
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
@@ -27,7 +25,6 @@ from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
 
 class FollowState(Enum):
@@ -120,6 +117,9 @@ _UNKNOWN = (
 )
 
 
+_NO_AXIS_NO_LAW = "No gain by further views is predicted before the rotation axis is known."
+
+
 class AxisSearch:
     """Repeats the search for the rotation axis each time the views have grown by half, at a quarter of a turn, at half
     a turn, and at the end.
@@ -169,101 +169,55 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
-GROWTH = 1.25  # growth of the views between predictions
-_FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
+class PassLaws:
+    """Measures the law of the error at the end of each pass, once all usable views until then are corrected.
 
-
-def planned_views(
-    source: ScanSource, selection: Selection, axis_col: float | None, taken: Sequence[NDArray[np.int64]]
-) -> Geometry:
-    """Geometry of the views so far and of those still to come by the plan.
-
-    Args:
-        taken: frames of the views so far, in batches.
-
-    Raises:
-        ValueError: the beam is a cone, or the file says no plan.
-    """
-    if cone_of(source, selection) is not None:
-        raise ValueError("its beam is a cone")
-    if source.part_starts.size > 1:
-        raise ValueError("it resumes a run that ended early, so that its views are not in the planned order")
-    angles = source.plan.get("angles_deg")
-    if angles is None or axis_col is None:
-        raise ValueError("its file does not state the planned views")
-    places = parse_views(selection.views, np.zeros(len(angles)))
-    last = max(int(ids[-1]) for ids in taken)
-    n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
-    to_come = np.radians(np.asarray(angles, np.float64)[places[places >= n_taken]])
-    so_far = [source.angles[ids] for ids in taken]
-    return geometry_of(source, selection, axis_col, np.concatenate([*so_far, to_come]))
-
-
-class EnoughViews:
-    """Predicts the gain of further views each time the views have grown by a quarter.
-
-    A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
-    which errs on the side of more views.
+    A pass whose law is not measured yet when the next one ends is left out: only the newest law is of use.
     """
 
-    def __init__(self, goal: Goal, seed: int) -> None:
-        self._goal = goal
+    def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
+        self._views, self._sink, self._clock, self._warn = views, sink, clock, warn
         self._rng = np.random.default_rng(seed)
-        self._samples: list[float] = []
-        self.next_look = _FIRST
+        self._end = 0  # rows of the file at the end of the last pass that was looked at
 
-    def look(self, data: NDArray[np.float32], planned: Geometry) -> Gain | None:
-        """The predicted gain of further views; None if it is unknown.
+    def look(self, cursor: Cursor, axis_col: float | None) -> None:
+        """Measure and report the law of the newest pass, if it is over and was not looked at yet.
 
-        Args:
-            data: line integrals [view, row, col] so far.
-            planned: geometry of these views and of those to come.
+        The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
+        depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
+        known. What prevents a law becomes a warning.
         """
-        n = len(data)
-        if not self.next_look <= n < planned.n_views or not well_spread(planned.angles[:n]):
-            return None
-        self.next_look = math.ceil(GROWTH * n)
-        before = self._samples
+        ends = self._views.source.pass_ends
+        if not ends.size or (end := int(ends[-1])) == self._end:
+            return
+        if axis_col is None:
+            self._warn(_NO_AXIS_NO_LAW)
+        if axis_col is None or cursor.taken < end:
+            return
+        from recon.voxels.measured_law import measured_law  # here: only scans that decide need it
+
+        self._end, begin = end, self._clock.now()
+        usable = {row for row in self._views.usable().frames.tolist() if row < end}
+        parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
+        images = {
+            row: image
+            for part in parts
+            for row, image in zip(part.view_ids.tolist(), part.data, strict=True)
+            if row in usable
+        }
+        rows = np.array([*images], np.int64)
+        if not rows.size:
+            return
+        sizes = np.unique(np.searchsorted(rows, ends)).tolist()
         try:
-            self._samples = predicted_gains(data, planned, self._rng, _SAMPLES)
-        except ValueError:  # views without matter
-            return None
-        return Gain.of(n, planned.n_views, before + self._samples) if before else None
-
-    def met(self, gain: Gain) -> bool:
-        """Whether the views so far suffice."""
-        return self._goal.met(gain)
-
-
-def report_gain(
-    enough: EnoughViews,
-    views: FollowedViews,
-    taken: Sequence[NDArray[np.int64]],
-    data: NDArray[np.float32],
-    axis_col: float | None,
-    sink: Sink,
-    clock: Clock,
-    warn: Warnings,
-) -> bool:
-    """Report the gain of further views, and whether those so far suffice. Returns False if nothing further can be
-    asked.
-
-    Args:
-        taken: frames of the views so far, in batches.
-        data: their line integrals [view, row, col].
-    """
-    try:
-        planned = planned_views(views.source, views.selection, axis_col, taken)
-    except ValueError as error:
-        warn(f"The gain of further views cannot be predicted: {error}. The scan is not stopped early.")
-        return False
-    gain = enough.look(data, planned)
-    if gain is None:
-        return True
-    if enough.met(gain):
-        sink(EnoughReached(**vars(gain), time=clock.now()))
-        return False
-    spread = f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"
-    message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
-    sink(StateEntered("gain", message, gain, time=clock.now()))
-    return True
+            geometry, _ = self._views.geometry(axis_col, rows)
+            measured = measured_law(np.stack([*images.values()]), geometry, [n for n in sizes if n], self._rng)
+        except (ValueError, MemoryError) as error:
+            why = str(error) or "the memory does not suffice"
+            self._warn(f"The law of the error is not known, so that no gain by further views is predicted: {why}.")
+            return
+        law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
+        if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
+            law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
+        now = self._clock.now()
+        self._sink(LawMeasured(**vars(law), gained=measured.gained, seconds=now - begin, time=now))

@@ -31,7 +31,7 @@ from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import checked_views, correction_blockers, refuse
-from beamline.reconstruct.followed_views import AxisSearch, Cursor, EnoughViews, FollowedViews, FollowState, report_gain
+from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
@@ -72,7 +72,7 @@ class ScanFollower:
         self._uncorrected = 0  # views in the file that the fit has not got yet
         self._said_behind = False
         self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
-        self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
+        self._laws = PassLaws(self.views, options.seed, sink, clock, warn)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
         self._slices = LiveSlices(self.views, self.snapshots, clock)
 
@@ -282,14 +282,9 @@ class ScanFollower:
         )
         self._sink(StateEntered("behind", message, time=self._clock.now()))
 
-    def ask_whether_enough(self) -> None:
-        """If a goal is set, report the gain of further views, and once that the views so far suffice."""
-        if self._enough is None or self._cursor.n_corrected < self._enough.next_look:
-            return
-        taken = [batch.view_ids for batch in self._cursor.batches]
-        data, channels = self._joined().data, (self._sink, self._clock, self._warn)
-        if not report_gain(self._enough, self.views, taken, data, self.axis_col, *channels):
-            self._enough = None
+    def measure_law(self) -> None:
+        """Once a pass of views is corrected, measure and report the law of the error."""
+        self._laws.look(self._cursor, self.axis_col)
 
     def draw_slices(self, pause: float | None = None) -> None:
         """Draw slices of the views so far, if there are new ones and `pause` s have passed (None: now).

@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
 from beamline.projections.selection import Selection
@@ -21,11 +21,9 @@ from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Method, PresetMethod, setting
-from recon.methods import names, streams
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
-from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
 
@@ -121,7 +119,6 @@ class ReconOptions:
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
         follow: settings for a scan that is still running; None for one that has ended.
-        enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: whose workers reconstruct slabs, as `--cluster` names them; None: this process does.
         region: the box of the volume to make; None: all of it.
@@ -144,7 +141,6 @@ class ReconOptions:
     truth: str | None = None
     unfinished: bool = False
     follow: FollowTiming | None = None
-    enough: Goal | None = None
     memory: int | None = None
     region: Region | AroundSample | None = None
     cluster: str | None = None
@@ -202,16 +198,8 @@ class ReconOptions:
 
     @property
     def streaming(self) -> FitMethod:
-        """The method for a scan that is followed while it runs.
-
-        Raises:
-            ConfigError: it needs the whole scan.
-        """
-        if not isinstance(self.method, FitMethod):
-            raise ConfigError(
-                f"--enough-loss and --enough-gain need a method whose volume grows with the views "
-                f"({', '.join(filter(streams, names()))}); {self.method.name} begins when the scan has ended."
-            )
+        """The method for a scan that is followed while it runs, which `streams` is true of."""
+        assert isinstance(self.method, FitMethod)
         return self.method
 
     @property

@@ -155,13 +155,13 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
                 f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
                 f"and with --unfinished the {follower.views.n} views that are there are used."
             )
+        follower.measure_law()
         follower.draw_slices(timing.picture)
         if not follower.advance(timing.slice):
             clock.sleep(timing.poll)
         elif clock.now() - last_snapshot >= timing.snapshot:
             follower.write_snapshot()
             last_snapshot = clock.now()
-        follower.ask_whether_enough()
 
 
 @contextmanager

@@ -304,7 +304,7 @@ def _refuse_several_volumes(options: ReconOptions) -> None:
 
 def _refuse_unfollowed(options: ReconOptions) -> None:
     """Raises ConfigError for a method or views that a growing scan cannot have."""
-    if not options.streams and options.enough is None:
+    if not options.streams:
         return
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:

@@ -12,6 +12,7 @@ from beamline.core.errors import BeamlineError, DataError, InstrumentError, Refe
 from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
+from beamline.plan.passes import Choice, Passes, begun, triggers_of
 from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block
 from beamline.scan.control import State
 from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
@@ -64,6 +65,7 @@ class Acquisition:
             devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
         )
         self._done: list[RecordedBlock] = []
+        self._retaken = 0  # views, or tried
         self.recovered = 0
         """Views that gave no frame at first, but when they were repeated."""
         self.unsafe = False
@@ -117,11 +119,12 @@ class Acquisition:
         self._raise_outcome()
 
     def _blocks(self) -> Iterator[Frame]:
-        place, filter_ = self._timeline.filter, self._devices.filter
+        plan = self._timeline.plan
+        place, filter_ = plan.filter, self._devices.filter
         if filter_ is not None and place is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
             filter_.put(place)
-        energy, monochromator = self._timeline.energy, self._devices.monochromator
+        energy, monochromator = plan.energy, self._devices.monochromator
         if monochromator is not None and energy is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
             monochromator.move_to(energy)
@@ -137,12 +140,63 @@ class Acquisition:
             if self._stop.stopping and not self._still_needed(block):
                 continue
             if block.kind is FrameKind.WIDE_VIEW:
-                yield from self._wide(block)
+                if block in self._wide_to_come:
+                    yield from self._wide(block)
                 continue
-            done = RecordedBlock(block, BlockTally())
-            yield from self._block(done)
+            if block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
+                yield from self._pass_by_pass(block, self._supervision.next_pass)
+            else:
+                yield from self._block(RecordedBlock(block, BlockTally()))
             if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
-                yield from self._again(block, done.taken)
+                yield from self._again(block)
+
+    def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Iterator[Frame]:
+        """The views in passes, and what is chosen after each. What nobody chose is left to the plan.
+
+        A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
+        """
+        passes = begun(views, self._timeline.plan)
+        choice = Choice((Choice.NEXT, *self._timeline.plan.choices)[-1])
+        due = [replace(views, stored=frozenset(range(views.n)) - triggers_of(*passes.done) | views.stored)]
+        while True:
+            again = passes.done[-1] in passes.done[:-1]
+            for block in due:
+                yield from self._of_pass(RecordedBlock(block, BlockTally(), again))
+            if choice is Choice.RETAKE:
+                yield from self._again(views)
+            elif choice is Choice.WIDE:
+                for block in self._wide_to_come:
+                    yield from self._wide(block)
+            if self._stop.stopping:
+                return
+            self._supervision.pass_ended()
+            may_retake = self._supervision.may_retake(self._missing_views)
+            now = replace(passes, wide=self._wide_to_come, retakes=may_retake)
+            if not (now.to_come or now.wide or now.retakes):
+                return
+            choice = next_pass(now)
+            self._stop.refuse_abort()
+            if choice is Choice.ENOUGH and not self._stop.stopping:
+                self._stop.stop_as_enough("the views suffice")
+            if self._stop.stopping or (choice is Choice.NEXT and not now.to_come):
+                return
+            passes = now.after(choice)
+            due = list(passes.done[len(now.done) :])
+
+    def _of_pass(self, done: RecordedBlock) -> Iterator[Frame]:
+        """Views of a pass. One that gave no frame in an earlier pass is then not missing."""
+        if done.block.left:
+            for frame in self._block(done):
+                if frame.kind is FrameKind.PROJECTION:
+                    self._recover(frame.trigger)
+                yield frame
+
+    @property
+    def _wide_to_come(self) -> tuple[Block, ...]:
+        """Blocks of wide views that were not taken."""
+        taken = [done.block for done in self._done]
+        wide = (block for block in self._timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
+        return tuple(block for block in wide if block.left and block not in taken)
 
     def _block(self, done: RecordedBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
@@ -160,31 +214,48 @@ class Acquisition:
             self._devices.sample.back()
         self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
-    def _again(self, views: Block, taken: BlockTally) -> Iterator[Frame]:
+    def _again(self, views: Block) -> Iterator[Frame]:
         """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
         which is then not missing. A repeated view without a frame is not a further failure."""
-        retakes = self._supervision.retakes(tuple(taken.missing))
+        retakes = self._supervision.retakes(self._missing_views)
         if not retakes:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
         beyond = middle_of_exposure(views)[triggers]
+        first = views.n + self._retaken
+        self._retaken += len(retakes)
         done = RecordedBlock(retake_block(views, triggers), BlockTally(), again=True)
         for frame in self._block(done):
             i = frame.trigger
-            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + i
+            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, first + i
             if frame.kind is FrameKind.INVALID:
                 yield replace(frame, trigger=trigger)
                 continue
             if row < 0:
                 trigger = retakes[i].trigger
-                if trigger in taken.missing:
-                    taken.missing.remove(trigger)
-                    self.recovered += 1
+                self._recover(trigger)
             rows_astray = [astray_row for astray_row, _ in done.taken.astray.get(i, [])]
             earlier = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, earlier))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
+
+    @property
+    def _missing_views(self) -> tuple[int, ...]:
+        """Triggers of the views that gave no frame, in ascending order."""
+        return tuple(sorted(trigger for taken in self._of_views() for trigger in taken.missing))
+
+    def _of_views(self) -> Iterator[BlockTally]:
+        """Tallies of views that were not repeated."""
+        kind = FrameKind.PROJECTION
+        return (done.taken for done in self._done if done.block.kind is kind and not done.again)
+
+    def _recover(self, trigger: int) -> None:
+        """A view has a frame: it is not missing, if it was."""
+        for taken in self._of_views():
+            if trigger in taken.missing:
+                taken.missing.remove(trigger)
+                self.recovered += 1
 
     def _wide(self, block: Block) -> Iterator[Frame]:
         """Wide views, at angles of the first views. Nothing replaces anything."""
@@ -241,7 +312,7 @@ class Acquisition:
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
-        if not (seconds := self._timeline.warm_up):
+        if not (seconds := self._timeline.plan.warm_up):
             return
         self._sink(StateEntered(self._supervision.states.state, f"The scintillator warms up for {seconds:g} s"))
         deadline = self._clock.now() + seconds
@@ -307,9 +378,10 @@ class Acquisition:
         return failed
 
     def _raise_outcome(self) -> None:
-        of_views = [done for done in self._done if done.block.kind is FrameKind.PROJECTION and not done.again]
-        views = sum(len(done.taken.rows) + len(done.block.stored) for done in of_views)
-        planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
+        blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
+        firsts, planned = [block.first_trigger for block in blocks], sum(block.n for block in blocks)
+        of_views = [done for done in self._done if done.block.first_trigger in firsts]  # without retakes
+        views = sum(len(done.taken.rows) for done in of_views) + sum(len(block.stored) for block in blocks)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
         if self._refused:
@@ -335,7 +407,7 @@ class Acquisition:
 
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""
-        return "".join(f" {text}" for done in self._done if not done.again and (text := _describe(done)))
+        return "".join(f" {text}" for done in self._done if (text := _describe(done)))
 
 
 def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
@@ -372,10 +444,10 @@ def _astray(block: Block, taken: BlockTally) -> str:
 
 
 def _describe(done: RecordedBlock) -> str:
-    """Sentences on missing, extra and doubtful frames of a block."""
+    """Sentences on missing, extra and doubtful frames of a block; a view that was repeated misses none."""
     block, taken, noun = done.block, done.taken, done.block.kind.name.lower()
     text = ""
-    if taken.missing:
+    if taken.missing and not done.again:
         n = len(taken.missing)
         angles = np.degrees(block.angles[taken.missing])
         at = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"

@@ -13,10 +13,12 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from queue import Empty, Full, Queue
+from typing import Any
 
 import numpy as np
 
@@ -61,8 +63,9 @@ def frames_in_memory(timeline: Timeline) -> int:
 
 _Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
 """A frame, its digests for the checks and for the file, and the flags; None: no check has looked at it."""
-_Item = _Checked | BaseException | threading.Event | None
-"""What comes to the second thread; an exception: the frame could not be digested."""
+_Call = Callable[[], object]
+_Item = _Checked | BaseException | _Call | None
+"""What comes to the second thread. An exception: the frame could not be digested. A call: made when its turn comes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +101,7 @@ class Recorder:
     Attributes:
         n_frames: written so far.
         retaken: views that were taken again.
+        announced: frames beyond the timeline, by `expect_more`.
         references: the darks and flats so far.
     """
 
@@ -130,15 +134,16 @@ class Recorder:
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
         self._invalid: set[int] = set()  # rows that never were anything else
-        self.retaken, self._retaking = 0, False
+        self.retaken, self.announced, self._retaking = 0, 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
         self._work = Workload()
         most = room(timeline)
-        self._waiting: Queue[Frame | threading.Event | None] = Queue(most)
+        self._waiting: Queue[Frame | _Call | None] = Queue(most)
         self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
         pause, views = pause or PauseRequest(), timeline.views
+        self._n_views = views.n
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
         self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
@@ -165,10 +170,21 @@ class Recorder:
     def wait(self) -> None:
         """Wait until every frame that was put is written, or a stop is requested."""
         reached = threading.Event()
-        self._enqueue(reached)
+        self._enqueue(reached.set)
         while not reached.wait(SLICE) and not self._stop.stopping:
-            self._refuse_stall()
+            self.check()
         self._raise_failure()
+
+    def end_pass(self) -> None:
+        """Record that the frames so far end a pass, if the scan decides."""
+        self._enqueue(self._writer.end_pass)
+        if self._retaking:
+            self.wait()
+            self._retaking = False
+
+    def decided(self, values: Mapping[str, Any]) -> None:
+        """Record what was chosen after a pass: the values of its event, if the scan decides."""
+        self._enqueue(partial(self._writer.decided, values))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; no frame may be put afterwards."""
@@ -206,11 +222,13 @@ class Recorder:
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
+        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each. A frame that
+        was taken again is not taken a third time."""
         warned = self._frames(
             lambda flag: flag.level is Level.WARN and flag.check in self._consequences.retaken_warnings
         )
-        return [Retake(row, self._triggers[row]) for row in sorted((self._alarmed | warned) & self._triggers.keys())]
+        rows = sorted((self._alarmed | warned) & self._triggers.keys())
+        return [Retake(row, self._triggers[row]) for row in rows if self._triggers[row] < self._n_views]
 
     @property
     def _alarmed(self) -> set[int]:
@@ -222,7 +240,7 @@ class Recorder:
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Announce frames beyond the timeline; may be called while no frame waits."""
-        self._retaking = True
+        self._retaking, self.announced = True, self.announced + n
         self._progress.expect_more(self.n_frames, n, seconds)
 
     @property
@@ -230,8 +248,8 @@ class Recorder:
         """Whether a frame is still being written; after `finish` this means that the disk does not respond."""
         return self._thread.is_alive()
 
-    def _enqueue(self, item: Frame | threading.Event | None) -> None:
-        """Queue a frame, an event to be set when its turn comes, or None after the last frame."""
+    def _enqueue(self, item: Frame | _Call | None) -> None:
+        """Queue a frame, a call to be made when its turn comes, or None after the last frame."""
         while True:
             if self._stop.aborting or (self._stop.stopping and self._flying):
                 self._waiting.maxsize = 0  # the stage turns before an open shutter: it stands first
@@ -261,7 +279,7 @@ class Recorder:
     def _check_frames(self) -> None:
         """The first thread: digests and checks, until the last frame, or until the second one goes on alone."""
         while (item := self._next()) is not None:
-            if isinstance(item, threading.Event):
+            if not isinstance(item, Frame):
                 self._checked.put(item)
             elif self._failure is None:  # frames after a failure are discarded, so that `put` does not wait for room
                 self._under_checks = item, time.monotonic()
@@ -334,6 +352,8 @@ class Recorder:
                     if not flushed and (nothing_waits or not isinstance(item, tuple)):
                         self._writer.flush()
                         flushed = True
+                if callable(item):
+                    item()
             except BaseException as error:  # a plug-in may raise SystemExit, which would end this thread in silence
                 with suppress(BaseException):  # the first one counts
                     self._writer.flush()  # the frames before
@@ -342,11 +362,9 @@ class Recorder:
             self._writing_since = math.inf
             if item is None:
                 return
-            if isinstance(item, threading.Event):
-                item.set()
             item = self._next_checked()
 
-    def _next(self) -> Frame | threading.Event | None:
+    def _next(self) -> Frame | _Call | None:
         """The next item of the queue; checks the disk about once a second meanwhile."""
         while True:
             self._look_at_backlog()

@@ -14,20 +14,26 @@ from pathlib import Path
 
 import h5py
 
-from beamline.config.load import NO_LIVE, Config, changed, load, resolved_yaml
+from beamline.config.load import NO_LIVE, Config, changed, load, plan_of, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
+from beamline.instrument import connect
+from beamline.plan.passes import Choice, begun, triggers_of
 from beamline.plan.plan import ScanPlan
+from beamline.plan.timeline import work_out
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
 from beamline.storage.parts import (
+    decisions_in,
     end_references_missing,
     files_with_frames,
     is_joined,
     join,
+    pass_ends_in,
     views_in,
     views_planned,
+    wide_views_in,
 )
 from beamline.storage.recover import Recovered, recover, require_ours
 from beamline.storage.run_record import alive
@@ -51,8 +57,10 @@ class ResumableRun:
         lock: keeps other processes from recovering the run or going on with it.
         config: its configuration.
         parts: its files so far, each with a frame at least.
-        views: of the plan, in these files.
+        views: of the plan, in these files, or decided against.
         planned: views of the whole plan.
+        wide: triggers of the wide views in these files, likewise.
+        choices: after each pass that ended in them, oldest first.
         end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
@@ -67,6 +75,8 @@ class ResumableRun:
     last_frame_time: float
     left_out: tuple[str, ...] = ()
     end_references: frozenset[FrameKind] | None = None
+    wide: frozenset[int] = frozenset()
+    choices: tuple[str, ...] = ()
 
     @property
     def in_words(self) -> str:
@@ -79,7 +89,8 @@ class ResumableRun:
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
         """The part of the plan that is still missing."""
-        return replace(plan, stored=self.views, end_references=self.end_references)
+        stored = self.views | self.wide
+        return replace(plan, stored=stored, choices=self.choices, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
         """Recover parts whose writer died, join the parts, and create the folder of the new part.
@@ -161,7 +172,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     config = load(run / CONFIG, environment={})
     if given is not None and not config.recon.live:
         given = changed(given, NO_LIVE)
-    views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
+    taken, planned, last_frame_time, parts, closed = _Taken(), 0, 0.0, list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             require_ours(part, file)
@@ -174,19 +185,63 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
             if file[layout.COMMITTED][()]:
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
-                views |= views_in(file)
+                taken = taken.and_of(file)
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
-    end_references = None
+    end_references, (views, wide) = None, taken.without_rejected(config)
     if len(views) >= planned:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
             _refuse_whole(run, planned, parts, closed)
     return ResumableRun(
-        run, lock, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
-    )
+        run, lock, config, tuple(parts), views, planned, last_frame_time, tuple(left_out), end_references, wide,
+        taken.choices,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """What the parts of a run hold, oldest first.
+
+    Attributes:
+        views, wide: triggers of the views, and of the wide ones.
+        since: of the views since the last pass that ended.
+        choices: after each pass that ended, oldest first; where none was recorded, the plan went on.
+        decides: the scan chooses what is measured after each pass.
+    """
+
+    views: frozenset[int] = frozenset()
+    wide: frozenset[int] = frozenset()
+    since: frozenset[int] = frozenset()
+    choices: tuple[str, ...] = ()
+    ended: int = 0
+    decides: bool = False
+
+    def and_of(self, file: h5py.File) -> _Taken:
+        """With those of the next part."""
+        ends, views = pass_ends_in(file), views_in(file)
+        since, ended = views_in(file, int(ends[-1])) if ends.size else self.since | views, self.ended + ends.size
+        choices = (*self.choices, *(str(values.get("choice")) for values in decisions_in(file)))
+        choices = (*choices, *[Choice.NEXT] * ended)[:ended]
+        wide = self.wide | wide_views_in(file)
+        return _Taken(self.views | views, wide, since, choices, ended, layout.PASS_ENDS in file)
+
+    def without_rejected(self, config: Config) -> tuple[frozenset[int], frozenset[int]]:
+        """Triggers of the views, and of the wide ones, that need not be taken: those that are there, and those that the
+        scan decided against."""
+        if not self.decides:
+            return self.views, self.wide
+        stage, camera, to_counts = connect.describe(config)
+        plan = replace(plan_of(config), choices=self.choices)
+        passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
+        missing = triggers_of(*passes.done) - self.views | triggers_of(*passes.to_come)
+        if self.choices[-1:] == (Choice.AGAIN,):
+            missing |= triggers_of(passes.done[-1]) - self.since
+        n = plan.angles.size
+        rejected = range(n, n + plan.wide_views * len(plan.wide_places)) if Choice.ENOUGH in self.choices else ()
+        return frozenset(range(n)) - missing, self.wide | {*rejected}
 
 
 def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:

@@ -386,6 +386,8 @@ class _Run:
                 lambda: self._refusal(recorder, follower), self.pause, lambda: wait_in_pause(recorder), self.states,
                 lambda missing: self._retakes(recorder, missing),
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
+                pass_ended=recorder.end_pass,
+                may_retake=lambda missing: min(len(self._bad(recorder, missing)), self._may_retake(recorder)),
             ),
         )  # fmt: skip
 
@@ -409,14 +411,7 @@ class _Run:
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
         """Views that were flagged for it or gave no frame; of more than the plan allows, an even spread."""
-        most = self.ready.plan.retakes
-        if not most:
-            return ()
-        recorder.wait()
-        if self.stop.stopping:
-            return ()
-        lost = [Retake(-1, trigger) for trigger in missing]
-        bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
+        bad, most = self._bad(recorder, missing), self._may_retake(recorder)
         chosen = spread_retakes(bad, most)
         if not chosen:
             return ()
@@ -426,9 +421,21 @@ class _Run:
                 f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
             )
             self.sink(Warned(message))
-        recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
+        recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
+
+    def _bad(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
+        """Views that were flagged or gave no frame, by trigger; none where none may be taken again."""
+        if not self._may_retake(recorder):
+            return ()
+        recorder.wait()
+        lost = [] if self.stop.stopping else [*recorder.views_to_retake, *(Retake(-1, trigger) for trigger in missing)]
+        return sorted(lost, key=lambda view: view.trigger)
+
+    def _may_retake(self, recorder: Recorder) -> int:
+        """Views that may still be taken again by the plan."""
+        return self.ready.plan.retakes - recorder.announced
 
 
 def wait_in_pause(recorder: Recorder) -> bool:

@@ -16,6 +16,7 @@ from beamline.core.events import BeamRead, Sink, Warned
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import count, size
 from beamline.monitor.check import Flag, Level, Policy
+from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Retake
 from beamline.scan.control import State, StateMachine
 from drivers.base.errors import DeviceError
@@ -44,11 +45,19 @@ class Supervision:
     wait_in_pause: Callable[[], bool] = _wait_in_pause
     # states: told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
-    # retakes: called once, after the last projection, with the triggers without a frame; returns the views to repeat
+    # retakes: called with the triggers without a frame, after the last projection and where retakes were chosen;
+    # returns the views that are repeated now
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
     # wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there was
     # beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
+    # next_pass: called after each pass of views, wide views or retakes, if something is left, and returns a choice that
+    # is possible. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
+    next_pass: Callable[[Passes], Choice] | None = None
+    # pass_ended: called before, and after the last pass, too; all frames were delivered
+    pass_ended: Callable[[], None] = lambda: None
+    # may_retake: called then with the triggers without a frame; returns how many views `retakes` would return
+    may_retake: Callable[[Sequence[int]], int] = lambda missing: 0
 
 
 @dataclass(frozen=True)

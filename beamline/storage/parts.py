@@ -41,9 +41,12 @@ _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
-def views_in(file: h5py.File) -> frozenset[int]:
+def views_in(file: h5py.File, first: int = 0) -> frozenset[int]:
     """The planned views in a file, counted from 0, except those whose frame is invalid, or whose record differs from
     its checksum.
+
+    Args:
+        first: the row from which on frames count.
 
     Raises:
         ValueError: a row claims to replace a later one.
@@ -54,11 +57,37 @@ def views_in(file: h5py.File) -> frozenset[int]:
     replaces[altered], kinds[altered] = -1, FrameKind.INVALID
     require_earlier(replaces)
     views = set()
-    for row in np.flatnonzero(kinds == FrameKind.PROJECTION):
+    for row in first + np.flatnonzero(kinds[first:] == FrameKind.PROJECTION):
         while replaces[row] >= 0:  # a view that was taken again has the number of the first one
             row = replaces[row]
         views.add(int(triggers[row]))
     return frozenset(views)
+
+
+def wide_views_in(file: h5py.File) -> frozenset[int]:
+    """Triggers of the wide views in a file, which count on from the planned views."""
+    n = int(file[layout.COMMITTED][()])
+    aside = file[layout.X_TRANSLATION][:n] if layout.X_TRANSLATION in file else np.zeros(n)
+    wide = (file[layout.KIND][:n] == FrameKind.ALIGNMENT) & (aside != 0)
+    wide[altered_rows(file, 0, n)] = False
+    return frozenset(file[layout.TRIGGER][:n][wide].tolist())
+
+
+def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
+    """Rows of a file at the end of each pass [pass], of those committed; empty where the scan chose nothing."""
+    if layout.PASS_ENDS not in file:
+        return np.zeros(0, np.int64)
+    hdf5.look_again(file[layout.PASS_ENDS])
+    ends = np.asarray(file[layout.PASS_ENDS][()], np.int64)
+    return ends[ends <= int(file[layout.COMMITTED][()])]
+
+
+def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
+    """What was chosen after each pass: values of the event `next_chosen`, likewise."""
+    if layout.DECISIONS not in file:
+        return ()
+    hdf5.look_again(file[layout.DECISIONS])
+    return tuple(json_object(datasets.text(line)) or {} for line in file[layout.DECISIONS][()])
 
 
 def views_planned(file: h5py.File) -> int | None:
@@ -85,12 +114,9 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     before = np.isin(kinds[: views[0]], (FrameKind.DARK, FrameKind.FLAT))
     first = np.flatnonzero(before)[-1] + 1 if before.any() else 0
     seen = triggers[first : views[-1] + 1]
-    return tuple(
-        (
-            sum(_planned(file, "start").values())
-            + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
-        ).tolist()
-    )
+    seen = seen[seen < (views_planned(file) or 0)]  # wide views, and those taken again, count on from there
+    gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
+    return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
@@ -240,6 +266,9 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         record[layout.REPLACES][again] += first
         values[layout.RECORD_CHECKSUM][i][again] = record_checksums(record)[again]
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
+    if layout.PASS_ENDS in files[0]:
+        values[layout.PASS_ENDS] = [pass_ends_in(file) + first for file, first in zip(files, firsts, strict=False)]
+        values[layout.DECISIONS] = [file[layout.DECISIONS][()] for file in files]
     _copy(files[0]["/"], joined, {path: np.concatenate(parts) for path, parts in values.items()})
     for path in _VIRTUAL:
         item = files[0][path]
@@ -311,7 +340,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)
         elif path in values:
-            datasets.copy_attributes(item, target.create_dataset(name, data=values[path]))
+            datasets.copy_attributes(item, target.create_dataset(name, data=values[path], dtype=item.dtype))
         else:
             source.copy(name, target)
 

@@ -1,8 +1,8 @@
 """Error law: how the error of a volume falls with further views, and the gain in dB that follows for each kind.
 
-The mean square error of a volume of n views has three shares: `offset`, an unknown density beside the field that adds a
-constant in the middle and falls only with wide views; `noise`, which falls with the light, at the same angles too; and the
-rest, by gaps between the angles. The last two together fall as n^-exponent when views at new angles come.
+The mean square error of a volume of n views has three shares: `offset`, an unknown density beside the field that adds
+a constant in the middle and falls only with wide views; `noise`, which falls with the light, at the same angles too;
+and the rest, by gaps between the angles. The last two together fall as n^-exponent when views at new angles come.
 """
 
 from __future__ import annotations

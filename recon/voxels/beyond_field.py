@@ -123,6 +123,25 @@ def sample_radius(
     return _predicting_radius(views, geometry, reach)
 
 
+def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None) -> float:
+    """The mean square error, 1/mm², of the constant that unknown matter beside the field adds in its middle.
+
+    It is of a volume in a box as wide as the sample, by the uncertainty of its density. Of cans of packed balls, 1.5, 2
+    and 3 times as wide as the field, 90 views give 5, 1 and 2 times the true one; 30 views a tenth of it.
+
+    Args:
+        geometry: of the views.
+        sample: as of `sample_radius`; None: it is within the field.
+    """
+    return 0.0 if sample is None else (sample.density * _middle_density(volume, geometry.reach)) ** 2
+
+
+def _middle_density(volume: Volume, reach: float) -> float:
+    """1/mm, mean over the middle half of the field."""
+    y, x = np.meshgrid(*volume.grid.coordinates()[1:], indexing="ij")
+    return float(volume.data[:, np.hypot(y, x) < reach / 2].mean())
+
+
 def _given_radius(given: float | SampleRadius, reach: float) -> SampleRadius | None:
     if isinstance(given, SampleRadius):
         return given
@@ -214,11 +233,8 @@ class _Trial:
         (data, geometry), (judged, apart) = self.seen, self.unseen
         grid = self.box.reaching(radius, geometry)
         method = FistaTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
-        volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume.data
+        volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume
         projector = Projector(apart, grid)
-        model = projection_lines(projector.forward(volume))
-        y, x = np.meshgrid(*grid.coordinates()[1:], indexing="ij")
-        middle = np.hypot(y, x) < geometry.reach / 2
-        return unseen_residuals(model, projection_lines(judged), None, projector.resolution), float(
-            volume[:, middle].mean()
-        )
+        model = projection_lines(projector.forward(volume.data))
+        left = unseen_residuals(model, projection_lines(judged), None, projector.resolution)
+        return left, _middle_density(volume, geometry.reach)

@@ -53,6 +53,7 @@ class ArraySource:
     shifts: NDArray[np.float64] | None = None
     aside_mm: NDArray[np.float64] | None = None
     part_starts: NDArray[np.int64] = np.zeros(1, np.int64)
+    pass_ends: NDArray[np.int64] = np.zeros(0, np.int64)
     checksummed = False
     altered: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()

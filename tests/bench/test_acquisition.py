@@ -26,7 +26,7 @@ from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import look, start
-from beamline.plan.plan import Block, Mode, Timeline
+from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.storage.disk_file import ToDisk
 from beamline.storage.writers import layout
@@ -98,7 +98,9 @@ class Load:
         )
         frame_bytes = 2 * self.shape[0] * self.shape[1]
         total = n * (frame_bytes + self.digests[0].preview.nbytes)
-        return Timeline(blocks, n * PERIOD, frame_bytes, total, 1, np.pi / n, 0.0, 0.0, (), ())
+        none_of_them = FieldPlan(0, Place.NONE, PERIOD)
+        plan = ScanPlan(angles, Mode.FLY, PERIOD, PERIOD, 0.0, none_of_them, none_of_them, "fixed")
+        return Timeline(blocks, n * PERIOD, frame_bytes, total, 1, np.pi / n, 0.0, 0.0, (), (), plan)
 
 
 def _context(load: Load) -> ScanContext:

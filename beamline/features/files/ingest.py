@@ -84,6 +84,7 @@ def ingest(
             source_distance_mm=None if source.cone is None else source.cone[0],
             plan=json.dumps({} if other_angles else dict(source.plan)),
             wide_views=source.aside_mm is not None,
+            decides=source.pass_ends.size > 0,
         )
         with hdf5.created(partial, layout.LIBVER) as file:
             invalid = _copy(source, file, out, info, no_data, progress)
@@ -131,6 +132,11 @@ def _copy(
         file["/entry/record/no_data"] = float(no_data)
     if source.part_starts.size > 1:
         file[layout.PART_STARTS] = source.part_starts
+    if info.decides:
+        lines = [json.dumps(values).encode() for values in source.decisions]
+        for path, values in ((layout.PASS_ENDS, source.pass_ends), (layout.DECISIONS, lines)):
+            file[path].resize(len(values), 0)
+            file[path][...] = np.array(values, file[path].dtype)
     rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0

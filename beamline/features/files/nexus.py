@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage import datasets, hdf5
+from beamline.storage.parts import pass_ends_in
 from beamline.storage.readers.nexus import Places, find
 from beamline.storage.rules import Finding
 from beamline.storage.writers import layout
@@ -93,7 +94,8 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
         return
     steps = np.diff(stamps)
     new = np.zeros(triggers.size, np.bool_)
-    new[np.unique(np.stack([key, triggers]), axis=1, return_index=True)[1]] = True
+    of_pass = np.searchsorted(pass_ends_in(places.entry.file), np.arange(key.size), "right")  # which may be repeated
+    new[np.unique(np.stack([key, triggers, of_pass]), axis=1, return_index=True)[1]] = True
     parts = places.data.virtual_sources() if places.data.is_virtual else []
     begin = [part.vspace.get_select_bounds()[0][0] for part in parts]
     new[[row for row in begin if row < new.size]] = True

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _OF_A_VOLUME = frozenset(
     ("output", "report", "write-config", "json", "dry-run", "max-residual", "truth", "uncertainty",
-     "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
+     "roi", "follow", "earlier", "memory", "cluster", "checkpoint", "resume", "budget",
      "time", "moves", "beside-scan")
 )  # fmt: skip
 """Options of `beamline recon` that a slice has no use for."""

@@ -141,7 +141,7 @@ def take(
     frame_bytes = 2 * math.prod(camera.timing.shape)
     worked = Timeline(
         blocks=tuple(blocks), duration=0.0, frame_bytes=frame_bytes, total_bytes=0, step_counts=0, step=0.0,
-        blur_px=0.0, skew_px=0.0, violations=(), remarks=(), filter=plan.filter, energy=plan.energy,
+        blur_px=0.0, skew_px=0.0, violations=(), remarks=(), plan=plan,
     )  # fmt: skip
     instrument.watch_moves(stop.refuse_abort)
     acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)

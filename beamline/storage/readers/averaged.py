@@ -47,6 +47,7 @@ class AveragedSource(Frames):
             attributes=self._and_joined,
             flags=lambda flags: None if flags is None else flags.of_groups(self._used),
             part_starts=lambda starts: np.unique(np.searchsorted(self._first(), starts)),
+            pass_ends=lambda ends: np.searchsorted(self._first(), ends),
             damaged=lambda rows: frozenset(i for i, group in enumerate(self._used) if rows.issuperset(group)),
             replaces=lambda rows: None,  # such frames are gone
             altered=frozenset(),

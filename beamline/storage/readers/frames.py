@@ -20,7 +20,8 @@ _Sizes = NDArray[np.int64]
 _AT_REFRESH = ("image_key", "angles", "exposures")
 BY_FRAME = ("currents", "energies", "times", "shifts", "aside_mm")
 _OF_FRAMES = (*_AT_REFRESH, *BY_FRAME)
-_COPIED = {*ScanSource.__annotations__} - {"unreadable", "facts", "stated_shifts", "stated_ending", *_OF_FRAMES}
+_PRESENT = {"unreadable", "facts", "stated_shifts", "stated_ending", "pass_ends", *_OF_FRAMES}
+_COPIED = {*ScanSource.__annotations__} - _PRESENT
 
 
 class Frames(ScanSource):
@@ -105,13 +106,17 @@ def _after(each: Sequence[Any], sizes: _Sizes) -> Iterator[tuple[Any, int]]:
 _JOINED: dict[str, Callable[[Any, _Sizes], Any]] = {
     **dict.fromkeys((*_OF_FRAMES, "triggers", "framestamps"), _column),
     "replaces": _replaced,
-    "part_starts": lambda each, sizes: np.concatenate([rows + n for rows, n in _after(each, sizes)]),
+    **dict.fromkeys(
+        ("part_starts", "pass_ends"), lambda each, sizes: np.concatenate([rows + n for rows, n in _after(each, sizes)])
+    ),
     **dict.fromkeys(
         ("altered", "damaged"), lambda each, sizes: frozenset(r + n for s, n in _after(each, sizes) for r in s)
     ),
     "flags": FrameFlags.joined,
+    "decisions": lambda each, sizes: sum(each, ()),
     "checksummed": lambda each, sizes: all(each),
 }
 """How what several sources say becomes one value; else it is that of the last."""
-for _name in (*BY_FRAME, *(name for name, value in vars(ScanSource).items() if isinstance(value, property))):
+_PROPERTIES = (name for name, value in vars(ScanSource).items() if isinstance(value, property))
+for _name in (*BY_FRAME, "pass_ends", *_PROPERTIES):
     setattr(Frames, _name, property(partial(Frames.known, name=_name)))

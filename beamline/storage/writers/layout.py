@@ -16,7 +16,8 @@
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
       record/parts              of joined.h5: name and frames of each file that it draws from
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
-      progress                  frames_committed, finished, status, missing_triggers, reason
+      progress                  frames_committed, finished, status, missing_triggers, reason; of a scan that decides
+                                after each pass: pass_ends, decisions
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
 image_key holds 0, 1, 2, 3; an alignment frame is 3 there, and -1 in frame_log/kind. image_key_control (a link to it),
@@ -72,6 +73,8 @@ FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 REASON = "/entry/progress/reason"
+PASS_ENDS = "/entry/progress/pass_ends"  # rows; only of scans that decide what is measured after a pass
+DECISIONS = "/entry/progress/decisions"  # a line of JSON each, the values of the event `next_chosen`; likewise
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
@@ -86,6 +89,7 @@ for cones."""
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
 REASON_BYTES = 600
+DECISION_BYTES = 8192
 FULL = "Full"
 _TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 
@@ -145,6 +149,7 @@ class ScanInfo:
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
         wide_views: whether some are planned.
+        decides: whether what is measured next is chosen after each pass.
         diameter_mm: of the sample.
     """
 
@@ -165,6 +170,7 @@ class ScanInfo:
     monochromator_kev: float | None = None
     saturation: float | None = None
     wide_views: bool = False
+    decides: bool = False
     diameter_mm: float | None = None
 
 
@@ -207,6 +213,10 @@ def create(
     _rewritable_text(file, REASON, "", REASON_BYTES)
     _growing(file, MISSING, (), np.dtype("<i8"))
     file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
+    if info.decides:
+        _growing(file, PASS_ENDS, (), np.dtype("<i8"))
+        line = h5py.string_dtype("utf-8", DECISION_BYTES)
+        file.create_dataset(DECISIONS, (0,), line, maxshape=(None,), chunks=(1,))
 
 
 def _groups(file: h5py.File) -> None:

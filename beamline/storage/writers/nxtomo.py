@@ -8,12 +8,13 @@ the death of this process. Every second they are brought to the disk (fsync), wh
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -46,9 +47,9 @@ __all__ = ["NXtomoWriter", "ScanInfo"]
 
 LAST = (
     layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.REASON,
-    layout.BEAM_TIME, layout.BEAM_VALUE,
+    layout.BEAM_TIME, layout.BEAM_VALUE, layout.PASS_ENDS, layout.DECISIONS,
 )  # fmt: skip
-"""Datasets that are written when a scan ends."""
+"""Datasets that are written when a scan, or a pass of it, ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
 
 
@@ -193,6 +194,33 @@ class NXtomoWriter:
         self._progress.flush()
         self._committed, self._before = self._rows, os.fstat(self._handle)
         self._to_disk(self._committed)
+
+    def end_pass(self) -> None:
+        """Record that a pass ends with the rows so far, in a file made for it (ScanInfo.decides).
+
+        DataError for a disk that does not take it, as of `append`.
+        """
+        self._add(layout.PASS_ENDS, self._rows)
+
+    def decided(self, values: Mapping[str, Any]) -> None:
+        """Record what was chosen after a pass, likewise."""
+        from pydantic_core import to_jsonable_python  # here, because most scans write no line
+
+        line = json.dumps(to_jsonable_python(values, inf_nan_mode="null"))
+        self._add(layout.DECISIONS, line.encode())
+
+    def _add(self, path: str, value: int | bytes) -> None:
+        if self._broken or path not in self._last:
+            return
+        try:
+            self.flush()
+            column = self._last[path]
+            column.resize(len(column) + 1, 0)
+            column[-1] = value
+            column.flush()
+        except FAILURES as error:
+            self._broken = True
+            raise self._disk_error("take the end of a pass", error) from error
 
     def close(
         self,

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,15 +56,15 @@ def schedule(
     axis_col: float | None = None,
     pause: float = 0.0,
     flags: Mapping[int, Flag] = MappingProxyType({}),
-    plan: str = "",
+    **info: Any,
 ) -> None:
     """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
-    last one; status None never finishes it. `flags` come with the row that they are named by."""
+    last one; status None never finishes it. `flags` come with the row that they are named by. `info`: of the file."""
     writers: list[NXtomoWriter] = []
-    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, plan=plan)
+    of_file = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, **info)
 
     def create() -> None:
-        writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
+        writers.append(NXtomoWriter(path, of_file, frames[0].counts.shape, clock=StandingClock()))
 
     def append(frame: Frame) -> Callable[[], None]:
         said = [flags[frame.index]] if frame.index in flags else []

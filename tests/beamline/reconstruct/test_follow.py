@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,10 +23,8 @@ from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame
 from recon.assess.metrics import psnr
-from recon.base.geometry import Geometry
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
-from recon.voxels.enough_views import Goal
 from recon.warm_up import warm_up
 from tests.beamline.reconstruct.growing_scan import (
     BRIEF,
@@ -169,27 +166,6 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert not (tmp_path / "recon.snapshot.h5").exists()  # the volume is there
 
 
-def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    golden = np.pi * (np.arange(60) * (5**0.5 - 1) / 2 % 1)
-    scan = replace(SCAN, angles=golden)
-    asked: list[tuple[int, int]] = []
-
-    def predicted(data: np.ndarray, planned: Geometry, rng: np.random.Generator, n: int) -> list[float]:
-        np.testing.assert_allclose(planned.angles, golden, atol=1e-6)
-        asked.append((len(data), planned.n_views))
-        return [4.0 / len(data)] * n
-
-    monkeypatch.setattr("beamline.reconstruct.followed_views.predicted_gains", predicted)
-    clock, events = ScanClock(), list[Event]()
-    plan = json.dumps({"angles_deg": np.degrees(golden).tolist()})
-    schedule(clock, tmp_path / "scan.h5", frames_of(scan), plan=plan)
-    reconstruct_file(options(tmp_path, enough=Goal(psnr_loss=0.2), method=BRIEF), events.append, clock)
-    (enough,) = [event.data for event in events if event.event == "enough"]
-    assert 24 < enough["n_views"] < 60 == enough["planned"]
-    assert enough["high"] <= 0.2 and enough["low"] <= enough["mean"] <= enough["high"]
-    assert asked[0][0] >= 24 and asked[-1][0] == enough["n_views"]
-
-
 FRAMES = frames_of(INTERLACED)
 SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
 
@@ -220,7 +196,6 @@ def test_scans_that_make_no_volume(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"method": Fbp(), "enough": Goal(1.0, None)},
         {"selection": Selection(views="fixed:5")},
         {"method": R2(steps=10)},
         {"truth": "missing.npz"},

@@ -7,7 +7,7 @@ import pytest
 
 import recon
 from recon.base.method import DataUse, ReconProblem, RunControl, SampleRadius
-from recon.voxels.beyond_field import sample_radius
+from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.field_edges import taller_than_field
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
@@ -119,6 +119,19 @@ def test_few_views_take_the_end_that_fbp_takes_and_say_that_nothing_is_known() -
     found = sample_radius(views_of(can(1.6 * COLS / 2), some), some)
     assert found is not None and (found.low, found.high, found.density) == (COLS / 2, 4.5 * COLS / 2, 1.0)
     assert found.radius == pytest.approx(1.6 * COLS / 2, rel=0.15)
+
+
+def test_what_is_open_of_the_density_adds_a_constant_in_the_middle(
+    wide: tuple[np.ndarray, np.ndarray], made: recon.Reconstruction
+) -> None:
+    grid = recon.Grid.matching(GEOMETRY)
+    y, x = np.meshgrid(*grid.coordinates()[1:], indexing="ij")
+    middle = np.hypot(y, x) < COLS / 4
+    half = recon.Volume(np.broadcast_to(np.where(middle, 0.5, 9), grid.shape).astype(np.float32), grid)
+    assert offset_error(half, GEOMETRY, SampleRadius(40, 38, 42, 0.02)) == pytest.approx(1e-4)
+    assert offset_error(half, GEOMETRY, None) == 0
+    constant = float((made.volume.data - wide[1])[:, middle].mean()) ** 2
+    assert constant < 2 * offset_error(made.volume, GEOMETRY, sample_radius(wide[0], GEOMETRY))
 
 
 @pytest.mark.parametrize("given", [-1.0, np.inf])

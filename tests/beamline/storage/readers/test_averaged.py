@@ -39,7 +39,9 @@ def means(base: ArraySource, *groups: list[int]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("dtype", [np.uint16, np.float32, np.uint32])
 def test_a_view_is_the_mean_of_its_frames_and_references_stay(dtype: Any) -> None:
     base = scan([DARK, FLAT, FLAT, *[VIEW] * 6, FLAT], [0, 0, 0, 0, 0, 0, 5, 5, 5, 0], dtype)
+    base.pass_ends = np.array([6, 9])
     read = AveragedSource(base, 3)
+    assert read.pass_ends.tolist() == [4, 5]
     np.testing.assert_array_equal(read.image_key, [DARK, FLAT, FLAT, VIEW, VIEW, FLAT])
     np.testing.assert_allclose(np.degrees(read.angles[3:5]), [0, 5])
     np.testing.assert_allclose(read.read([3, 4, 1]), means(base, [3, 4, 5], [6, 7, 8], [1]), rtol=6e-8)

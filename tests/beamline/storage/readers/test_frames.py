@@ -22,7 +22,11 @@ def test_rows_count_from_the_first_frame_of_all() -> None:
     other.replaces, other.part_starts = np.array([-1, 0, -1]), np.array([0, 1])
     nothing = np.full((3, len(TODAY)), np.nan, np.float32), np.full((3, len(TODAY), 4), -1, np.int32)
     other.flags = FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY, *nothing)
+    one.pass_ends = np.array([2])
     both = Frames(one, other)
+    assert both.pass_ends.tolist() == [2]
+    other.pass_ends = np.array([1, 3])
+    assert both.pass_ends.tolist() == [2, 3, 5] and both.pass_ends.dtype == np.int64
     assert (both.damaged, both.altered) == ({1, 2}, {4})
     assert both.replaces is not None and both.replaces.tolist() == [-1, -1, -1, 2, -1]
     assert both.part_starts.tolist() == [0, 2, 3]

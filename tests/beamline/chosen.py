@@ -1,0 +1,63 @@
+"""A run of the fake instrument in passes, whose choices a test makes."""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from beamline.config.load import plan_of
+from beamline.plan.passes import Choice, Passes
+from beamline.scan.preflight import preflight
+from beamline.scan.recorder import Recorder
+from beamline.scan.supervision import Supervision
+
+Chooser = Callable[[Passes], Choice]
+
+
+@contextmanager
+def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
+    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded."""
+    recorders: list[Recorder] = []
+
+    def recorder(*given: Any, **more: Any) -> Recorder:
+        recorders.append(Recorder(*given, **more))
+        return recorders[-1]
+
+    def next_pass(passes: Passes) -> Choice:
+        choice = choose(passes)
+        recorders[-1].decided({"n_views": passes.n_views, "choice": choice, "predicted": float("nan")})
+        return choice
+
+    with patch.context() as within:
+        for module in ("preflight", "resume"):
+            in_passes = lambda config: replace(plan_of(config), pass_views=pass_views)  # noqa: E731
+            within.setattr(f"beamline.scan.{module}.plan_of", in_passes)
+        deciding = lambda *given, **more: _deciding(preflight(*given, **more))  # noqa: E731
+        within.setattr("beamline.scan.run.preflight", deciding)
+        within.setattr("beamline.scan.run.Recorder", recorder)
+        supervised = lambda *given, **more: Supervision(*given, **more, next_pass=next_pass)  # noqa: E731
+        within.setattr("beamline.scan.run.Supervision", supervised)
+        yield
+
+
+def _deciding(ready: Any) -> Any:
+    return replace(ready, info=replace(ready.info, decides=True))
+
+
+class Asked:
+    """Answers by a script, where they are possible, else that the plan goes on; keeps what it was asked."""
+
+    def __init__(self, script: Iterable[Choice]) -> None:
+        self.script, self.asked, self.answers = iter(script), list[Passes](), list[Choice]()
+
+    def __call__(self, passes: Passes) -> Choice:
+        choice = next(self.script, Choice.NEXT)
+        possible = {
+            Choice.NEXT: True, Choice.AGAIN: passes.may_repeat, Choice.WIDE: bool(passes.wide),
+            Choice.RETAKE: passes.retakes > 0, Choice.ENOUGH: True,
+        }  # fmt: skip
+        self.asked.append(passes)
+        self.answers.append(choice if possible[choice] else Choice.NEXT)
+        return self.answers[-1]

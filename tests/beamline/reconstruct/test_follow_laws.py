@@ -1,0 +1,274 @@
+"""The law of the error of a followed scan: once at the end of each pass, of all views until then."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.events import Event, LawMeasured
+from beamline.core.sinks import Warnings
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.reconstruct import live_fit
+from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.pipeline import reconstruct_file
+from beamline.storage.readers.nxtomo import NXtomoSource
+from beamline.storage.readers.open import SourceOptions, open_scan
+from drivers.base.frame import Frame, FrameKind
+from recon.assess.error_law import ErrorLaw
+from recon.base.geometry import Geometry
+from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule
+from tests.beamline.scans import frames_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+FRAMES = frames_of(INTERLACED)  # four references, and three passes of ten views
+ENDS = (14, 24, 34)
+
+
+@dataclass
+class Laws:
+    """Takes the place of the numerics: what it was asked, and an error that it raises."""
+
+    asked: list[tuple[np.ndarray, Geometry, list[int]]] = field(default_factory=list)
+    error: Exception | None = None
+    offset: float = 0.0
+
+    def __call__(
+        self, data: np.ndarray, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator
+    ) -> SimpleNamespace:
+        self.asked.append((data, geometry, list(sizes)))
+        if self.error is not None:
+            raise self.error
+        return SimpleNamespace(law=ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), gained=0.5 * len(sizes))
+
+    @property
+    def sizes(self) -> list[list[int]]:
+        return [sizes for _, _, sizes in self.asked]
+
+
+@pytest.fixture
+def laws(monkeypatch: pytest.MonkeyPatch) -> Laws:
+    made = Laws()
+    monkeypatch.setitem(sys.modules, "recon.voxels.measured_law", SimpleNamespace(measured_law=made))
+    return made
+
+
+@pytest.fixture
+def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Sets the ends of the passes of files, by name."""
+
+    def ends_of(**ends: Sequence[int]) -> None:
+        def so_far(source: NXtomoSource) -> np.ndarray:
+            return np.array([end for end in ends.get(Path(source.path).stem, ()) if end <= source.n], np.int64)
+
+        monkeypatch.setattr(NXtomoSource, "pass_ends", property(so_far))
+
+    return ends_of
+
+
+@dataclass
+class Followed:
+    """A scan of a frame a second, and who follows it."""
+
+    clock: ScanClock
+    follower: ScanFollower
+    events: list[Event]
+
+    def seconds(self, n: float) -> None:
+        self.clock.sleep(n)
+        self.follower.take_new_frames(False)
+        self.follower.measure_law()
+
+    def of(self, name: str) -> list[dict[str, Any]]:
+        return [event.data for event in self.events if event.event == name]
+
+
+@pytest.fixture
+def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
+    made: list[Followed] = []
+
+    def begin(frames: Sequence[Frame] = FRAMES, changes: dict[str, Any] | None = None, **how: Any) -> Followed:
+        clock, events = ScanClock(), list[Event]()
+        schedule(clock, tmp_path / "scan.h5", list(frames), period=1.0, **how)
+        clock.sleep(1.0)
+        wanted = options(tmp_path, **(changes or {}))
+        source = wanted.source.open(follow=True)
+        follower = ScanFollower(wanted, source, events.append, clock, Warnings(events.append, clock))
+        made.append(Followed(clock, follower, events))
+        return made[-1]
+
+    yield begin
+    for each in made:
+        each.follower.source.close()
+        close(each.clock)
+
+
+def test_one_law_a_pass_of_all_views_until_its_end(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], tmp_path: Path
+) -> None:
+    passes(scan=ENDS)
+    scan = follow()
+    scan.seconds(13)
+    assert not laws.asked  # a view is missing
+    for n in (1, 1, 9, 10):
+        scan.seconds(n)
+        scan.seconds(0)
+    assert laws.sizes == [[10], [10, 20], [10, 20, 30]]
+    told = scan.of("error_law")
+    assert [(law["n_views"], law["exponent"], law["noise"], law.get("gained")) for law in told] == [
+        (n, 1.5, 0.25, gained) for n, gained in ((10, 0.5), (20, 1.0), (30, 1.5))
+    ]
+    assert all(law["seconds"] >= 0 for law in told) and isinstance(scan.events[-1], LawMeasured)
+    close(scan.clock)
+    with open_scan(tmp_path / "scan.h5") as source:
+        whole = prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda sentence: None)
+    for n, (data, geometry, _) in zip((10, 20, 30), laws.asked, strict=True):
+        np.testing.assert_allclose(data[: n - 1], whole.projections.data[: n - 1], atol=1e-6)
+        assert data[n - 1] == pytest.approx(whole.projections.data[n - 1], abs=0.1)  # provisional
+        np.testing.assert_array_equal(geometry.angles, whole.geometry.angles[:n])
+
+
+def test_a_pass_that_the_next_one_overtakes_is_left_out_and_later_views_have_no_part(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=ENDS)
+    follow().seconds(28)
+    assert laws.sizes == [[10, 20]] and len(laws.asked[0][0]) == laws.asked[0][1].n_views == 20
+
+
+def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_fit, "BATCH_VIEWS", 8)
+    passes(scan=ENDS)
+    scan, asked = follow(), []
+    for n in (28, 0, 0):
+        scan.seconds(n)
+        asked.append(len(laws.asked))
+    assert asked == [0, 0, 1] and laws.sizes == [[10, 20]]
+
+
+def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", FRAMES, pause=1.0)
+    reconstruct_file(options(tmp_path, method=BRIEF), events.append, clock)
+    assert not laws.asked and events[-1].event == "done"
+
+
+def test_laws_come_while_the_volume_grows(laws: Laws, passes: Callable[..., None], tmp_path: Path) -> None:
+    passes(scan=ENDS)
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", FRAMES, period=0.3, pause=2.0)
+    reconstruct_file(options(tmp_path, method=BRIEF), events.append, clock)
+    assert [event.data["n_views"] for event in events if event.event == "error_law"] == [10, 20, 30]
+
+
+@pytest.mark.parametrize("error", [ValueError("the views show no matter"), MemoryError()])
+def test_what_prevents_a_law_is_one_sentence_and_the_fit_goes_on(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], error: Exception
+) -> None:
+    passes(scan=ENDS)
+    laws.error = error
+    scan = follow()
+    for n in (14, 10, 10):
+        scan.seconds(n)
+    (warning,) = scan.of("warning")
+    assert len(laws.asked) == 3 and (str(error) or "memory") in warning["message"]
+    assert scan.follower.n_views_taken == 30 and not scan.of("error_law")
+
+
+def test_a_mistake_is_not_taken_for_a_scan_without_a_law(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=ENDS)
+    laws.error = ZeroDivisionError()
+    with pytest.raises(ZeroDivisionError):
+        follow().seconds(14)
+
+
+def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    """Here rows 6 and 13, which have an alarm, and wide views. The second pass has the angles of the first."""
+    views = FRAMES[4:14]
+    wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0) for frame in views[:3]]
+    order = [*FRAMES[:14], *wide, *views]
+    passes(scan=(14, 27))
+    laws.offset = 0.2
+    scan = follow([replace(frame, index=i) for i, frame in enumerate(order)], flags=alarms(6, 13), wide_views=True)
+    for n in (14, 13):
+        scan.seconds(n)
+    assert laws.sizes == [[8], [8, 18]]
+    angles = np.delete(INTERLACED.angles[:10], (2, 9))
+    np.testing.assert_allclose(laws.asked[1][1].angles, [*angles, *INTERLACED.angles[:10]], atol=1e-6)
+    shares = [(law["noise"], law["offset"]) for law in scan.of("error_law")]
+    assert shares == [(0.25, 0.2), (0.25 / 0.8, 0.0)]  # wide views make known what lies beside the field
+
+
+def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=(14, 15))
+    scan = follow([*FRAMES[:14], replace(FRAMES[5], index=14, replaces=5)])
+    for n in (14, 1):
+        scan.seconds(n)
+    assert laws.sizes == [[10], [9, 10]]
+    angles = INTERLACED.angles
+    np.testing.assert_allclose(laws.asked[1][1].angles, [angles[0], *angles[2:10], angles[1]], atol=1e-6)
+
+
+def test_a_selection_of_views_stands_for_all(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=ENDS)
+    scan = follow(changes={"selection": Selection(views="every:2", axis_col=SCAN.axis_col)})
+    for n in (14, 10):
+        scan.seconds(n)
+    assert laws.sizes == [[5], [5, 10]]
+    assert [law["n_views"] for law in scan.of("error_law")] == [10, 20]
+
+
+def test_a_pass_without_a_view_that_can_be_used_has_no_law(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=ENDS)
+    follow(flags=alarms(*range(4, 14))).seconds(14)
+    assert not laws.asked
+
+
+def test_before_the_axis_is_known_there_is_no_law(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+) -> None:
+    passes(scan=(7, 24))
+    scan = follow(changes={"selection": Selection()})
+    for n in (7, 1):
+        scan.seconds(n)
+    (warning,) = scan.of("warning")
+    assert "rotation axis" in warning["message"] and not laws.asked
+    scan.seconds(16)
+    assert laws.sizes == [[3, 20]]
+
+
+def test_a_resumed_run_has_the_passes_of_all_parts(
+    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], tmp_path: Path
+) -> None:
+    passes(first=(14,), scan=(8, 18))
+    clock = ScanClock()
+    schedule(clock, tmp_path / "first.h5", FRAMES[:20], status="stopped")
+    close(clock)
+    later = [replace(frame, index=i) for i, frame in enumerate([*FRAMES[:4], *FRAMES[20:]])]
+    source = SourceOptions(tmp_path / "scan.h5", earlier=(tmp_path / "first.h5",))
+    scan = follow(later, changes={"source": source})
+    for n in (1, 8, 10):
+        scan.seconds(n)
+        scan.seconds(0)
+    assert laws.sizes == [[10], [10, 20], [10, 20, 30]]
+    np.testing.assert_allclose(laws.asked[-1][1].angles, INTERLACED.angles, atol=1e-6)

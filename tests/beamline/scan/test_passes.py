@@ -1,0 +1,234 @@
+"""A scan in passes: what is chosen after each is taken, nothing else, and the file says it."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import h5py
+import pytest
+from click.testing import CliRunner
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from beamline.cli.main import main
+from beamline.core.errors import ScanStopped
+from beamline.core.stop import StopRequest
+from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import validate
+from beamline.plan.passes import Choice
+from beamline.projections.replay import judged_flags
+from beamline.projections.usable_views import usable_views
+from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, recover_run
+from beamline.scan.run import run_scan
+from beamline.storage.parts import decisions_in, pass_ends_in
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers import layout
+from drivers.base.frame import Frame, FrameKind
+from tests.beamline.chosen import Asked, choosing
+from tests.beamline.fakes import FakeInstrument, Faults, assert_true, decode
+from tests.beamline.ran import Ran, killed
+
+FIRST, VIEWS = 5, 12  # 3 darks and 2 flats before the views
+WIDE = 4  # at two angles on either side
+WORDS = ("scan.wide_views=2", "sample.diameter_mm=0.9", "scan.settle_s=0", "scan.period_s=2")
+MODES = {
+    "fly": (("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 4}"), 0, [3, 3, 3, 3]),
+    "step": (("scan.mode=step",), 5, [5, 5, 2]),
+    "one": (("scan.mode=step",), 0, [12]),
+}
+
+
+def expected(sizes: Sequence[int], answers: Sequence[Choice]) -> list[list[int]]:
+    """Triggers of each set that is chosen, wide views from VIEWS on; without retakes."""
+    firsts = [sum(sizes[:i]) for i in range(len(sizes))]
+    to_come = [list(range(first, first + n)) for first, n in zip(firsts, sizes, strict=True)]
+    done, wide = [to_come.pop(0)], list(range(VIEWS, VIEWS + WIDE))
+    sets = [done[0]]
+    for answer in answers:
+        match answer:
+            case Choice.NEXT if to_come:
+                done.append(to_come.pop(0))
+                sets.append(done[-1])
+            case Choice.AGAIN:
+                to_come.pop()
+                done.append(done[-1])
+                sets.append(done[-1])
+            case Choice.WIDE:
+                sets.append(wide)
+                wide = []
+            case Choice.ENOUGH:
+                return sets
+    return [*sets, wide]  # what nobody chose
+
+
+def frames_of(path: Path) -> list[Frame]:
+    with open_scan(path) as source:
+        return list(source.frames())
+
+
+@pytest.mark.parametrize("mode", MODES)
+@settings(max_examples=12, deadline=None)
+@given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH])))
+def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> None:
+    words, pass_views, sizes = MODES[mode]
+    asked = Asked(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+        ran = Ran(Path(folder), FakeInstrument(), *WORDS, *words)
+        ran.assert_safe()
+        sets = expected(sizes, asked.answers)
+        frames = frames_of(ran.folder / "scan.h5")
+        views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
+        assert [frame.trigger for frame in views] == [trigger for one in sets for trigger in one]
+        assert all((frame.trigger >= VIEWS) is (frame.kind is FrameKind.WIDE_VIEW) for frame in views)
+        assert len(views) <= VIEWS + WIDE and all(frame.replaces < 0 for frame in frames)
+        assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
+        assert [decode(frame.counts)[3] for frame in frames] == list(range(len(frames)))
+        enough = Choice.ENOUGH in asked.answers
+        assert len(frames) == FIRST + len(views) + (0 if enough else 2)  # flats of the end
+        assert (ran.error is None) is not enough
+        status = "stopped" if enough else "complete"
+        if enough:
+            n = sum(len(one) for one in sets if max(one) < VIEWS)
+            assert f"Stopped after {n} of 12 projections: the views suffice." in str(ran.error)
+        else:
+            assert (ran.result.missing, ran.result.n_frames, ran.result.retaken) == ((), len(frames), 0)
+            last = ran.of("frame")[-1].data
+            assert len(views) < VIEWS + WIDE or last["n"] == last["of"] == len(frames)
+        assert sum(event.data["n"] for event in ran.of("block_started")) == len(frames)
+        with h5py.File(ran.folder / "scan.h5") as file:
+            asked_for = sets if len(asked.answers) >= len(sets) else sets[: len(asked.answers) + 1]
+            rows = [FIRST + sum(map(len, sets[: i + 1])) for i in range(len(asked_for))]
+            assert pass_ends_in(file).tolist() == rows[: len(pass_ends_in(file))]
+            decisions = decisions_in(file)
+            assert [values["choice"] for values in decisions] == asked.answers
+            assert len(pass_ends_in(file)) in (len(decisions), len(decisions) + 1)
+            assert file[layout.STATUS][()].decode() == status
+        so_far = [passes.n_views for passes in asked.asked]
+        assert so_far == [values["n_views"] for values in decisions]
+
+
+def test_without_a_chooser_nothing_is_in_the_file(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument())
+    with h5py.File(ran.result.path) as file:
+        assert layout.PASS_ENDS not in file and layout.DECISIONS not in file
+        assert (pass_ends_in(file).size, decisions_in(file)) == (0, ())
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_views_are_taken_again_between_passes_within_the_budget(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A view is lost and one flagged in the first pass, and a third is flagged later, which is taken after the last."""
+    words, pass_views, sizes = MODES[mode]
+    n = sizes[0]
+    lost, flagged = FIRST + 1, {FIRST + 2, FIRST + n + 3 + 1}
+    asked = Asked([Choice.RETAKE, Choice.RETAKE, Choice.NEXT])
+    retake = ("monitor.retake=true", "monitor.retake_share=0.25")
+    with choosing(monkeypatch, asked, pass_views):
+        ran = Ran(tmp_path, FakeInstrument(Faults(lost={lost}, repeats=flagged)), *WORDS, *retake, *words)
+    assert asked.answers[:2] == [Choice.RETAKE, Choice.NEXT]  # each view is taken again once
+    assert [passes.retakes for passes in asked.asked][:2] == [2, 0]
+    frames = frames_of(ran.result.path)
+    again = [frame for frame in frames if frame.trigger >= VIEWS and frame.kind is FrameKind.PROJECTION]
+    assert (ran.result.missing, ran.result.retaken, len(again)) == ((), 3, 2)
+    assert [frame.index for frame in frames if frame.trigger == 1 and frame.kind is FrameKind.PROJECTION] == [
+        FIRST + n - 1
+    ]
+    assert again[0].index == FIRST + n and again[0].replaces == FIRST + 1
+    assert len({frame.trigger for frame in again}) == 2
+
+
+def test_a_view_without_a_frame_has_one_when_its_pass_is_taken_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words, _, sizes = MODES["fly"]
+    faults = Faults(lost={FIRST + 1, FIRST + sizes[0] + 2})  # another one when it is taken again
+    with choosing(monkeypatch, Asked([Choice.AGAIN])):
+        ran = Ran(tmp_path, FakeInstrument(faults), *WORDS, *words)
+    assert (ran.result.missing, ran.result.retaken) == ((), 1)
+    triggers = [frame.trigger for frame in frames_of(ran.result.path) if frame.kind is FrameKind.PROJECTION]
+    assert triggers == [0, 2, 0, 1, *range(3, 9)]
+
+
+def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    instrument, stop = FakeInstrument(), StopRequest()
+    answers = iter([Choice.NEXT, Choice.WIDE, Choice.NEXT])
+
+    def close_and_choose(passes: object) -> Choice:
+        instrument.devices.shutter.close()
+        if (answer := next(answers, None)) is None:
+            stop.stop()
+        return answer or Choice.NEXT
+
+    with choosing(monkeypatch, close_and_choose):
+        ran = Ran(tmp_path, instrument, *WORDS, *MODES["fly"][0], stop=stop)
+    assert "Stopped after 9 of 12 projections: the operator asked" in str(ran.error)
+    assert_true(frame for frame in frames_of(ran.folder / "scan.h5") if frame.kind is not FrameKind.WIDE_VIEW)
+    ran.assert_safe()
+
+
+CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+@settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.generate])
+@given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
+def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
+    words, pass_views, sizes = MODES[mode]
+    asked = Asked(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+        for part, cut in enumerate([*cuts, None]):
+            stop, instrument = StopRequest(), FakeInstrument()
+            instrument.clock.sleep(1e4 * part)
+            instrument.at = {} if cut is None else {cut: stop.abort}
+            with killed(patch) if cut is not None else nullcontext():
+                if not part:
+                    ran = Ran(Path(folder), instrument, *WORDS, *words, stop=stop)
+                    continue
+                with suppress(ScanStopped, NothingMissing, NotJoined), open_for_resume(ran.folder) as series:
+                    run_scan(series.config, series, stop=stop, instrument=instrument.connected())
+        recover_run(ran.folder)
+        with suppress(NothingMissing), open_for_resume(ran.folder) as series:
+            assert Choice.ENOUGH in asked.answers and series.end_references  # which no stop waits for
+        sets = expected(sizes, asked.answers)
+        path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
+        frames = frames_of(path)
+        rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
+        assert [frame.trigger for frame in rows] == [trigger for one in sets for trigger in one]
+        assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
+        with h5py.File(path) as file:
+            ends, decisions = pass_ends_in(file), decisions_in(file)
+        assert [values["choice"] for values in decisions] == asked.answers
+        so_far = [sum(frame.index < end for frame in rows) for end in ends]
+        assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]
+        assert len(ends) in (len(decisions), len(decisions) + 1)
+        assert [one for one in validate(path, lambda done, of: None) if one.severity == "error"] == []
+
+
+def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By validate, by a copy, by the monitor over the file, and by a reconstruction."""
+    words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 32, passes: 4}", "scan.period_s=0.4")
+    wide = ("scan.wide_views=2", "sample.diameter_mm=0.9")
+    asked = Asked([Choice.AGAIN, Choice.WIDE])
+    with choosing(monkeypatch, asked):
+        ran = Ran(tmp_path / "runs", FakeInstrument(), *words, *wide)
+    path = ran.result.path
+    assert asked.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
+    assert ran.result.flags == {}
+    ingest(path, tmp_path / "copy.h5")
+    for file in (path, tmp_path / "copy.h5"):
+        assert [one.message for one in validate(file) if one.severity != "info"] == []
+        with open_scan(file) as source:
+            assert source.pass_ends.tolist() == [13, 21, 25, 33, 41]
+            assert [values["choice"] for values in source.decisions] == asked.answers
+            assert usable_views(source, use_flags=True).frames.size == 32
+            assert judged_flags(source).flagged.sum() == 0
+    out = tmp_path / "volume.h5"
+    said = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])
+    assert said.exit_code == 0, said.output
+    assert [line for line in said.output.splitlines() if "arning" in line or "again" in line] == []
