@@ -96,7 +96,7 @@ class Instrument:
             ReferencesError: darks or flats cannot be used.
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended it; ScanAborted: at once.
             In all these cases the acquired frames are in the file: see `last`. A scan that ends because its views were
-            enough (`recon.stop_when`) does not raise.
+            enough (`scan.decide`) does not raise.
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):

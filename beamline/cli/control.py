@@ -21,6 +21,8 @@ from drivers.base.errors import DeviceError
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
+CHOICES = ("next", "again", "wide", "retake", "enough")
+"""What can be measured next, as of `beamline.plan.passes.Choice`, which help does not need."""
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
@@ -30,16 +32,38 @@ def _command(verb: str, help_text: str) -> click.Command:
     @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
     @click.argument("run", required=False, type=click.Path(path_type=Path))
     def send(run: Path | None) -> None:
-        from beamline.config.models import StorageSection  # here: help does not need it
-        from beamline.scan.control import Verb, tell
-
-        runs = Path(StorageSection.model_fields["folder"].default)
-        if run is not None and not run.is_dir():
-            raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
-        run = run or _only(runs)
-        click.echo(f"{run}: {tell(run, Verb(verb))}")
+        _send(run, verb)
 
     return send
+
+
+def _send(run: Path | None, word: str) -> None:
+    """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
+    from beamline.config.models import StorageSection  # here: help does not need it
+    from beamline.plan.passes import Choice
+    from beamline.scan.control import Verb, tell
+
+    runs = Path(StorageSection.model_fields["folder"].default)
+    if run is not None and not run.is_dir():
+        raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
+    run = run or _only(runs)
+    click.echo(f"{run}: {tell(run, Choice(word) if word in CHOICES else Verb(word))}")
+
+
+@click.command()
+@click.argument("words", nargs=-1, required=True, metavar=f"[RUN] {'|'.join(CHOICES)}")
+def decide(words: tuple[str, ...]) -> None:
+    """Say what is measured next by the scan in the folder RUN (the running one of ./runs), while it asks.
+
+    With `scan.decide: ask` a scan asks after each pass of views: the next pass of the plan, the angles of the last one
+    again, the wide views, views that were flagged, or no further view.
+
+    Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not ask, 5 disk error.
+    """
+    *run, choice = words
+    if len(run) > 1 or choice not in CHOICES:
+        raise click.UsageError(f"{' '.join(words)!r}: expected a folder of a run or none, then {' | '.join(CHOICES)}.")
+    _send(Path(run[0]) if run else None, choice)
 
 
 pause = _command(

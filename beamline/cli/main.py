@@ -62,6 +62,7 @@ CORE = {
     "resume": CommandEntry("beamline.cli.control", "Let a paused scan go on."),
     "stop": CommandEntry("beamline.cli.control", "Stop a running scan cleanly, from another terminal."),
     "abort": CommandEntry("beamline.cli.control", "Abort a running scan at once, from another terminal."),
+    "decide": CommandEntry("beamline.cli.control", "Say what a scan that asks measures next, from another terminal."),
     "recon": CommandEntry("beamline.cli.recon", "Reconstruct a scan, finished or still running."),
     "recover": CommandEntry("beamline.cli.control", "Make an ordinary scan file of one whose writer died."),
     "monitor": CommandEntry(

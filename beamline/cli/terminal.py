@@ -35,7 +35,7 @@ from beamline.core.events import (
     VolumeDone,
 )
 from beamline.core.process import ChildProcess
-from beamline.core.sinks import Narration, Warnings, sentence
+from beamline.core.sinks import Narration, Warnings, lines
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import SENTENCE, one_line, printable
 from beamline.report.metrics import METRICS, formatted
@@ -129,10 +129,10 @@ class Terminal:
             case Failed() | VolumeDone() | RunDone() | Done():
                 pass  # the command prints these itself
             case _:
-                text = sentence(event)
+                text = "\n".join(lines(event))
                 if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                     self._last_text = text
-                    self._console.print(one_line(text, SENTENCE))
+                    self._console.print(text)
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:

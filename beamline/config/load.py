@@ -37,7 +37,7 @@ from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
-NO_LIVE = ("recon.live=false", "recon.stop_when=null")
+NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
 
@@ -185,6 +185,7 @@ def plan_of(config: Config) -> ScanPlan:
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,
+        pass_views=scan.pass_views,
         retake_share=config.monitor.retake_share if config.monitor.retake else 0.0,
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, model_validator
 
 from beamline.config.beam import Kev, NoMonochromator
 from beamline.config.devices import DeviceSection
@@ -106,6 +106,18 @@ class Fields(Section):
     exposure_s: Seconds | None = None
 
 
+class WishSection(Section):
+    """What a scan that decides is to reach; several wishes hold together, null is none."""
+
+    quality_db: Annotated[float, Field(gt=0, le=100)] | None = Field(
+        default=None, description="dB of PSNR that the volume may stay below that of the whole plan."
+    )
+    seconds: Seconds | None = Field(default=None, description="Of the scan from its first frame, at most.")
+    dose: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=None, description="Share of the plan's exposures with light on the sample, at most."
+    )
+
+
 class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: AnglesSection
@@ -148,8 +160,26 @@ class ScanSection(Section):
         default="warn",
         description="The behaviour of a scan without a watchdog, or with one that ended and could not be replaced.",
     )
+    decide: Literal["off", "ask", "do"] = Field(
+        default="off",
+        description="What follows each pass of views: the plan (off), what the operator answers (ask), or the best "
+        "gain a second until the wish is met (do).",
+    )
+    wish: WishSection = WishSection(quality_db=1.0)
+    wait_s: Annotated[float, Field(ge=0, le=3600)] = Field(
+        default=30.0, description="Longest wait for a prediction after a pass, and again for the operator's answer."
+    )
+    pass_views: Annotated[int, Field(ge=0, le=1_000_000)] = Field(
+        default=0, description="Views of a pass of a step scan; a fly scan has the passes of interlaced angles."
+    )
     darks: Fields = Fields()
     flats: Fields = Fields()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _off_is_a_word(cls, data: Any) -> Any:
+        """YAML reads a bare `off` as false."""
+        return {**data, "decide": "off"} if isinstance(data, dict) and data.get("decide") is False else data
 
 
 class OpticsSection(Section):
@@ -176,23 +206,6 @@ class StorageSection(Section):
     )
 
 
-class StopWhen(Section):
-    """Limits at which the views suffice, as predicted from the live volume; if both are given, both must be met."""
-
-    psnr_gain_per_10_views: PositiveFloat | None = Field(
-        default=None, description="dB that ten more views may still add; null: any."
-    )
-    psnr_loss: PositiveFloat | None = Field(
-        default=None, description="dB that the volume may stay below that of the whole scan; null: any."
-    )
-
-    @model_validator(mode="after")
-    def _some_limit(self) -> Self:
-        if self.psnr_gain_per_10_views is self.psnr_loss is None:
-            raise ValueError("stop_when needs psnr_gain_per_10_views or psnr_loss, in dB; null never stops early")
-        return self
-
-
 class ReconSection(Section):
     live: bool = Field(
         default=True,
@@ -209,21 +222,16 @@ class ReconSection(Section):
     )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
-    stop_when: StopWhen | None = Field(
-        default=None, description="End the scan when its views are enough; needs live: true. null: take all views."
-    )
 
-    @model_validator(mode="after")
-    def _somebody_looks(self) -> Self:
-        if self.stop_when is not None and not self.live:
+    @model_validator(mode="before")
+    @classmethod
+    def _wishes_are_of_the_scan(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "stop_when" in data:
             raise ValueError(
-                "stop_when needs live: true, because the live reconstruction decides when the views suffice"
+                "stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db: 0.5} ends a "
+                "scan when the views to come would add so few dB"
             )
-        if self.stop_when is not None and not streams(self.method):
-            raise ValueError(
-                f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
-            )
-        return self
+        return data
 
 
 class Speed(Section):
@@ -301,11 +309,25 @@ class Config(Section):
         one, several = self.scan.energy, self.scan.energies
         if one is not None and several is not None:
             raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
-        if several and self.recon.stop_when is not None:
-            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
         texts = [f"{energy:.7g}" for energy in several or ()]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
+        return self
+
+    @model_validator(mode="after")
+    def _decisions_have_a_volume_and_passes(self) -> Self:
+        scan, recon, angles = self.scan, self.recon, self.scan.angles
+        interlaced = isinstance(angles, InterlacedAngles) and angles.passes > 1
+        needs = {
+            "one scan at a time; set scan.energies to null": scan.energies is None,
+            "a live volume; set recon.live to true": recon.live,
+            "a volume that grows with the views; set recon.method to r2": streams(recon.method),
+            "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views of a step scan, such "
+            "as 60": scan.pass_views if scan.mode is Mode.STEP else interlaced,
+        }
+        if scan.decide != "off" and not all(needs.values()):
+            lacking = next(what for what, there in needs.items() if not there)
+            raise ValueError(f"scan.decide {scan.decide} needs {lacking}; off takes the plan as it is")
         return self
 
     @model_validator(mode="after")

@@ -261,8 +261,8 @@ class PassEnded(Event, event="pass_ended"):
 
     Attributes:
         number: of the pass, from 1; n_views: so far.
-        options: what can be measured next, `beamline.plan.choose.Option` by their values: choice, frames, seconds, dose
-            (share of the plan's), bytes, and gain, low, high in dB (None: not known yet).
+        options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
+            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known yet).
         recommended: the choice that the program takes or would take.
         wait: real s for which the operator is asked; 0: nobody is.
         remark: a sentence, where no prediction is there.
@@ -284,7 +284,9 @@ class NextChosen(Event, event="next_chosen"):
         choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
         reason: a sentence.
         options: as of `PassEnded`.
-        predicted, gained: dB by the last choice, as predicted then and as measured now; None: not known.
+        predicted, gained: dB by an earlier choice, the newest that a law has judged since the last event, as predicted
+            then and as measured now; None: not known.
+        judged: number of the pass after which that choice was made.
     """
 
     number: int
@@ -295,16 +297,7 @@ class NextChosen(Event, event="next_chosen"):
     options: Sequence[Mapping[str, Any]]
     predicted: float | None = None
     gained: float | None = None
-
-
-class EnoughReached(Event, event="enough"):
-    """The views so far suffice: further views would add `mean` dB, between `low` and `high`."""
-
-    n_views: int
-    planned: int
-    mean: float
-    low: float
-    high: float
+    judged: int | None = None
 
 
 class Counted(Event, event="progress"):

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from queue import SimpleQueue
-from typing import Self, TextIO
+from typing import Any, Self, TextIO
 
 from beamline.core.events import (
     BlockDone,
     BlockStarted,
     Done,
-    EnoughReached,
     Event,
     Failed,
     FrameFlagged,
     FrameStored,
+    NextChosen,
+    PassEnded,
     ReconDone,
     ReconStarted,
     RunDone,
@@ -33,7 +34,7 @@ from beamline.core.events import (
     Warned,
 )
 from beamline.core.flag import Level
-from beamline.core.text import SENTENCE, one_line, size, spans
+from beamline.core.text import SENTENCE, count, one_line, size, spans
 from drivers.base.clock import Clock
 
 
@@ -64,9 +65,10 @@ def sentence(event: Event) -> str | None:
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):
             return f"Volume from {n_views} views so far: {path}"
-        case EnoughReached(n, planned, mean, low, high):
-            spread = f"{mean:.2f} dB ({low:.2f} to {high:.2f})"
-            return f"Enough views: {n} of {planned}; the others would add {spread}"
+        case PassEnded():
+            return "\n".join(_options(event))
+        case NextChosen():
+            return _decision(event)
         case ScanDone(scan):
             alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
             again = f", {scan.retaken} views taken again" if scan.retaken else ""
@@ -79,6 +81,14 @@ def sentence(event: Event) -> str | None:
         case RunDone(folder):
             return f"Done: {folder}"
     return None
+
+
+def lines(event: Event) -> list[str]:
+    """The event as lines for people, a table where a pass has ended; [] where it has no sentence."""
+    text = sentence(event)
+    if text is None:
+        return []
+    return text.split("\n") if isinstance(event, PassEnded) else [one_line(text, SENTENCE)]
 
 
 _OVER = 32  # frames after the last one of a finding that takes several: more come every 8 views at most
@@ -116,17 +126,17 @@ class Narration:
 
 
 class UserLog:
-    """A sink that writes each event's sentence with its UTC time."""
+    """A sink that writes each event's lines with its UTC time."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._narrated = stream, Narration()
 
     def __call__(self, event: Event) -> None:
         for each in self._narrated(event):
-            if text := sentence(each):
+            for line in lines(each):
                 stamp = datetime.fromtimestamp(each.time, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-                self._stream.write(f"{stamp}  {one_line(text, SENTENCE)}\n")
-                self._stream.flush()
+                self._stream.write(f"{stamp}  {line}\n")
+            self._stream.flush()
 
 
 def _trial(trial: TrialDone) -> str:
@@ -136,6 +146,45 @@ def _trial(trial: TrialDone) -> str:
     quality = f", {trial.quality_db:.2f} dB" if math.isfinite(trial.quality_db) else ""
     memory = "" if trial.peak_bytes is None else f", {size(trial.peak_bytes)}"
     return begin + f"{trial.seconds:.2f} s{quality}{memory}"
+
+
+def _options(ended: PassEnded) -> Iterator[str]:
+    """Lines of at most 80 characters: what can be measured next, side by side, and how the operator answers."""
+    yield f"Pass {ended.number} is over, {count(ended.n_views, 'view')} so far. What can be measured next:"
+    yield f"  {'choice':<7}{'gain, dB':<22}{'dB/min':>8}{'s':>9}{'dose':>9}{'data':>10}"
+    for each in ended.options:
+        mark, choice = "> " if each["choice"] == ended.recommended else "  ", one_line(str(each["choice"]))
+        cost = f"{each['seconds']:>9.0f}{100 * each['dose']:>7.1f} %{size(each['bytes']):>10}"
+        yield f"{mark}{choice:<7}{_gain(each):<22}{_gain_per_minute(each):>8}{cost}"
+    if ended.remark:
+        yield one_line(ended.remark, SENTENCE)
+    if ended.wait:
+        answer = f"beamline decide CHOICE, Enter for {one_line(ended.recommended)}"
+        yield f"Within {ended.wait:.0f} s: {answer}; else the plan goes on."
+
+
+def _gain(option: Mapping[str, Any]) -> str:
+    gain, low, high = option["gain"], option["low"], option["high"]
+    if gain is None:
+        return "not known"
+    return f"{gain:+.2f}" if low is None or high is None or low == high else f"{gain:+.2f} ({low:.2f} to {high:.2f})"
+
+
+def _gain_per_minute(option: Mapping[str, Any]) -> str:
+    gain, seconds = option["gain"], option["seconds"]
+    return "-" if gain is None or not seconds else f"{60 * gain / seconds:+.2f}"
+
+
+_DECIDED = {"program": "chosen by the program", "operator": "chosen by the operator", "plan": "as planned"}
+
+
+def _decision(chosen: NextChosen) -> str:
+    said = f"After pass {chosen.number}: {chosen.choice}, {_DECIDED.get(chosen.by, chosen.by)}: {chosen.reason}"
+    if chosen.gained is None:
+        return said
+    predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
+    which = "before" if chosen.judged is None else f"after pass {chosen.judged}"
+    return f"{said.rstrip('.')}. The choice {which}: {predicted}measured {chosen.gained:+.2f} dB"
 
 
 def _missing(block: BlockDone) -> str | None:

@@ -217,8 +217,8 @@ class StopRequest:
         self.stopping = True
 
     def stop_as_enough(self, reason: str) -> None:
-        """Stop as by `stop`, but without hurry, because the views suffice."""
-        self._enough = not self.stopping
+        """Stop as by `stop`, but without hurry, because the views suffice (`beamline.plan.passes.Choice.ENOUGH`)."""
+        self._enough = self._enough or not self.stopping
         self.stop(reason, by_itself=True)
 
     def abort(self, reason: str = "the operator aborted it") -> None:

@@ -131,7 +131,7 @@ class TimingCheck(Logged):
     start = TimingState
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
-        again = frame.replaces >= 0 or frame.trigger < state.trigger  # a repeated view has its old trigger
+        again = frame.replaces >= 0 or frame.trigger <= state.trigger  # a repeated view has its old trigger
         if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
             return Look(state)
         after = TimingState(frame.trigger, frame.framestamp, frame.time)

@@ -18,7 +18,7 @@ from beamline.core.events import event_in
 from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched
-from beamline.scan.control import State
+from beamline.scan.control import State, Verb
 from beamline.scan.runs import newest
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.run_record import DIED
@@ -65,6 +65,32 @@ class RunValues:
     angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
     flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
     flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each of FlagNames", ())
+    pass_number: int = published("PassNumber", "of the pass of views that ended last, from 1", 0)
+    options: tuple[str, ...] = published("Options", "what can be measured after it: next, again, wide ...", ())
+    option_gains: tuple[float, ...] = published("OptionGains", "by each of Options, as predicted", (), "dB")
+    option_lows: tuple[float, ...] = published("OptionGainsLow", "low ends of OptionGains", (), "dB")
+    option_highs: tuple[float, ...] = published("OptionGainsHigh", "high ends of OptionGains", (), "dB")
+    option_times: tuple[float, ...] = published("OptionTimes", "that each of Options takes", (), "s")
+    option_doses: tuple[float, ...] = published("OptionDoses", "of each of Options, of the plan's dose", (), "%")
+    option_sizes: tuple[float, ...] = published("OptionSizes", "of the data of each of Options", (), "GB")
+    recommended: str = published("Recommended", "the one of Options that the program takes or would take", "")
+    wait: float = published("AnswerWithin", "for which the operator is asked what is next; 0: nobody is", 0.0, "s")
+    decision: str = published("Decision", "what was chosen last, by whom, and why", "")
+    predicted_gain: float = published("PredictedGain", "by an earlier choice, as predicted then", math.nan, "dB")
+    measured_gain: float = published("MeasuredGain", "by an earlier choice, as measured", math.nan, "dB")
+
+
+def answer_of(values: RunValues, word: str) -> Verb:
+    """The verb by which a word of an operator answers the scan.
+
+    Raises:
+        ConfigError: the scan asks nothing now, or the word is none of its options.
+    """
+    if not values.wait:
+        raise ConfigError(f"the scan asks nothing now, so that {one_line(word)!r} is no answer. Nothing was changed.")
+    if word not in values.options:
+        raise ConfigError(f"{one_line(word)!r} is none of {', '.join(values.options)}. Nothing was changed.")
+    return Verb(word)
 
 
 class Severity(IntEnum):
@@ -138,7 +164,7 @@ class StampedValues:
         ended = status == DIED or (not before.run and status != "running")  # the log does not say how it ended
         if ended and status != before.state:
             why = one_line(seen["next"], LONGEST)
-            taken |= {"state": status, "message": why}
+            taken |= {"state": status, "message": why, "wait": 0.0}
             stamps["state"] = stamps["message"] = Stamp(now, _OF_STATE.get(status, Severity.NO_ALARM), why)
         return replace(self, values=replace(before, **taken), stamps=stamps, unread="")
 
@@ -269,6 +295,26 @@ def _flag(before: RunValues, event: Event) -> dict[str, Any]:
     return {**names, **counted.get(event["level"], {})}
 
 
+def _pass(before: RunValues, event: Event) -> dict[str, Any]:
+    def of_each(name: str, factor: float = 1.0) -> tuple[float, ...]:
+        return tuple(factor * _number(option[name]) for option in event["options"])
+
+    return {
+        "pass_number": int(event["number"]), "wait": _number(event.get("wait", 0.0)),
+        "options": tuple(one_line(str(option["choice"])) for option in event["options"]),
+        "option_gains": of_each("gain"), "option_lows": of_each("low"), "option_highs": of_each("high"),
+        "option_times": of_each("seconds"), "option_doses": of_each("dose", 100.0),
+        "option_sizes": of_each("bytes", 1e-9), "recommended": str(event["recommended"]),
+    }  # fmt: skip
+
+
+def _chosen(before: RunValues, event: Event) -> dict[str, Any]:
+    return {
+        "wait": 0.0, "decision": f"{event['choice']}, by the {event['by']}: {event['reason']}",
+        "predicted_gain": _number(event.get("predicted")), "measured_gain": _number(event.get("gained")),
+    }  # fmt: skip
+
+
 _BY_KIND: dict[str, Callable[[RunValues, Event], dict[str, Any]]] = {
     "run_started": _run,
     "state": _state,
@@ -278,5 +324,7 @@ _BY_KIND: dict[str, Callable[[RunValues, Event], dict[str, Any]]] = {
     "warning": lambda before, event: {"message": str(event["message"])},
     "failed": lambda before, event: {} if "source" in event else {"message": str(event["message"])},
     "snapshot": lambda before, event: {"views": int(event["n_views"]), "residual": _number(event.get("unlearnt"))},
-    "scan_done": lambda before, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan},
+    "pass_ended": _pass,
+    "next_chosen": _chosen,
+    "scan_done": lambda before, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan, "wait": 0.0},
 }

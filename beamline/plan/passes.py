@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -65,12 +65,13 @@ def triggers_of(*blocks: Block) -> frozenset[int]:
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def begun(views: Block, plan: ScanPlan) -> Passes:
-    """A scan at the end of the pass that it begins with, without its wide views; one that goes on is in that pass.
+def begun(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
+    """A scan at the end of the pass that it begins with; one that goes on is in that pass.
 
     Passes are those of the whole plan, whatever is stored.
     """
-    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view))
+    blocks = pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view)
+    passes = Passes((), blocks, (*wide,))
     for choice in (Choice.NEXT, *plan.choices):
         passes = passes.after(Choice(choice))
     return passes

@@ -31,7 +31,7 @@ _TIMED_VOXELS = 2**17  # of the part that is timed, which counts in the budget
 
 
 @dataclass(frozen=True)
-class Choice:
+class TimedChoice:
     """A method with the settings that some time suffices for.
 
     Attributes:
@@ -46,7 +46,7 @@ class Choice:
     seconds: float
 
 
-def choices(paces: Mapping[str, Pace], seconds: float, largest: int) -> list[Choice]:
+def choices(paces: Mapping[str, Pace], seconds: float, largest: int) -> list[TimedChoice]:
     """The methods that so many seconds suffice for, with as many useful steps as they do; the preferred one first.
 
     Pixels are binned only where the time suffices for no method on all of them: FBP of all is better than any method of
@@ -60,13 +60,13 @@ def choices(paces: Mapping[str, Pace], seconds: float, largest: int) -> list[Cho
     return [min((_longest(name, paces[name], n, 0.0) for name in paces for n in binnings), key=lambda c: c.seconds)]
 
 
-def _longest(name: str, pace: Pace, binning: int, seconds: float) -> Choice:
+def _longest(name: str, pace: Pace, binning: int, seconds: float) -> TimedChoice:
     """The choice of as many steps as the time suffices for, of the least useful number if it does not."""
     useful = USEFUL[name]
     fixed, each = pace.fixed / binning**3, pace.each / binning ** (2 if name == R2.name else 3)
     most = int((seconds - fixed) / each) if each > 0 else useful.most
     steps = max(useful.least, min(most, useful.most))
-    return Choice(name, steps, binning, fixed + steps * each)
+    return TimedChoice(name, steps, binning, fixed + steps * each)
 
 
 def paces_of(methods: Iterable[Method], geometry: Geometry, grid: Grid, now: Clock) -> dict[str, Pace]:
@@ -101,12 +101,12 @@ class _Budget:
     def seconds_left(self) -> float:
         return self.end - self.now()
 
-    def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
+    def choices(self, share: float = 1.0, name: str | None = None) -> list[TimedChoice]:
         """`choices` of all methods (or of one) within this share of the time left."""
         paces = self.paces if name is None else {name: self.paces[name]}
         return choices(paces, share * self.seconds_left, self.largest)
 
-    def method(self, choice: Choice, default_count: int) -> Method:
+    def method(self, choice: TimedChoice, default_count: int) -> Method:
         """The method with the settings of the choice, for a volume of so many Gaussians by default."""
         counted, method = USEFUL[choice.method].setting, self.methods[choice.method]
         settings = {counted: choice.steps} if counted else {}
@@ -180,8 +180,8 @@ def within(
 
 
 def _chosen(
-    plan: _Budget, able: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
-) -> tuple[Choice, str]:
+    plan: _Budget, able: Sequence[TimedChoice], prepared: PreparedProjections, seed: int, control: RunControl
+) -> tuple[TimedChoice, str]:
     """The method that predicts views of some rows best, with the settings that the rest of the time suffices for."""
     untried = f"{able[0].method} was best on other scans; nothing was tried: "
     problem = _problem_of(prepared, seed)
@@ -225,7 +225,7 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     return run_on(method, prepared, Grid.matching(geometry), seed, replace(control.by(end), stop_trials=trials))
 
 
-def _named(choice: Choice, result: Reconstruction | None = None) -> str:
+def _named(choice: TimedChoice, result: Reconstruction | None = None) -> str:
     text = choice.method
     if result is not None and result.history:
         text += f", {result.history[-1].step} {USEFUL[choice.method].setting}"

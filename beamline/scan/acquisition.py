@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,7 +62,7 @@ class Acquisition:
         self._devices, self._timeline, self._stop, self._sink, self._clock = devices, timeline, stop, sink, clock
         self._supervision, self._refused = supervision or Supervision(), ""
         self._exposures = Exposures(
-            devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
+            devices, camera_settings, settle, clock, stop, sink, self._supervision, self.wait_while_paused
         )
         self._done: list[RecordedBlock] = []
         self._retaken = 0  # views, or tried
@@ -140,7 +140,7 @@ class Acquisition:
             if self._stop.stopping and not self._still_needed(block):
                 continue
             if block.kind is FrameKind.WIDE_VIEW:
-                if block in self._wide_to_come:
+                if all(done.block is not block for done in self._done):
                     yield from self._wide(block)
                 continue
             if block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
@@ -155,48 +155,38 @@ class Acquisition:
 
         A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
         """
-        passes = begun(views, self._timeline.plan)
-        choice = Choice((Choice.NEXT, *self._timeline.plan.choices)[-1])
-        due = [replace(views, stored=frozenset(range(views.n)) - triggers_of(*passes.done) | views.stored)]
+        plan, wide = self._timeline.plan, [b for b in self._timeline.blocks if b.kind is FrameKind.WIDE_VIEW and b.left]
+        passes, choice = begun(views, plan, wide), Choice((Choice.NEXT, *plan.choices)[-1])
+        rest = replace(views, stored=frozenset(range(views.n)) - triggers_of(*passes.done) | views.stored)
+        due = [*([rest] if rest.left else []), *(wide if choice is Choice.WIDE else [])]
         while True:
-            again = passes.done[-1] in passes.done[:-1]
-            for block in due:
-                yield from self._of_pass(RecordedBlock(block, BlockTally(), again))
+            yield from self._of_pass(due, passes.done[-1] in passes.done[:-1])
             if choice is Choice.RETAKE:
                 yield from self._again(views)
-            elif choice is Choice.WIDE:
-                for block in self._wide_to_come:
-                    yield from self._wide(block)
             if self._stop.stopping:
                 return
             self._supervision.pass_ended()
-            may_retake = self._supervision.may_retake(self._missing_views)
-            now = replace(passes, wide=self._wide_to_come, retakes=may_retake)
-            if not (now.to_come or now.wide or now.retakes):
+            passes = replace(passes, retakes=self._supervision.may_retake(self._missing_views))
+            if not (passes.to_come or passes.wide or passes.retakes):
                 return
-            choice = next_pass(now)
+            choice = next_pass(passes)
             self._stop.refuse_abort()
             if choice is Choice.ENOUGH and not self._stop.stopping:
                 self._stop.stop_as_enough("the views suffice")
-            if self._stop.stopping or (choice is Choice.NEXT and not now.to_come):
+            if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
                 return
-            passes = now.after(choice)
-            due = list(passes.done[len(now.done) :])
+            before, passes = passes, passes.after(choice)
+            due = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
 
-    def _of_pass(self, done: RecordedBlock) -> Iterator[Frame]:
-        """Views of a pass. One that gave no frame in an earlier pass is then not missing."""
-        if done.block.left:
-            for frame in self._block(done):
-                if frame.kind is FrameKind.PROJECTION:
-                    self._recover(frame.trigger)
-                yield frame
-
-    @property
-    def _wide_to_come(self) -> tuple[Block, ...]:
-        """Blocks of wide views that were not taken."""
-        taken = [done.block for done in self._done]
-        wide = (block for block in self._timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        return tuple(block for block in wide if block.left and block not in taken)
+    def _of_pass(self, blocks: Sequence[Block], again: bool) -> Iterator[Frame]:
+        """Views, once more or not, and wide views. A view that an earlier pass lacks is then not missing."""
+        for block in blocks:
+            if block.kind is FrameKind.WIDE_VIEW:
+                yield from self._wide(block)
+                continue
+            done = RecordedBlock(block, BlockTally(), again)
+            yield from self._block(done)
+            self._recover(done.taken.rows)
 
     def _block(self, done: RecordedBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
@@ -233,7 +223,7 @@ class Acquisition:
                 continue
             if row < 0:
                 trigger = retakes[i].trigger
-                self._recover(trigger)
+                self._recover([trigger])
             rows_astray = [astray_row for astray_row, _ in done.taken.astray.get(i, [])]
             earlier = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, earlier))
@@ -243,18 +233,20 @@ class Acquisition:
     @property
     def _missing_views(self) -> tuple[int, ...]:
         """Triggers of the views that gave no frame, in ascending order."""
-        return tuple(sorted(trigger for taken in self._of_views() for trigger in taken.missing))
+        return tuple(sorted(i for done in self._done_views if not done.again for i in done.taken.missing))
 
-    def _of_views(self) -> Iterator[BlockTally]:
-        """Tallies of views that were not repeated."""
-        kind = FrameKind.PROJECTION
-        return (done.taken for done in self._done if done.block.kind is kind and not done.again)
+    @property
+    def _done_views(self) -> list[RecordedBlock]:
+        """What was taken of the views; views that were taken again for single ones have other triggers."""
+        blocks = [block.first_trigger for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
+        views = (done for done in self._done if done.block.kind is FrameKind.PROJECTION)
+        return [done for done in views if done.block.first_trigger in blocks]
 
-    def _recover(self, trigger: int) -> None:
-        """A view has a frame: it is not missing, if it was."""
-        for taken in self._of_views():
-            if trigger in taken.missing:
-                taken.missing.remove(trigger)
+    def _recover(self, triggers: Collection[int]) -> None:
+        """These views have a frame: they are not missing, if they were."""
+        for done in self._done_views:
+            for trigger in set(done.taken.missing) & {*triggers} if not done.again else ():
+                done.taken.missing.remove(trigger)
                 self.recovered += 1
 
     def _wide(self, block: Block) -> Iterator[Frame]:
@@ -319,7 +311,7 @@ class Acquisition:
         while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
             self._clock.sleep(min(SLICE, left))
 
-    def _wait_while_paused(self) -> None:
+    def wait_while_paused(self) -> None:
         """Wait with a closed shutter while a pause is requested; a stop ends it.
 
         A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.
@@ -379,9 +371,8 @@ class Acquisition:
 
     def _raise_outcome(self) -> None:
         blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
-        firsts, planned = [block.first_trigger for block in blocks], sum(block.n for block in blocks)
-        of_views = [done for done in self._done if done.block.first_trigger in firsts]  # without retakes
-        views = sum(len(done.taken.rows) for done in of_views) + sum(len(block.stored) for block in blocks)
+        planned = sum(block.n for block in blocks)
+        views = sum(len(done.taken.rows) for done in self._done_views) + sum(len(block.stored) for block in blocks)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
         if self._refused:

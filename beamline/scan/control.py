@@ -13,12 +13,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, StateEntered
 from beamline.core.files import CONTROL, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.plan.passes import Choice
 from beamline.storage.run_record import DIED, alive, read_record
 
 
@@ -31,6 +33,7 @@ class State(StrEnum):
     FLATS = "flats"
     TAXI = "taxi"
     ACQUIRING = "acquiring"
+    ASKING = "asking"
     PAUSED = "paused"
     FINISHING = "finishing"
     DONE = "done"
@@ -49,7 +52,8 @@ _TAKING = frozenset({State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING})
 NEXT: Mapping[State, frozenset[State]] = {
     State.IDLE: frozenset({State.PREPARING}),
     State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
-    **{state: (_TAKING - {state}) | {State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
+    **{state: (_TAKING - {state}) | {State.ASKING, State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
+    State.ASKING: _TAKING | {State.PAUSED, State.FINISHING, State.FAILED},
     State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
     State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
     **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
@@ -92,15 +96,21 @@ class Verb(StrEnum):
 
 
 @contextmanager
-def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+def verbs_taken(
+    folder: Path, stop: StopRequest, pause: PauseRequest, choose: Callable[[Choice], None] = lambda choice: None
+) -> Iterator[None]:
     """A context in which the scan of this folder obeys commands, by files in a folder that only its owner can enter.
+
+    Args:
+        choose: takes what the operator has chosen to be measured next.
 
     Raises:
         DataError: the disk does not take the folder for them.
     """
     place, over = folder / CONTROL, threading.Event()
-    actions: Mapping[Verb, Callable[[], None]] = {
+    actions: Mapping[Verb | Choice, Callable[[], None]] = {
         Verb.ABORT: stop.abort, Verb.STOP: stop.stop, Verb.PAUSE: pause.pause, Verb.RESUME: pause.resume,
+        **{choice: partial(choose, choice) for choice in Choice},
     }  # fmt: skip
 
     def take_verbs() -> None:
@@ -122,7 +132,7 @@ def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterato
     finally:
         over.set()
         thread.join(ANSWER_WITHIN)
-        for verb in Verb:
+        for verb in actions:
             _taken(place / verb)
         with suppress(OSError):
             place.rmdir()
@@ -147,7 +157,7 @@ class Asked:
     """A command sent to the scan of a part of a run, with its time on the monotonic clock."""
 
     part: Path
-    verb: Verb
+    verb: Verb | Choice
     since: float
 
     def state(self) -> State | None:
@@ -169,17 +179,25 @@ class Asked:
         return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None
 
 
-def ask(run: Path, verb: Verb) -> Asked:
+def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
+    Args:
+        verb: or what is measured next, while the scan asks.
+
     Raises:
-        ConfigError: no scan runs there.
+        ConfigError: no scan runs there, or it does not ask.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
     request = part / CONTROL / verb
     if not request.parent.is_dir():
         raise ConfigError(f"no scan is running in {run}. Nothing was changed.")
+    if isinstance(verb, Choice) and (state := state_of(part)) is not State.ASKING:
+        raise ConfigError(
+            f"the scan in {run} does not ask what to measure next: it is {state}. It asks after each pass of views, "
+            "where scan.decide is ask. Nothing was changed."
+        )
     try:
         request.touch()
     except OSError as error:
@@ -190,7 +208,7 @@ def ask(run: Path, verb: Verb) -> Asked:
     return Asked(part, verb, time.monotonic())
 
 
-def tell(run: Path, verb: Verb) -> State:
+def tell(run: Path, verb: Verb | Choice) -> State:
     """Send a command to a running scan, and wait until it is done; returns the state. Raises as `ask` and `Asked`."""
     asked = ask(run, verb)
     while (state := asked.state()) is None:
@@ -204,10 +222,10 @@ def state_of(part: Path) -> State:
     return State.IDLE if record is None else states.get(record.state, State.IDLE)
 
 
-def _done(state: State, verb: Verb) -> bool:
+def _done(state: State, verb: Verb | Choice) -> bool:
     """Whether a scan in this state has obeyed the verb."""
     if state is State.FINISHING or state.ended:
         return True
     if verb in (Verb.PAUSE, Verb.RESUME):
         return (state is State.PAUSED) is (verb is Verb.PAUSE)
-    return False
+    return isinstance(verb, Choice) and state is not State.ASKING

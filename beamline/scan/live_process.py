@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from beamline.config.load import Config, plan_of
 from beamline.core.events import (
     Done,
-    EnoughReached,
     Failed,
+    LawMeasured,
     ReconDone,
     Sink,
     StateEntered,
@@ -50,11 +50,8 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
     Args:
         earlier: files of the same scan, whose views come first.
     """
-    recon, plan = config.recon, plan or LivePlan()
-    options = {**_common(config), "--seconds": recon.seconds}
-    if (when := recon.stop_when) is not None:
-        limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
-        options |= {name: limit for name, limit in limits.items() if limit is not None}
+    plan = plan or LivePlan()
+    options = {**_common(config), "--seconds": config.recon.seconds}
     if plan.binning > 1:
         options["--bin"] = plan.binning
     if plan.every > 1:
@@ -126,10 +123,13 @@ class LiveReconstruction:
     the file has all views, and its last round makes up for the steps that are lost.
 
     Args:
-        enough: takes the reason why the views so far are enough, in the thread that reads the output.
+        on_law: takes each law of the error that it measures, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan beside it takes precedence.
+
+    Attributes:
+        ended: it could not be started, or has ended in the scan and is not started again.
     """
 
     def __init__(
@@ -137,13 +137,13 @@ class LiveReconstruction:
         command: Sequence[str],
         log: Path,
         sink: Sink,
-        enough: Callable[[str], None] = lambda reason: None,
+        on_law: Callable[[LawMeasured], None] = lambda law: None,
         what: str = "live reconstruction",
         silence: float = _SILENCE,
         low_priority: bool = True,
     ) -> None:
-        self._sink, self._log, self._enough, self._what = sink, log, enough, what
-        self._silence = silence
+        self._sink, self._log, self._on_law, self._what = sink, log, on_law, what
+        self._silence, self.ended = silence, False
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
@@ -160,6 +160,7 @@ class LiveReconstruction:
                     self._command, stderr, self._pass_on, tether=True, on_end=self._on_end, behind=self._low_priority
                 )
         except OSError as error:
+            self.ended = True
             self._sink(Warned(f"The {self._what} could not be started ({error}). The scan is not affected."))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
@@ -225,6 +226,7 @@ class LiveReconstruction:
                 self._again -= 1
                 then = "It is started again, and takes up the views in the file."
             else:
+                self.ended = True
                 then = "The scan goes on without it. To start another: beamline recon FILE --follow -o OUT.h5"
             message = f"The live reconstruction has ended {when} (code {process.code}); see {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
@@ -239,10 +241,8 @@ class LiveReconstruction:
         match event:
             case StateEntered(state="ready"):
                 self._ready.set()
-            case EnoughReached(n_views=n, planned=planned, mean=mean, low=low, high=high):
-                self._enough(
-                    f"{n} of {planned} views are enough, the others would add {mean:.2f} dB ({low:.2f} to {high:.2f})"
-                )
+            case LawMeasured():
+                self._on_law(event)
             case Done():
                 self._done = event.data
                 event = ReconDone(self._done)

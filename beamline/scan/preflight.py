@@ -304,6 +304,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         period=timeline.views.period,
         plan=json.dumps(asked),
         wide_views=bool(plan.wide_places),
+        decides=config.scan.decide != "off",
         filter=plan.filter or known.filter,
         energy_kev=plan.energy or known.energy_kev,
         monochromator_kev=plan.energy or known.monochromator_kev,

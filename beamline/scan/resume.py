@@ -7,12 +7,14 @@ file joins them all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
+import numpy as np
+from numpy.typing import NDArray
 
 from beamline.config.load import NO_LIVE, Config, changed, load, plan_of, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
@@ -33,7 +35,6 @@ from beamline.storage.parts import (
     pass_ends_in,
     views_in,
     views_planned,
-    wide_views_in,
 )
 from beamline.storage.recover import Recovered, recover, require_ours
 from beamline.storage.run_record import alive
@@ -61,6 +62,7 @@ class ResumableRun:
         planned: views of the whole plan.
         wide: triggers of the wide views in these files, likewise.
         choices: after each pass that ended in them, oldest first.
+        seconds: that they took, from the first frame of each to its last one.
         end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
@@ -77,6 +79,7 @@ class ResumableRun:
     end_references: frozenset[FrameKind] | None = None
     wide: frozenset[int] = frozenset()
     choices: tuple[str, ...] = ()
+    seconds: float = 0.0
 
     @property
     def in_words(self) -> str:
@@ -172,7 +175,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     config = load(run / CONFIG, environment={})
     if given is not None and not config.recon.live:
         given = changed(given, NO_LIVE)
-    taken, planned, last_frame_time, parts, closed = _Taken(), 0, 0.0, list[Path](), True
+    planned, times, parts, closed = 0, list[NDArray[np.float64]](), list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             require_ours(part, file)
@@ -185,63 +188,46 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
             if file[layout.COMMITTED][()]:
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
-                taken = taken.and_of(file)
-                last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
+                times.append(file[layout.TIME][()])
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
-    end_references, (views, wide) = None, taken.without_rejected(config)
+    end_references, (views, wide, choices) = None, _stored(parts, config)
     if len(views) >= planned:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
             _refuse_whole(run, planned, parts, closed)
+    last, seconds = max(float(each.max()) for each in times), sum(float(np.ptp(each)) for each in times)
     return ResumableRun(
-        run, lock, config, tuple(parts), views, planned, last_frame_time, tuple(left_out), end_references, wide,
-        taken.choices,
+        run, lock, config, tuple(parts), frozenset(views), planned, last, tuple(left_out), end_references,
+        frozenset(wide), choices, seconds,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Taken:
-    """What the parts of a run hold, oldest first.
-
-    Attributes:
-        views, wide: triggers of the views, and of the wide ones.
-        since: of the views since the last pass that ended.
-        choices: after each pass that ended, oldest first; where none was recorded, the plan went on.
-        decides: the scan chooses what is measured after each pass.
-    """
-
-    views: frozenset[int] = frozenset()
-    wide: frozenset[int] = frozenset()
-    since: frozenset[int] = frozenset()
-    choices: tuple[str, ...] = ()
-    ended: int = 0
-    decides: bool = False
-
-    def and_of(self, file: h5py.File) -> _Taken:
-        """With those of the next part."""
-        ends, views = pass_ends_in(file), views_in(file)
-        since, ended = views_in(file, int(ends[-1])) if ends.size else self.since | views, self.ended + ends.size
-        choices = (*self.choices, *(str(values.get("choice")) for values in decisions_in(file)))
-        choices = (*choices, *[Choice.NEXT] * ended)[:ended]
-        wide = self.wide | wide_views_in(file)
-        return _Taken(self.views | views, wide, since, choices, ended, layout.PASS_ENDS in file)
-
-    def without_rejected(self, config: Config) -> tuple[frozenset[int], frozenset[int]]:
-        """Triggers of the views, and of the wide ones, that need not be taken: those that are there, and those that the
-        scan decided against."""
-        if not self.decides:
-            return self.views, self.wide
-        stage, camera, to_counts = connect.describe(config)
-        plan = replace(plan_of(config), choices=self.choices)
-        passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
-        missing = triggers_of(*passes.done) - self.views | triggers_of(*passes.to_come)
-        if self.choices[-1:] == (Choice.AGAIN,):
-            missing |= triggers_of(passes.done[-1]) - self.since
-        n = plan.angles.size
-        rejected = range(n, n + plan.wide_views * len(plan.wide_places)) if Choice.ENOUGH in self.choices else ()
-        return frozenset(range(n)) - missing, self.wide | {*rejected}
+def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], tuple[str, ...]]:
+    """Triggers of the views, and of the wide ones, that need not be taken: those in the files, and those that the scan
+    decided against. And what it chose after each pass that ended."""
+    views, wide, since, choices, ended, decides = set[int](), set[int](), set[int](), list[str](), 0, False
+    for part in parts:
+        with hdf5.open_hdf5(part) as file, hdf5.readable(part):
+            decides, ends = layout.PASS_ENDS in file, pass_ends_in(file)
+            since = {*views_in(file, int(ends[-1]))} if ends.size else since | views_in(file)
+            views |= views_in(file)
+            wide |= views_in(file, kind=FrameKind.ALIGNMENT)  # as which wide views are written
+            ended += ends.size
+            chosen = (str(values.get("choice")) for values in decisions_in(file))
+            choices = [*choices, *chosen, *[Choice.NEXT] * ended][:ended]
+    if not decides:
+        return views, wide, ()
+    plan = replace(plan_of(config), choices=(*choices,))
+    stage, camera, to_counts = connect.describe(config)
+    passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
+    missing = triggers_of(*passes.done) - views | triggers_of(*passes.to_come)
+    if choices[-1:] == [Choice.AGAIN]:
+        missing |= triggers_of(passes.done[-1]) - since
+    n = plan.angles.size
+    rejected = range(n, n + plan.wide_views * len(plan.wide_places)) if Choice.ENOUGH in choices else ()
+    return {*range(n)} - missing, wide.union(rejected), plan.choices
 
 
 def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:

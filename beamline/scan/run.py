@@ -30,14 +30,17 @@ from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
-from beamline.plan.plan import Retake, spread_retakes
+from beamline.plan.choose import Wish
+from beamline.plan.plan import Block, Retake, spread_retakes
+from beamline.plan.timeline import block_seconds
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
+from beamline.scan.decider import Decider
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
-from beamline.scan.references import ReferenceReport
+from beamline.scan.references import REFERENCES, ReferenceReport
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
@@ -46,6 +49,7 @@ from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
+from drivers.base.frame import FrameKind
 from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
@@ -119,7 +123,7 @@ def run_scan(
             for sentence in remarks:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
-            stack.enter_context(verbs_taken(folder, stop, run.pause))
+            stack.enter_context(verbs_taken(folder, stop, run.pause, run.decider.answer))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
                 pause = run.pause if config.scan.without_watchdog == "pause" else None
@@ -197,6 +201,33 @@ class _Run:
     def references(self) -> ReferenceReport:
         return ReferenceReport(self.config.references, self.ready.plan.exposure, self.sink)
 
+    @cached_property
+    def decider(self) -> Decider:
+        scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
+        wide = (block for block in timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
+
+        def seconds_of(block: Block, at: float | None = None) -> float:
+            at = devices.stage.position() if at is None else at
+            return block_seconds(block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, at)
+
+        i = timeline.blocks.index(timeline.views)
+        due = set(REFERENCES) - {block.kind for block in timeline.blocks[:i]}  # also after views that are enough
+        return Decider(
+            asks=scan.decide == "ask",
+            wish=Wish(**dict(scan.wish)),
+            wait=scan.wait_s,
+            timeline=timeline,
+            seconds_of=seconds_of,
+            now=self.instrument.clock.now,
+            states=self.states,
+            stop=self.stop,
+            sink=self.sink,
+            seconds=sum(seconds_of(block, 0.0) for block in timeline.blocks[i:] if block.kind in due)
+            + (self.series.seconds if self.series else 0.0),
+            frames=sum(len(block.stored) for block in wide),
+            close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
+        )
+
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """Run the whole scan, and end it by the event `done` or `failed`."""
         try:
@@ -228,7 +259,8 @@ class _Run:
         with ExitStack() as ending:
             follower = None
             if command is not None:
-                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink, self.stop.stop_as_enough)
+                log, on_law = self.folder / RECON_LOG, self.decider.add_law
+                follower = LiveReconstruction(command, log, self.sink, on_law)
                 ending.callback(follower.close)
             return self._acquire_and_follow(writer, follower, release)
 
@@ -341,6 +373,7 @@ class _Run:
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
+                self.decider.began = min(self.decider.began, frame.time)
                 if self.instrument.simulated is not None:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
@@ -378,18 +411,35 @@ class _Run:
         )
 
     def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:
-        ready, instrument = self.ready, self.instrument
-        return Acquisition(
+        ready, instrument, decider = self.ready, self.instrument, self.decider
+        acquisition = Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.sink,
             Supervision(
                 lambda: self._refusal(recorder, follower), self.pause, lambda: wait_in_pause(recorder), self.states,
                 lambda missing: self._retakes(recorder, missing),
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
+                next_pass=None if self.config.scan.decide == "off" else decider,
                 pass_ended=recorder.end_pass,
-                may_retake=lambda missing: min(len(self._bad(recorder, missing)), self._may_retake(recorder)),
+                may_retake=lambda missing: len(self._to_retake(recorder, missing)[0]),
             ),
         )  # fmt: skip
+
+        def wait_a_moment() -> bool:
+            acquisition.wait_while_paused()
+            return wait_in_pause(recorder)
+
+        decider.unable, decider.record = lambda: self._unable_to_predict(follower), recorder.decided
+        decider.wait_a_moment = wait_a_moment
+        return acquisition
+
+    def _unable_to_predict(self, follower: LiveReconstruction | None) -> str:
+        """Why the live reconstruction measures no law of the error; "" where it may."""
+        if follower is None:
+            return "there is no live reconstruction"
+        if self.ready.info.source_distance_mm is not None:
+            return "the beam is a cone, in which no gain is predicted"
+        return "the live reconstruction has ended" if follower.ended else ""
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
@@ -410,32 +460,29 @@ class _Run:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged for it or gave no frame; of more than the plan allows, an even spread."""
-        bad, most = self._bad(recorder, missing), self._may_retake(recorder)
-        chosen = spread_retakes(bad, most)
+        """Views that were flagged for it or gave no frame, which are announced."""
+        chosen, n = self._to_retake(recorder, missing)
         if not chosen:
             return ()
-        if len(chosen) < len(bad):
+        if len(chosen) < n:
             message = (
-                f"{len(bad)} views were flagged or gave no frame, and {most} may be taken again "
-                f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
+                f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
+                f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
             )
             self.sink(Warned(message))
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
 
-    def _bad(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged or gave no frame, by trigger; none where none may be taken again."""
-        if not self._may_retake(recorder):
-            return ()
+    def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
+        """Views that were flagged or gave no frame, and their number; of more than the plan allows, an even spread."""
+        most = self.ready.plan.retakes - recorder.announced
+        if not most:
+            return (), 0
         recorder.wait()
-        lost = [] if self.stop.stopping else [*recorder.views_to_retake, *(Retake(-1, trigger) for trigger in missing)]
-        return sorted(lost, key=lambda view: view.trigger)
-
-    def _may_retake(self, recorder: Recorder) -> int:
-        """Views that may still be taken again by the plan."""
-        return self.ready.plan.retakes - recorder.announced
+        lost = [Retake(-1, trigger) for trigger in missing]
+        bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
+        return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
 
 
 def wait_in_pause(recorder: Recorder) -> bool:

@@ -12,10 +12,11 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import files_with_frames, joined_file_of, to_join, views_in, views_planned
+from beamline.storage.parts import decisions_in, files_with_frames, joined_file_of, to_join, views_in, views_planned
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
+from beamline.storage.writers.rows import ending_in
 
 
 def scan_file(path: str | Path) -> Path:
@@ -116,12 +117,15 @@ def _died(sure: bool) -> str:
 
 def _lacks_views(run: Path) -> bool:
     """Whether the files of a run, all closed, lack views of its plan."""
-    planned, views = 0, set[int]()
+    planned, views, chosen, complete = 0, set[int](), set[str](), False
     try:
         for part in files_with_frames(run):
             with hdf5.open_hdf5(part) as file, hdf5.readable(part):
                 planned = views_planned(file) or 0
                 views |= views_in(file)
+                chosen |= {str(values.get("choice")) for values in decisions_in(file)}
+                complete = ending_in(file).status == "complete"
     except (DataError, *hdf5.ALTERED):
         return False
-    return len(views) < planned
+    rejected = "enough" in chosen or ("again" in chosen and complete)  # which takes the place of other views
+    return len(views) < planned and not rejected

@@ -41,12 +41,13 @@ _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
-def views_in(file: h5py.File, first: int = 0) -> frozenset[int]:
+def views_in(file: h5py.File, first: int = 0, kind: FrameKind = FrameKind.PROJECTION) -> frozenset[int]:
     """The planned views in a file, counted from 0, except those whose frame is invalid, or whose record differs from
     its checksum.
 
     Args:
         first: the row from which on frames count.
+        kind: of these frames.
 
     Raises:
         ValueError: a row claims to replace a later one.
@@ -57,37 +58,30 @@ def views_in(file: h5py.File, first: int = 0) -> frozenset[int]:
     replaces[altered], kinds[altered] = -1, FrameKind.INVALID
     require_earlier(replaces)
     views = set()
-    for row in first + np.flatnonzero(kinds[first:] == FrameKind.PROJECTION):
+    for row in first + np.flatnonzero(kinds[first:] == kind):
         while replaces[row] >= 0:  # a view that was taken again has the number of the first one
             row = replaces[row]
         views.add(int(triggers[row]))
     return frozenset(views)
 
 
-def wide_views_in(file: h5py.File) -> frozenset[int]:
-    """Triggers of the wide views in a file, which count on from the planned views."""
-    n = int(file[layout.COMMITTED][()])
-    aside = file[layout.X_TRANSLATION][:n] if layout.X_TRANSLATION in file else np.zeros(n)
-    wide = (file[layout.KIND][:n] == FrameKind.ALIGNMENT) & (aside != 0)
-    wide[altered_rows(file, 0, n)] = False
-    return frozenset(file[layout.TRIGGER][:n][wide].tolist())
-
-
 def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
     """Rows of a file at the end of each pass [pass], of those committed; empty where the scan chose nothing."""
-    if layout.PASS_ENDS not in file:
-        return np.zeros(0, np.int64)
-    hdf5.look_again(file[layout.PASS_ENDS])
-    ends = np.asarray(file[layout.PASS_ENDS][()], np.int64)
-    return ends[ends <= int(file[layout.COMMITTED][()])]
+    ends = np.asarray(_list_in(file, layout.PASS_ENDS), np.int64)
+    return ends[ends <= int(file[layout.COMMITTED][()])] if ends.size else ends
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
     """What was chosen after each pass: values of the event `next_chosen`, likewise."""
-    if layout.DECISIONS not in file:
+    return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
+
+
+def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
+    """The values of a dataset, also of one that grows; none where the file does not have it."""
+    if path not in file:
         return ()
-    hdf5.look_again(file[layout.DECISIONS])
-    return tuple(json_object(datasets.text(line)) or {} for line in file[layout.DECISIONS][()])
+    hdf5.look_again(file[path])
+    return file[path][()]
 
 
 def views_planned(file: h5py.File) -> int | None:

@@ -37,7 +37,7 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         deciding = lambda *given, **more: _deciding(preflight(*given, **more))  # noqa: E731
         within.setattr("beamline.scan.run.preflight", deciding)
         within.setattr("beamline.scan.run.Recorder", recorder)
-        supervised = lambda *given, **more: Supervision(*given, **more, next_pass=next_pass)  # noqa: E731
+        supervised = lambda *given, **more: Supervision(*given, **{**more, "next_pass": next_pass})  # noqa: E731
         within.setattr("beamline.scan.run.Supervision", supervised)
         yield
 

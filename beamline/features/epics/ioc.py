@@ -1,4 +1,4 @@
-"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control also the verbs to it."""
+"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control also verbs and answers to it."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from typing import Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.core.text import one_line
-from beamline.page.followed_run import LONGEST, FollowedRun, RunValues, Severity, Stamp
+from beamline.page.followed_run import LONGEST, FollowedRun, RunValues, Severity, Stamp, answer_of
+from beamline.plan.passes import Choice
 from beamline.scan.control import Asked, Verb, ask
 from beamline.scan.runs import newest
 
 SHOWN = [each for each in fields(RunValues) if each.name not in ("angle", "flag_names", "flag_counts")]
 """The values of a run that are process variables."""
 _DEVICE, _UNDEFINED = 1, 6  # alarm_t.status of EPICS's normative types
-_TYPES: dict[str, str] = {"str": "s", "int": "l", "float": "d"}
+_TYPES = {"str": "s", "int": "l", "float": "d", "tuple[str, ...]": "as", "tuple[float, ...]": "ad"}
 
 
 class RunServer:
@@ -28,7 +29,7 @@ class RunServer:
     Args:
         prefix: before each name, such as "2bma:splatline:".
         address: to listen at.
-        control: verbs are taken, from everybody who reaches the address.
+        control: verbs and answers are taken, from everybody who reaches the address.
         say: takes a line for each verb.
         now: a clock, s since the Unix epoch.
 
@@ -68,10 +69,15 @@ class RunServer:
         self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, begun))
         provider.add(prefix + "Heartbeat", self._heartbeat)
         untold = _posted(False, begun)
-        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in (Verb if control else ())}
+        verbs = [verb for verb in Verb if verb not in [*Choice]] if control else []
+        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in verbs}
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
+        self._decide = SharedPV(nt=NTScalar("s"), initial=_posted("", begun))  # kept: a PV alone loses its handler
+        self._decide.put(self._take_answer)
+        if control:
+            provider.add(prefix + "Decide", self._decide)
         try:
             self._server = Server(providers=[provider], conf={"EPICS_PVAS_INTF_ADDR_LIST": address})
         except RuntimeError as error:
@@ -109,13 +115,22 @@ class RunServer:
             if not bool(op.value()):
                 op.done()
                 return
-            self._say(f"{verb} from {op.peer()}")
-            try:
-                self._asked.append((pv, op, ask(newest(self._run.runs), verb)))
-            except (BeamlineError, OSError) as error:
-                self._refuse(pv, op, error)
+            self._send(pv, op, lambda: verb)
 
         return put
+
+    def _take_answer(self, pv: Any, op: Any) -> None:
+        """The handler of the PV whose text answers the scan: one of its options, while it asks."""
+        self._send(pv, op, lambda: answer_of(self._run.stamped.values, op.value().raw.value))
+
+    def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb]) -> None:
+        """Send a verb to the run at once; `look` answers the client."""
+        try:
+            verb = verb_of()
+            self._say(f"{verb} from {op.peer()}")
+            self._asked.append((pv, op, ask(newest(self._run.runs), verb)))
+        except (BeamlineError, OSError) as error:
+            self._refuse(pv, op, error)
 
     def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
         """Answer the client of a verb that is done; one that is not yet waits for the next look."""
@@ -125,15 +140,20 @@ class RunServer:
             self._refuse(pv, op, error)
             return
         if done:
-            pv.post(_posted(False, Stamp(self._now())))
+            pv.post(_posted(_unset(pv), Stamp(self._now())))
             op.done()
         else:
             self._asked.append((pv, op, asked))
 
     def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
         stamp = Stamp(self._now(), Severity.MAJOR, user_message(error))
-        pv.post(_posted(False, stamp))
+        pv.post(_posted(_unset(pv), stamp))
         op.done(error=stamp.message)
+
+
+def _unset(pv: Any) -> str | bool:
+    """The value of the PV of a verb or an answer before a client writes it."""
+    return "" if isinstance(pv.current(), str) else False
 
 
 def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:

@@ -89,7 +89,6 @@ for cones."""
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
 REASON_BYTES = 600
-DECISION_BYTES = 8192
 FULL = "Full"
 _TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 
@@ -215,8 +214,7 @@ def create(
     file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
     if info.decides:
         _growing(file, PASS_ENDS, (), np.dtype("<i8"))
-        line = h5py.string_dtype("utf-8", DECISION_BYTES)
-        file.create_dataset(DECISIONS, (0,), line, maxshape=(None,), chunks=(1,))
+        file.create_dataset(DECISIONS, (0,), h5py.string_dtype("utf-8", 8192), maxshape=(None,), chunks=(1,))
 
 
 def _groups(file: h5py.File) -> None:

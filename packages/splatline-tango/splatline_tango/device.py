@@ -14,20 +14,22 @@ from tango.server import Device, attribute, command
 from tango.server import run as run_server
 
 from beamline.core.errors import BeamlineError, DataError, user_message
-from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity, StampedValues
+from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity, StampedValues, answer_of
+from beamline.plan.passes import Choice
 from beamline.scan.control import State, Verb, ask
 from beamline.scan.runs import newest
 
 ATTRIBUTES = [each for each in fields(RunValues) if each.name not in ("data_rate", "residual", "skipped")]
 """The values of a run that are attributes of the device; `metadata` has their names, meanings and units."""
 _CLASS = "SplatlineScan"
-_CHECKS = 64  # of the monitor, at most
+_CHECKS = 64  # of the monitor, or options of what is next, at most
 _TYPES: dict[str, dict[str, Any]] = {
     "str": {"dtype": str},
     "int": {"dtype": int},
     "float": {"dtype": float},
     "tuple[str, ...]": {"dtype": (str,), "max_dim_x": _CHECKS},
     "tuple[int, ...]": {"dtype": (int,), "max_dim_x": _CHECKS},
+    "tuple[float, ...]": {"dtype": (float,), "max_dim_x": _CHECKS},
 }
 _RAISED = {"warnings": tango.AttrQuality.ATTR_WARNING, "alarms": tango.AttrQuality.ATTR_ALARM}
 _STATES: dict[str, str] = {
@@ -104,8 +106,10 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     for each in ATTRIBUTES:
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
         body[each.metadata["name"]] = attribute(fget=reader(each.name), **facts)
-    for verb in Verb if control else ():
+    for verb in [verb for verb in Verb if verb not in [*Choice]] if control else ():
         body[verb.value.capitalize()] = command(_sender(run, verb))
+    if control:
+        body["Decide"] = command(_decider(run), dtype_in=str, doc_in="one of Options")
     return type(_CLASS, (Device,), body)
 
 
@@ -113,14 +117,26 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
     """The command of the device that sends a verb to the run, and returns at once."""
 
     def send(device: Any) -> None:
-        try:
-            ask(newest(run.runs), verb)
-        except (BeamlineError, OSError) as error:
-            tango.Except.throw_exception("SplatlineRefused", user_message(error), f"{_CLASS}.{send.__name__}")
+        _send(run, lambda: verb, send.__name__)
 
     send.__name__ = verb.value.capitalize()
     send.__doc__ = f"What `beamline {verb}` does. Returns at once; the state says when it is done."
     return send
+
+
+def _decider(run: FollowedRun) -> Callable[[Any, str], None]:
+    def Decide(device: Any, choice: str) -> None:  # noqa: N802 - the name of the command
+        """What `beamline decide` does, while AnswerWithin is above 0. Returns at once."""
+        _send(run, lambda: answer_of(run.stamped.values, choice), "Decide")
+
+    return Decide
+
+
+def _send(run: FollowedRun, verb_of: Callable[[], Verb], command: str) -> None:
+    try:
+        ask(newest(run.runs), verb_of())
+    except (BeamlineError, OSError) as error:
+        tango.Except.throw_exception("SplatlineRefused", user_message(error), f"{_CLASS}.{command}")
 
 
 def serve(runs: Path, place: ServerPlace, control: bool, ready: Callable[[], None]) -> None:

@@ -18,7 +18,7 @@ TAKES_FILE = {
     "simulate": "FILE -o out.h5", "sweep": "FILE axis=1:3:1",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
-NO_FILE = {"config", "demo", "ioc", "pause", "resume", "stop", "abort", "runs"}
+NO_FILE = {"config", "demo", "ioc", "pause", "resume", "stop", "abort", "decide", "runs"}
 OTHERWISE = {("batch", "text"), ("batch", "cut"), ("watch", "cut")}
 """The next scan is made; it may become a scan file."""
 KINDS = {

@@ -103,6 +103,15 @@ SCAN = {
     "status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5", "missing": [], "flags": {},
     "alarmed_frames": 0, "alarmed_views": 0, "retaken": 0, "reference_faults": [], "recon": None,
 }  # fmt: skip
+OPTIONS = [
+    {"choice": choice, "frames": frames, "seconds": seconds, "dose": dose, "bytes": size, "gain": gain,
+     "low": low, "high": high}
+    for choice, frames, seconds, dose, size, gain, low, high in (
+        ("next", 90, 95.2, 0.125, 1.21e9, 0.82, 0.61, 1.02), ("again", 90, 95.2, 0.125, 1.21e9, -0.31, -0.52, 0.1),
+        ("wide", 48, 12345.0, 0.067, 6.4e11, None, None, None), ("enough", 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0),
+    )
+]  # fmt: skip
+CHOSEN = {"number": 3, "n_views": 270, "choice": "again", "reason": "it brings most a second.", "options": OPTIONS}
 EVENTS = [
     ("run_started", {**RUN, "remarks": []}, "390 frames, 18 MB"),
     ("state", {"state": "done", "message": "Finished"}, "Finished"),
@@ -134,6 +143,15 @@ EVENTS = [
         SCAN,
         "Scan complete: 3",
     ),
+    ("error_law", {"n_views": 9, "exponent": 1.0, "exponent_error": 0.1, "noise": 1.0, "offset": 0.1}, None),
+    (
+        "next_chosen",
+        {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71},
+        "After pass 3: again, chosen by the program: it brings most a second. The choice before: predicted +0.80 dB, "
+        "measured +0.71 dB",
+    ),
+    ("next_chosen", {**CHOSEN, "by": "operator", "gained": -0.1}, "by the operator: it brings most a second. The c"),
+    ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),
     ("failed", {"message": "no beam"}, "Failed: no beam"),
     ("done", {"folder": "runs/x"}, "Done: runs/x"),
@@ -148,6 +166,42 @@ def test_events_in_words(event: str, data: dict[str, Any], words: str | None) ->
     else:
         assert text is not None
         assert words in text
+
+
+TABLE = """\
+Pass 3 is over, 270 views so far. What can be measured next:
+  choice gain, dB                dB/min        s     dose      data
+> next   +0.82 (0.61 to 1.02)     +0.52       95   12.5 %   1.21 GB
+  again  -0.31 (-0.52 to 0.10)    -0.20       95   12.5 %   1.21 GB
+  wide   not known                    -    12345    6.7 %    640 GB
+  enough +0.00                        -        0    0.0 %       0 B
+"""
+PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({}, ""),
+        ({"wait": 30.0}, "Within 30 s: beamline decide CHOICE, Enter for next; else the plan goes on.\n"),
+        ({"remark": "No volume yet: \x1b[2J"}, "No volume yet: \\x1b[2J\n"),
+    ],
+)
+@pytest.mark.parametrize("stream", [Tty, io.StringIO])
+def test_what_can_be_measured_next_stands_side_by_side(
+    stream: type[io.StringIO], more: dict[str, Any], words: str
+) -> None:
+    text = shown(stream(), ("pass_ended", {**PASS, **more}))
+    assert text == TABLE + words
+    assert max(map(len, text.splitlines())) <= 80
+    log = io.StringIO()
+    UserLog(log)(event_of({"event": "pass_ended", "time": 1_795_152_000.5, **PASS, **more}))
+    assert log.getvalue().replace("2026-11-20T05:20:00Z  ", "") == text
+
+
+def test_the_longest_question_fits_80_columns() -> None:
+    text = shown(io.StringIO(), ("pass_ended", {**PASS, "recommended": "enough", "wait": 900.0}))
+    assert max(map(len, text.splitlines())) <= 80
 
 
 def test_the_user_log_has_a_line_and_a_time_for_each_sentence() -> None:

@@ -9,6 +9,23 @@ from recon.methods import names_of_one_volume
 from tests.beamline.config_file import GOOD, faults, load
 
 FAULTS = {
+    "former key": (
+        ("sample: {name: test}", "sample: {name: test}\nrecon: {stop_when: null}"),
+        "my.yaml:2: recon: stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db",
+    ),
+    "decision": (
+        ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: perhaps"),
+        "my.yaml:5: scan.decide is 'perhaps'; expected off | ask | do",
+    ),
+    "on is no decision": (("exposure_s: 0.01", "exposure_s: 0.01\n  decide: on"), "decide is true (YAML reads yes"),
+    "dose": (
+        ("exposure_s: 0.01", "exposure_s: 0.01\n  wish: {dose: 50}"),
+        "my.yaml:5: scan.wish.dose is 50; expected a number > 0 and <= 1 | null",
+    ),
+    "decision without passes": (
+        ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step"),
+        "my.yaml:5: scan.decide do needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or",
+    ),
     "unknown key": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  setle_s: 1"),
         "my.yaml:5: scan.setle_s is not a known key (did you mean settle_s?); legal keys there: mode, angles",

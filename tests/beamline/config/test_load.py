@@ -31,6 +31,48 @@ def test_defaults_and_numbers_as_people_write_them(tmp_path: Path) -> None:
         loaded.scan.period_s = 1.0  # type: ignore[misc]
 
 
+PASSES = "scan.angles={scheme: interlaced, views: 12, passes: 3}"
+
+
+def test_a_decision_is_off_unless_asked_for_and_off_needs_no_quotes(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD.replace("scan:\n", "scan:\n  decide: off\n"))
+    assert load(path).scan.decide == load(write(tmp_path)).scan.decide == "off"
+    assert load(path, "scan.decide=off", BEAMLINE_SCAN__DECIDE="off").scan.decide == "off"
+    decides = load(path, "scan.decide=do", PASSES)
+    wish = decides.scan.wish
+    assert (wish.quality_db, wish.seconds, wish.dose, decides.scan.wait_s) == (1.0, None, None, 30.0)
+    wish = load(path, "scan.decide=do", PASSES, "scan.wish={seconds: 600, dose: 0.5}").scan.wish
+    assert (wish.quality_db, wish.seconds, wish.dose) == (None, 600.0, 0.5)
+    assert config.changed(decides, config.NO_LIVE).scan.decide == "off"  # read back from text
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            (),
+            "scan.decide ask needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views",
+        ),
+        (("scan.pass_views=6",), "needs passes"),  # a fly scan
+        (("scan.angles={scheme: interlaced, views: 12, passes: 1}",), "needs passes"),
+        (("scan.mode=step", PASSES), "needs passes"),
+        ((PASSES, "recon.live=false"), "scan.decide ask needs a live volume; set recon.live to true"),
+        ((PASSES, "recon.method=fbp"), "needs a volume that grows with the views; set recon.method to r2"),
+        ((PASSES, "recon.method=auto"), "set recon.method to r2"),
+    ],
+)
+def test_a_scan_cannot_decide_without_what_a_prediction_needs(
+    tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(write(tmp_path), "scan.decide=ask", *words)
+    assert sentence in str(caught.value) and "off takes the plan as it is" in str(caught.value)
+
+
+def test_a_step_scan_decides_with_passes_of_some_views(tmp_path: Path) -> None:
+    assert load(write(tmp_path), "scan.decide=ask", "scan.mode=step", "scan.pass_views=4").scan.pass_views == 4
+
+
 def test_precedence_flags_environment_file_defaults(tmp_path: Path) -> None:
     path = write(tmp_path)
     assert load(path).scan.settle_s == 0.1

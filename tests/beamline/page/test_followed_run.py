@@ -5,18 +5,23 @@ from pathlib import Path
 
 import pytest
 
+from beamline.core.errors import ConfigError
 from beamline.core.events import (
     BeamRead,
     Event,
     Failed,
     FrameFlagged,
     FrameStored,
+    NextChosen,
+    PassEnded,
     RunStarted,
     StateEntered,
     Warned,
 )
 from beamline.core.flag import Flag, Level
-from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues
+from beamline.page import followed_run
+from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues, answer_of
+from beamline.plan.passes import Choice
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
 FRAME = FrameStored(5, 20, "projection", 2.5, 40.0, 6.0, 812.0)
@@ -60,6 +65,43 @@ def test_flags_are_counted_by_check_until_another_run_begins() -> None:
     now = _after(STARTED, *flags)
     assert dict(zip(now.flag_names, now.flag_counts, strict=True)) == {"beam": 2, "motion": 1}
     assert _after(STARTED, *flags, STARTED).flag_names == ()
+
+
+NEXT, ENOUGH = (
+    {"choice": "next", "frames": 90, "seconds": 95.5, "dose": 0.125, "bytes": 2e9, "gain": 0.8, "low": 0.6, "high": 1},
+    {"choice": "enough", "frames": 0, "seconds": 0, "dose": 0, "bytes": 0, "gain": None, "low": None, "high": None},
+)
+ASKED = PassEnded(3, 270, [NEXT, ENOUGH], "next", 30.0)
+CHOSEN = NextChosen(3, 270, "enough", "operator", "as asked", [NEXT, ENOUGH], 0.8, 0.7)
+
+
+def test_what_can_be_measured_next_stands_in_lists_until_it_is_chosen() -> None:
+    now = _after(STARTED, ASKED)
+    assert (now.pass_number, now.options, now.recommended, now.wait) == (3, ("next", "enough"), "next", 30.0)
+    lists = (now.option_gains, now.option_lows, now.option_highs, now.option_times, now.option_doses, now.option_sizes)
+    assert [each[0] for each in lists] == [0.8, 0.6, 1.0, 95.5, 12.5, 2.0]
+    assert [each[1] == each[1] for each in lists] == [False] * 3 + [True] * 3  # not known
+    assert (now.decision, now.measured_gain == now.measured_gain) == ("", False)
+    chosen = _after(STARTED, ASKED, CHOSEN)
+    assert (chosen.wait, chosen.options, chosen.predicted_gain, chosen.measured_gain) == (
+        0.0,
+        now.options,
+        0.8,
+        0.7,
+    )
+    assert chosen.decision == "enough, by the operator: as asked"
+
+
+def test_an_answer_is_an_option_of_a_scan_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(followed_run, "Verb", Choice)
+    assert answer_of(_after(STARTED, ASKED), "enough") == "enough"
+    with pytest.raises(ConfigError, match="'wide' is none of next, enough"):
+        answer_of(_after(STARTED, ASKED), "wide")
+    for events in ((), (STARTED, replace(ASKED, wait=0.0)), (STARTED, ASKED, CHOSEN)):
+        with pytest.raises(ConfigError, match="asks nothing now"):
+            answer_of(_after(*events), "next")
+    died = _stamped(STARTED, ASKED).with_file({**SEEN, "status": "died", "next": "resume it"}, 0.0, 1300.0)
+    assert died.values.wait == 0.0
 
 
 SEEN = {"frames": 15, "status": "running", "free": 3e9, "age_s": 0.5, "newest": 1234.5, "next": ""}

@@ -17,7 +17,7 @@ from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
-from beamline.reconstruct.budget import Choice, binned, choices, paces_of, within
+from beamline.reconstruct.budget import TimedChoice, binned, choices, paces_of, within
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
@@ -297,7 +297,7 @@ def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) 
 def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.2, 0.01, 0.01)
-    monkeypatch.setattr(module, "choices", lambda *_: [Choice("r2", 100, 2, 0.5)])
+    monkeypatch.setattr(module, "choices", lambda *_: [TimedChoice("r2", 100, 2, 0.5)])
     np.save(tmp_path / "truth.npy", SCAN.truth(Grid(SCAN.shape[:1] + 2 * SCAN.shape[1:], 1.0)))
     options = ReconOptions(
         SourceOptions(tmp_path / "scan.h5"), OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from beamline.cli.control import CHOICES
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.plan.passes import Choice
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
 from beamline.storage.run_record import RecordFile, RunRecord
@@ -80,6 +82,35 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     for file in files:
         file.close()
     assert running(Path("runs")) == []
+
+
+def test_what_is_measured_next_is_said_only_while_the_scan_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert tuple(Choice) == CHOICES
+    run = tmp_path / "runs" / "a"
+    run.mkdir(parents=True)
+    (run / "config.resolved.yaml").touch()
+    chosen: list[Choice] = []
+    file = RecordFile(run, RunRecord(State.ACQUIRING))
+
+    def choose(choice: Choice) -> None:
+        chosen.append(choice)
+        file.put(RunRecord(State.TAXI))
+
+    with verbs_taken(run, StopRequest(), PauseRequest(), choose):
+        refused = CliRunner().invoke(main, ["decide", "again"])
+        assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
+        assert list((run / "control").iterdir()) == [] and not chosen
+        file.put(RunRecord(State.ASKING))
+        told = CliRunner().invoke(main, ["decide", str(run), "again"])
+        assert (told.exit_code, told.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        (run / "control" / "enough").touch()
+    file.close()
+    assert not (run / "control").exists()
+    for words in (["again", "again", "again"], ["sideways"], []):
+        assert CliRunner().invoke(main, ["decide", *words]).exit_code == 2
 
 
 def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(

@@ -169,7 +169,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         (("scan.energy=8.3",), "exclude each other"),
         (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),
-        (("recon.live=true", "recon.stop_when={psnr_loss: 1}"), "recon.stop_when"),
+        (("recon.live=true", "scan.decide=do"), "set scan.energies to null"),
         (("simulation.scene.beam.energy_kev=null", "simulation.scene.beam.tube={kv: 60}"), "gives one energy"),
         (("simulation.scene.phantom.materials.fresh.formula=Xx",), "Xx"),
         (("scan.energies=[8.3, 9000]",), "9000"),

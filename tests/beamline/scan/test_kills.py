@@ -11,25 +11,31 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from beamline.config.models import StorageSection
 from beamline.core.errors import ConfigError, DataError
 from beamline.features.files.validate import validate
+from beamline.plan.passes import Choice
 from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
+from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
+from tests.beamline.chosen import Asked, Chooser, choosing
 from tests.beamline.fakes import FakeInstrument, assert_true, decode
 from tests.beamline.ran import small
 
 VIEWS, FRAMES, SECONDS = 200, 207, 0.002  # s a frame, of real time
+FIRST, PASS = 5, 50  # row of the first view, and views of a pass
 WORDS = (f"scan.angles.views={VIEWS}", "scan.period_s=0.05")
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process that is forked is killed")
@@ -41,7 +47,7 @@ def _no_pause_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "BacklogGuard", lambda *_: lambda waiting: None)
 
 
-def _scan(runs: Path, step: bool, taken: Connection) -> None:
+def _scan(runs: Path, step: bool, taken: Connection, choose: Chooser | None = None) -> None:
     """It sends a byte for each frame."""
 
     def on_frame(number: int) -> None:
@@ -49,7 +55,9 @@ def _scan(runs: Path, step: bool, taken: Connection) -> None:
         time.sleep(SECONDS)
 
     instrument = FakeInstrument(on_frame=on_frame)
-    run_scan(small(*WORDS, f"scan.mode={'step' if step else 'fly'}"), runs, instrument=instrument.connected())
+    config = small(*WORDS, f"scan.mode={'step' if step else 'fly'}")
+    with nullcontext() if choose is None else choosing(pytest.MonkeyPatch(), choose, PASS):
+        run_scan(config, runs, instrument=instrument.connected())
 
 
 def _assert_frames(path: Path, one_part: bool = True) -> int:
@@ -63,7 +71,7 @@ def _assert_frames(path: Path, one_part: bool = True) -> int:
     return len(frames)
 
 
-def _killed(folder: Path, moments: Sequence[float], step: bool) -> list[Path]:
+def _killed(folder: Path, moments: Sequence[float], step: bool, choose: Chooser | None = None) -> list[Path]:
     """The folders of runs of a scan as kills leave them, where there is one yet.
 
     A moment is the number of a frame, with a share of the time to the next one; they rise. Beyond the last
@@ -71,7 +79,7 @@ def _killed(folder: Path, moments: Sequence[float], step: bool) -> list[Path]:
     """
     runs, folders, taken = folder / "runs", list[Path](), 0
     ours, theirs = multiprocessing.Pipe(duplex=False)
-    process = multiprocessing.get_context("fork").Process(target=_scan, args=(runs, step, theirs))
+    process = multiprocessing.get_context("fork").Process(target=_scan, args=(runs, step, theirs, choose))
     process.start()
     theirs.close()
     assert process.pid is not None
@@ -141,6 +149,29 @@ def _gone_on(run: Path) -> bool:
 def test_a_few_kills(tmp_path: Path) -> None:
     counted = kills(tmp_path, 3, 1, 1, [False])
     assert counted["recovered"] + counted["whole"] + counted["none"] == 3
+
+
+def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of its four passes are taken twice; the kills come in the first, in its second time, and in the last."""
+    script = [Choice.AGAIN, Choice.NEXT, Choice.AGAIN]
+    moments = [FIRST + share * PASS for share in (0.5, 1.5, 3.7)]
+    for run in _killed(tmp_path, moments, True, Asked(script)):
+        recover_run(run)
+        with h5py.File(run / "scan.h5") as file:
+            n = len(decisions_in(file))
+            if pass_ends_in(file).size > n:  # just between the two, where the plan goes on
+                continue
+        with choosing(monkeypatch, Asked(script[n:]), PASS), open_for_resume(run) as series:
+            instrument = FakeInstrument()
+            instrument.clock.sleep(1e4)
+            run_scan(series.config, series, instrument=instrument.connected())
+        with open_scan(run / "joined.h5") as source:
+            frames = [frame for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
+            assert [values["choice"] for values in source.decisions] == script
+            assert [sum(frame.index < end for frame in frames) // PASS for end in source.pass_ends] == [1, 2, 3, 4]
+        assert_true(frames)
+        once = [*range(PASS)]
+        assert [frame.trigger for frame in frames] == [*once, *once, *(PASS + i for i in (*once, *once))]
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import Event
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Event, LawMeasured
 from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
@@ -255,33 +255,41 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=T
     assert len(ran.of("recon_done")) == 1 and stop.enough
     stop.abort()
     assert not stop.enough
+    twice = StopRequest()
+    twice.stop_as_enough("by the decision")
+    twice.stop_as_enough("again")
+    assert twice.enough and twice.reason == "by the decision"
     asked = StopRequest()
     asked.stop()
     asked.stop_as_enough("too late")
     assert not asked.enough
 
 
-def test_what_the_live_reconstruction_finds_enough_is_passed_on(tmp_path: Path) -> None:
+def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path) -> None:
     said = """
 import json
-print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1, "low": 0.0, "high": 0.2}))
+law = {"event": "error_law", "n_views": 90, "exponent": 1.1, "exponent_error": 0.1, "noise": 0.2, "offset": 0.0}
+print(json.dumps({**law, "gained": None, "seconds": 2.0}))
+print(json.dumps({"event": "error_law", "n_views": 90}))
 """
-    reasons: list[str] = []
+    laws: list[LawMeasured] = []
     command = script(said)(tmp_path / "scan.h5", tmp_path / "recon.h5")
-    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, reasons.append)
+    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, laws.append)
     process.finish(stop=lambda: False, hurry=lambda: False)
-    assert reasons == ["90 of 180 views are enough, the others would add 0.10 dB (0.00 to 0.20)"]
-    words = follow_command(small("recon.live=true", "recon.stop_when={psnr_loss: 0.5}"))(tmp_path, tmp_path)
-    assert words[words.index("--enough-loss") + 1] == "0.5" and "--enough-gain" not in words
-    for wrong, says in (
-        ("{}", "needs psnr_gain_per_10_views or psnr_loss"),
-        ("{psnr_loss: 0}", "expected a number > 0"),
-        ("{psnr_loss: 0.5}", "as r2; got fbp"),
-    ):
-        with pytest.raises(ConfigError, match=says):
-            small("recon.live=true", "recon.method=fbp", f"recon.stop_when={wrong}")
-    with pytest.raises(ConfigError, match="needs live: true"):
-        small("recon.stop_when={psnr_loss: 0.5}")
+    (law,) = laws
+    assert (law.n_views, law.exponent, law.noise, law.gained) == (90, 1.1, 0.2, None)
+
+
+@pytest.mark.parametrize(("code", "ended"), [("raise SystemExit(1)", True), ("import time; time.sleep(100)", False)])
+def test_one_that_gives_no_law_any_more_is_known(tmp_path: Path, code: str, ended: bool) -> None:
+    command = script(code)(tmp_path / "scan.h5", tmp_path / "recon.h5")
+    said: list[Event] = []
+    process = LiveReconstruction(command, tmp_path / "recon.log", said.append)
+    wait_until(lambda: len(said) == 1 + ended)
+    assert process.ended is ended
+    process.close()
+    absent = LiveReconstruction([str(tmp_path / "no program")], tmp_path / "other.log", said.append)
+    assert absent.ended
 
 
 @pytest.mark.parametrize("stopped", [False, True])

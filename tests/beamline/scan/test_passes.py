@@ -21,9 +21,11 @@ from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, recover_run
 from beamline.scan.run import run_scan
+from beamline.storage.interrupted import next_step
 from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
+from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.chosen import Asked, choosing
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true, decode
@@ -104,6 +106,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
             assert [values["choice"] for values in decisions] == asked.answers
             assert len(pass_ends_in(file)) in (len(decisions), len(decisions) + 1)
             assert file[layout.STATUS][()].decode() == status
+        assert next_step(ran.folder / "scan.h5") == ""  # it has what it was to take
         so_far = [passes.n_views for passes in asked.asked]
         assert so_far == [values["n_views"] for values in decisions]
 
@@ -201,6 +204,8 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         with h5py.File(path) as file:
             ends, decisions = pass_ends_in(file), decisions_in(file)
+            assert ending_in(file).missing == ()
+        assert next_step(path) == ""
         assert [values["choice"] for values in decisions] == asked.answers
         so_far = [sum(frame.index < end for frame in rows) for end in ends]
         assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]

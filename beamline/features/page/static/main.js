@@ -1,6 +1,7 @@
 // The page of a run: it follows the feed, and fetches pictures as they are needed.
 import { PLANES, Picture, debounce, fetchTile, namesOf, packed, position, usualWindow, windowButtons, windowSliders } from "./picture.js";
 import { Timeline } from "./flags.js";
+import { Passes } from "./passes.js";
 
 const $ = (id) => document.getElementById(id);
 const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "invalid" };
@@ -218,6 +219,9 @@ $("curve").addEventListener("change", drawCurve);
 new ResizeObserver(() => { if (plot) plot.setSize({ width: $("plot").clientWidth, height: 260 }); }).observe($("plot"));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { if (plot) { plot.destroy(); plot = null; drawCurve(); } });
 
+// --- passes ------------------------------------------------------------------------------------------------------
+const passes = new Passes($("passes"), { answer: send });
+
 // --- events ------------------------------------------------------------------------------------------------------
 function onRun(event) {
   const data = JSON.parse(event.data), live = data.source === "recon";
@@ -230,7 +234,8 @@ function onRun(event) {
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
     case "progress": if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
-    case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
+    case "pass_ended": passes.end(data); log(data, `Pass ${data.number} is over, ${data.n_views} views so far`); break;
+    case "next_chosen": passes.choose(data); log(data, `After pass ${data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
     case "warning": log(data, data.message, "warning"); break;
     case "failed": log(data, data.message, "failed"); break;
@@ -310,6 +315,7 @@ function header(now) {
   shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
   $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
   const over = now.status !== "running" && now.status !== "preparing";
+  passes.update(!over, mayAct());
   for (const button of document.querySelectorAll("#verbs button")) button.disabled = over || (button.dataset.verb === "resume" && word !== "paused") || (button.dataset.verb === "pause" && word === "paused");
 }
 
@@ -319,20 +325,23 @@ async function begin() {
   $("run").textContent = facts.run;
   timeline.monitored = facts.monitored;
   $("sinogram-row").max = facts.shape[0] - 1; $("sinogram-row").value = Math.floor(facts.shape[0] / 2);
-  $("verbs").hidden = !(facts.may_act && act);
+  $("verbs").hidden = !mayAct();
 }
 
 // --- verbs -------------------------------------------------------------------------------------------------------
 if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", location.pathname); }
 const act = sessionStorage.getItem("act");
-for (const button of document.querySelectorAll("#verbs button")) button.addEventListener("click", async () => {
-  const verb = button.dataset.verb;
-  if (verb === "abort" && !confirm("Abort the scan? The stage stops at once, and no further frame is taken.")) return;
+function mayAct() { return Boolean(facts?.may_act && act); }
+for (const button of document.querySelectorAll("#verbs button")) button.addEventListener("click", () => {
+  const { verb } = button.dataset;
+  if (verb !== "abort" || confirm("Abort the scan? The stage stops at once, and no further frame is taken.")) send(verb);
+});
+async function send(verb) {
   $("said").textContent = `${verb}: sent`;
   const answer = await fetch(`api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
   const data = await answer.json().catch(() => ({}));
   $("said").textContent = answer.ok ? "" : data.message || `${verb}: refused (${answer.status})`;
-});
+}
 
 // --- feed --------------------------------------------------------------------------------------------------------
 let feed = null, over = false, last = "", handling = Promise.resolve();
@@ -347,6 +356,7 @@ follow();
 function onEnd() {
   over = true; feed.close();
   for (const button of document.querySelectorAll("#verbs button")) button.disabled = true;
+  passes.update(false, false);
   $("viewer-link").hidden = true;
   $("said").textContent = `This page has ended and shows what it had last. ${again()}`;
 }

@@ -15,7 +15,10 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ConfigError
+from beamline.features.epics import ioc
 from beamline.features.epics.ioc import RunServer
+from beamline.page import followed_run
+from beamline.plan.passes import Choice
 from tests.beamline.features.run_folder import FAILED, STARTED, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
 
@@ -41,10 +44,10 @@ def _until(server: RunServer, met: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-def _put(server: RunServer, client: Any, name: str) -> None:
-    """Write true, and look as `beamline ioc` does, until the scan has obeyed."""
+def _put(server: RunServer, client: Any, name: str, value: object = True) -> None:
+    """Write a value, and look as `beamline ioc` does, until the scan has obeyed."""
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(client.put, name, True, timeout=WITHIN)
+        answer = pool.submit(client.put, name, value, timeout=WITHIN)
         _until(server, answer.done)
     answer.result()
 
@@ -124,6 +127,45 @@ def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
             client.put("T:StopScan", True, timeout=WITHIN)
         after = client.get("T:StopScan")
         assert (bool(after), after.severity) == (False, 2) and "There is no run" in after.raw.alarm.message
+
+
+ASKED = {
+    "event": "pass_ended", "time": 1.7e9 + 3, "number": 3, "n_views": 270, "recommended": "next", "wait": 30.0,
+    "options": [
+        {"choice": "next", "seconds": 95.0, "dose": 0.125, "bytes": 2e9, "gain": 0.8, "low": 0.6, "high": 1.0},
+        {"choice": "enough", "seconds": 0.0, "dose": 0.0, "bytes": 0, "gain": None, "low": None, "high": None},
+    ],
+}  # fmt: skip
+
+
+def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = write_run(tmp_path / "2026-01-01T000000_a", STARTED, ASKED)
+    asked: list[tuple[Path, str]] = []
+
+    class Obeyed:
+        def state(self) -> str:
+            return "acquiring"
+
+    def ask(run: Path, verb: str) -> Obeyed:
+        asked.append((run, verb))
+        return Obeyed()
+
+    monkeypatch.setattr(ioc, "ask", ask)
+    monkeypatch.setattr(followed_run, "Verb", Choice)
+    with _served(tmp_path, control=True) as (server, client):
+        with pytest.raises(thread.RemoteError, match="asks nothing now"):
+            client.put("T:Decide", "next", timeout=WITHIN)
+        server.look()
+        assert list(client.get("T:Options")) == ["next", "enough"] and client.get("T:Recommended") == "next"
+        assert client.get("T:OptionDoses")[0] == 12.5 and client.get("T:OptionGainsLow")[0] == 0.6
+        assert client.get("T:OptionGains")[1] != client.get("T:OptionGains")[1]
+        with pytest.raises(thread.RemoteError, match="'wide' is none of next, enough"):
+            client.put("T:Decide", "wide", timeout=WITHIN)
+        assert asked == []
+        _put(server, client, "T:Decide", "enough")
+        assert asked == [(run, "enough")] and client.get("T:Decide") == ""
+        with pytest.raises(TimeoutError):  # a choice is no verb of its own
+            client.put("T:EnoughScan", True, timeout=1.0)
 
 
 def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:

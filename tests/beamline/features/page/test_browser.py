@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from beamline.features.page import app
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
+from beamline.monitor.digest import digest
+from beamline.plan.passes import Choice
 from beamline.storage.volumes.base import bare_record
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import write_reconstruction
+from drivers.base.clock import SystemClock
 from recon.base.volume import VolumeSeries
 from tests.beamline.features.page.chromium import (
     BEAMLINE,
@@ -43,6 +50,75 @@ def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
         browser.until(lambda: canvas_has_picture(browser, "frame"), "it is drawn")
         assert not browser.driver.find_element("id", "verbs").is_displayed()
         assert browser.complaints() == []
+
+
+NEXT, ENOUGH = (
+    {
+        "choice": "next",
+        "frames": 90,
+        "seconds": 90.0,
+        "dose": 0.125,
+        "bytes": 2e9,
+        "gain": 0.8,
+        "low": 0.6,
+        "high": 1.0,
+    },
+    {"choice": "enough", "frames": 0, "seconds": 0.0, "dose": 0.0, "bytes": 0, "gain": 0.0, "low": 0.0, "high": 0.0},
+)
+PASS = {"n_views": 90, "options": [NEXT, ENOUGH], "time": 1.7e9}
+ENDED = {"event": "pass_ended", "recommended": "next", "wait": 30.0, **PASS}
+CHOSEN = {"event": "next_chosen", "choice": "next", "by": "program", "reason": "<b>most a second", **PASS}
+
+
+def test_what_can_be_measured_next_is_shown_and_chosen(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by a page that is opened late, which learns all from the log."""
+    asked: list[tuple[Path, str]] = []
+
+    def ask(run: Path, verb: str) -> Obeyed:
+        asked.append((run, verb))
+        return Obeyed()
+
+    monkeypatch.setattr(app, "Verb", Choice)
+    monkeypatch.setattr(app, "ask", ask)
+    events = [{**ENDED, "number": 1}, {**CHOSEN, "number": 1}, {**ENDED, "number": 2}]
+    log = tmp_path / "events.jsonl"
+    log.write_text("".join(f"{json.dumps(event)}\n" for event in events), encoding="utf-8")
+    find = partial(browser.driver.find_elements, "css selector")
+    frames = frames_of(TwoCylinders())
+    with NXtomoWriter(tmp_path / "scan.h5", ScanInfo("s"), frames[0].counts.shape, clock=SystemClock()) as writer:
+        for frame in frames:
+            writer.append(frame, digest(frame.counts), [])
+        with served(tmp_path, control=True) as page:
+            browser.open(page.addresses.look)
+            browser.until(lambda: "beamline decide CHOICE; after 30 s" in browser.text("passes"), "the scan asks")
+            assert find("#passes button") == []
+            assert page.addresses.act is not None
+            browser.open(page.addresses.act)
+            browser.until(lambda: len(find("#passes button")) == 2, "there is a button for each option")
+            rows = [row.text for row in find("#passes tbody tr")]
+            assert rows == [
+                "next: the next pass of the plan +0.80 (0.60 to 1.00) +0.53 90 s 12.5 % 2.00 GB recommended next",
+                "enough: no further view +0.00 - 0 s 0.0 % 0 MB enough",
+                "1 next program +0.80 - <b>most a second",
+            ]
+            find("#passes button")[1].click()
+            browser.until(lambda: asked == [(tmp_path, "enough")], "the answer reaches the scan")
+            chosen = {**CHOSEN, "number": 2, "choice": "enough", "by": "operator", "predicted": 0.8, "gained": 0.7}
+            with log.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(chosen) + "\n")
+            browser.until(lambda: find("#passes button") == [], "it asks no more")
+            rows = [row.text for row in find("#passes .decisions tbody tr")]
+            assert rows == ["2 enough operator +0.00 - <b>most a second", "1 next program +0.80 +0.70 <b>most a second"]
+            assert browser.complaints() == []
+
+
+class Obeyed:
+    """A verb that the scan has obeyed."""
+
+    def state(self) -> str:
+        return "acquiring"
 
 
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:

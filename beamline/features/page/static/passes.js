@@ -1,0 +1,65 @@
+// What can be measured after a pass, side by side; buttons that answer while the scan asks; what was chosen so far.
+
+const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", wide: "wide views", retake: "bad views again", enough: "no further view" };
+const BY = { program: "program", operator: "operator", plan: "nobody: as planned" };
+
+export class Passes {
+  /** answer: takes a choice, where the person may act and the scan asks. */
+  constructor(box, { answer }) {
+    Object.assign(this, { box, answer, ended: null, asks: false, mayAct: false, decisions: [] });
+  }
+
+  /** A pass is over. */
+  end(data) { this.ended = data; this.asks = (data.wait ?? 0) > 0; this.draw(); }
+
+  /** What was chosen; what an earlier choice has brought stands in this event. */
+  choose(data) {
+    const before = this.decisions.find((each) => each.number === data.judged) ?? this.decisions[this.decisions.length - 1], own = data.options.find((each) => each.choice === data.choice);
+    if (before) { before.predicted = data.predicted ?? before.predicted; before.gained = data.gained ?? before.gained; }
+    this.decisions.push({ ...data, predicted: own?.gain ?? null, gained: null });
+    this.asks = false;
+    this.draw();
+  }
+
+  /** Whether the scan runs, and whether this person may act. */
+  update(runs, mayAct) {
+    if (runs === this.runs && mayAct === this.mayAct) return;
+    Object.assign(this, { runs, mayAct });
+    this.draw();
+  }
+
+  draw() {
+    const find = (name) => this.box.querySelector(name), asks = this.asks && this.runs, { ended } = this;
+    this.box.hidden = !ended && !this.decisions.length;
+    find("thead + tbody").replaceChildren(...(ended ? ended.options : []).map((each) => this.option(each, asks && this.mayAct)));
+    find("small").textContent = ended ? `pass ${ended.number} is over, ${ended.n_views} views so far` : "";
+    const how = this.mayAct ? "Choose above" : "beamline decide CHOICE";
+    const question = asks ? `The scan asks what is next. ${how}; after ${ended.wait.toFixed(0)} s without an answer the plan goes on.` : "";
+    find(".asks").textContent = [ended?.remark, question].filter(Boolean).join(" ");
+    find(".decisions").hidden = !this.decisions.length;
+    find(".decisions tbody").replaceChildren(...this.decisions.map((each) => row([each.number, each.choice, BY[each.by] ?? each.by, db(each.predicted), db(each.gained), each.reason])).reverse());
+  }
+
+  option(each, asked) {
+    const { choice, gain, low, high, seconds } = each, marked = choice === this.ended.recommended;
+    const range = low === null || high === null || low === high ? "" : ` (${low.toFixed(2)} to ${high.toFixed(2)})`;
+    const rate = gain === null || !seconds ? "-" : db(60 * gain / seconds);
+    const made = row([MEANINGS[choice] ? `${choice}: ${MEANINGS[choice]}` : choice, gain === null ? "not known" : db(gain) + range, rate, `${seconds.toFixed(0)} s`, `${(100 * each.dose).toFixed(1)} %`, size(each.bytes), marked ? "recommended" : ""]);
+    if (marked) made.className = "recommended";
+    if (asked) {
+      const button = document.createElement("button");
+      button.textContent = choice;
+      button.addEventListener("click", () => this.answer(choice));
+      made.insertCell().append(button);
+    }
+    return made;
+  }
+}
+
+function row(texts) {
+  const made = document.createElement("tr");
+  for (const text of texts) made.insertCell().textContent = text;
+  return made;
+}
+function db(value) { return value === null || value === undefined ? "-" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`; }
+function size(bytes) { return bytes < 1e9 ? `${(bytes / 1e6).toFixed(0)} MB` : `${(bytes / 1e9).toFixed(2)} GB`; }

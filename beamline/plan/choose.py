@@ -1,0 +1,143 @@
+"""Choose: what can be measured after a pass, what each choice costs and would bring, and which one a wish asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from beamline.plan.passes import Choice, Passes
+from beamline.plan.plan import Block, Timeline
+from drivers.base.frame import FrameKind
+from recon.assess.error_law import ErrorLaw, Gain
+
+
+@dataclass(frozen=True)
+class PassOption:
+    """One choice with what it costs, and the gain in dB of PSNR that is predicted of it (NaN: no law is known).
+
+    Attributes:
+        frames, seconds, bytes: that it takes.
+        dose: share of the exposures of the whole plan with light on the sample.
+        low, high: ends of what is likely.
+    """
+
+    choice: Choice
+    frames: int
+    seconds: float
+    dose: float
+    bytes: int
+    gain: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What a scan is to reach; None: no such wish.
+
+    Attributes:
+        quality_db: dB of PSNR that the volume may stay below that of the whole plan.
+        seconds: of the scan, at most.
+        dose: share of the plan's, at most.
+    """
+
+    quality_db: float | None = None
+    seconds: float | None = None
+    dose: float | None = None
+
+
+@dataclass(frozen=True)
+class Spent:
+    """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
+
+    seconds: float
+    dose: float
+
+
+def frame_dose(timeline: Timeline) -> float:
+    """The share of one frame in the exposures of the whole plan with light on the sample."""
+    return 1 / sum(block.n for block in timeline.blocks if block.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW))
+
+
+def options(
+    passes: Passes, law: ErrorLaw | None, timeline: Timeline, seconds_of: Callable[[Block], float]
+) -> tuple[PassOption, ...]:
+    """What is possible now; ENOUGH, which always is, comes last.
+
+    Args:
+        law: of the frames so far, as many as its `n_views`.
+        seconds_of: duration of a block, from where the stage stands.
+    """
+
+    def option(choice: Choice, frames: int, seconds: float, **measured: Any) -> PassOption:
+        gain = Gain(math.nan, math.nan, math.nan) if law is None else law.gain(**measured)
+        gains = gain.mean + 0.0, gain.low + 0.0, gain.high + 0.0  # never -0.0
+        n_bytes = frames * timeline.total_bytes // timeline.n_frames
+        return PassOption(choice, frames, seconds, frames * frame_dose(timeline), n_bytes, *gains)
+
+    offered, n = [], passes.retakes
+    if passes.to_come:
+        following, last = passes.to_come[0], passes.done[-1]
+        offered.append(option(Choice.NEXT, following.left, seconds_of(following), views=following.left))
+        if passes.may_repeat:
+            offered.append(option(Choice.AGAIN, last.left, seconds_of(last), again=last.left))
+    if passes.wide:
+        frames, seconds = sum(block.left for block in passes.wide), sum(map(seconds_of, passes.wide))
+        offered.append(option(Choice.WIDE, frames, seconds, wide=True))
+    if n:
+        offered.append(option(Choice.RETAKE, n, n * timeline.retake_seconds / timeline.plan.retakes, views=n))
+    return (*offered, PassOption(Choice.ENOUGH, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0))
+
+
+def choose(offered: Sequence[PassOption], wish: Wish, spent: Spent, rest: Gain) -> tuple[Choice, str]:
+    """The choice with the best gain a second until the wish is met, and why.
+
+    The next pass of the plan keeps its place unless another choice is better beyond the uncertainty of both.
+
+    Args:
+        offered: with known gains.
+        rest: by all that the plan still has.
+    """
+    if wish.quality_db is not None and rest.mean <= wish.quality_db:
+        return Choice.ENOUGH, f"all that is left would add {_in_words(rest)}; {wish.quality_db:g} dB may lack"
+    useful = [one for one in offered if one.gain > 0]
+    within = [one for one in useful if not _beyond(one, wish, spent)]
+    if not within:
+        reasons = [_beyond(one, wish, spent) for one in useful]
+        return Choice.ENOUGH, next(iter(reasons), "nothing that is left would improve the volume")
+    best = max(within, key=lambda one: one.gain / one.seconds)
+    following = next((one for one in within if one.choice is Choice.NEXT), best)
+    if best.low / best.seconds <= following.high / following.seconds:
+        best = following
+    gain = _in_words(Gain(best.gain, best.low, best.high))
+    return best.choice, f"{gain} in {best.seconds:.0f} s; nothing else is surely better for its time"
+
+
+def rest_gain(passes: Passes, law: ErrorLaw, first: int = 0) -> Gain:
+    """The gain by all that the plan still has, once the first so many passes to come are taken."""
+    taken, left = (sum(block.left for block in part) for part in (passes.to_come[:first], passes.to_come[first:]))
+    law = replace(law, n_views=law.n_views + taken)
+    return law.gain(views=left + passes.retakes, wide=bool(passes.wide))
+
+
+def next_is_sure(passes: Passes, offered: Sequence[PassOption], wish: Wish, spent: Spent, law: ErrorLaw) -> bool:
+    """Whether a law of fewer views suffices: by it the next pass is chosen, and surely does not meet the wish."""
+    choice, _ = choose(offered, wish, spent, rest_gain(passes, law))
+    later = rest_gain(passes, law, first=1)
+    return choice is Choice.NEXT and (wish.quality_db is None or later.low > wish.quality_db)
+
+
+def _beyond(one: PassOption, wish: Wish, spent: Spent) -> str:
+    """What of the wish an option would exceed, in words; "" if nothing."""
+    seconds, dose = spent.seconds + one.seconds, 100 * (spent.dose + one.dose)
+    if wish.seconds is not None and seconds > wish.seconds:
+        return f"{one.choice} would end the scan after {seconds:.0f} s; {wish.seconds:g} s are wished"
+    if wish.dose is not None and dose > 100.0000001 * wish.dose:
+        return f"{one.choice} would make it {dose:.3g} % of the plan's dose; {100 * wish.dose:g} % are wished"
+    return ""
+
+
+def _in_words(gain: Gain) -> str:
+    return f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"

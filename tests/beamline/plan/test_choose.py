@@ -1,0 +1,187 @@
+"""What is measured next: the best gain a second until the wish is met, and never beyond a wish."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from beamline.plan.choose import PassOption, Spent, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.passes import Choice, Passes, pass_blocks
+from beamline.plan.plan import Block, Mode, Timeline
+from beamline.plan.timeline import block_seconds
+from recon.assess.error_law import ErrorLaw, Gain
+from tests.beamline.fakes import FakeInstrument
+
+NOTHING = Spent(0.0, 0.0)
+QUALITY = Wish(quality_db=1.0)
+LAW = ErrorLaw(12, 1.0, 0.1, 0.3, 0.2)
+
+
+def scan(views: int = 48, passes: int = 4, wide: int = 0) -> Timeline:
+    instrument = FakeInstrument()
+    plan = instrument.plan(views, passes=passes)
+    return instrument.worked_out(replace(plan, retake_share=0.25, wide_views=wide, wide_places=(-1.0, 1.0)[: 2 * wide]))
+
+
+def seconds_of(block: Block) -> float:
+    instrument = FakeInstrument()
+    return block_seconds(block, instrument.stage.limits, instrument.camera.timing, 0.05)
+
+
+def after(timeline: Timeline, n: int, retakes: int = 0) -> Passes:
+    each, wide = pass_blocks(timeline.views, 0), tuple(block for block in timeline.blocks if block.aside)
+    return Passes(each[:n], each[n:], wide, retakes)
+
+
+def test_options_are_what_is_possible_with_what_each_takes() -> None:
+    timeline = scan(wide=5)
+    offered = {one.choice: one for one in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
+    assert list(offered) == [Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.RETAKE, Choice.ENOUGH]
+    assert [one.frames for one in offered.values()] == [12, 12, 10, 3, 0]
+    assert offered[Choice.NEXT].dose == pytest.approx(12 / 58) and offered[Choice.WIDE].dose == pytest.approx(10 / 58)
+    assert offered[Choice.NEXT].bytes == pytest.approx(12 * timeline.total_bytes / timeline.n_frames, abs=1)
+    assert offered[Choice.NEXT].seconds == seconds_of(pass_blocks(timeline.views, 0)[1])
+    assert offered[Choice.RETAKE].seconds == pytest.approx(3 / 12 * timeline.retake_seconds)
+    gains = {choice: (one.gain, one.low, one.high) for choice, one in offered.items()}
+    assert gains == {
+        Choice.NEXT: tuple(vars(LAW.gain(views=12)).values()), Choice.AGAIN: tuple(vars(LAW.gain(again=12)).values()),
+        Choice.WIDE: tuple(vars(LAW.gain(wide=True)).values()), Choice.RETAKE: tuple(vars(LAW.gain(views=3)).values()),
+        Choice.ENOUGH: (0, 0, 0),
+    }  # fmt: skip
+
+
+def test_what_is_not_possible_is_no_option_and_without_a_law_no_gain_is_known() -> None:
+    timeline = scan()
+    last = options(after(timeline, 4), LAW, timeline, seconds_of)
+    assert [one.choice for one in last] == [Choice.ENOUGH]
+    unknown = options(after(timeline, 1), None, timeline, seconds_of)
+    assert [one.choice for one in unknown] == [Choice.NEXT, Choice.AGAIN, Choice.ENOUGH]
+    assert [math.isnan(one.gain) for one in unknown] == [True, True, False]
+    instrument = FakeInstrument()
+    steps = instrument.timeline(10, Mode.STEP)
+    each = pass_blocks(steps.views, 4)  # the last one has two views, so four take too much
+    assert Choice.AGAIN not in {one.choice for one in options(Passes(each[:1], each[1:]), LAW, steps, seconds_of)}
+
+
+def option(choice: Choice, gain: float, seconds: float = 10.0, off: float = 0.0, dose: float = 0.1) -> PassOption:
+    return PassOption(choice, 12, seconds, dose, 10**6, gain, gain - off, gain + off)
+
+
+NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("offered", "wish", "spent", "rest", "chosen", "why"),
+    [
+        ([NEXT], QUALITY, NOTHING, 1.01, Choice.NEXT, "1.00 dB (0.80 to 1.20) in 10 s"),
+        ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would add 1.00 dB"),
+        ([NEXT], Wish(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
+        ([NEXT], Wish(seconds=100), Spent(90.0, 0), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], Wish(seconds=100), Spent(91.0, 0), 9, Choice.ENOUGH, "after 101 s; 100 s are wished"),
+        ([NEXT], Wish(dose=0.5), Spent(0, 0.4), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], Wish(dose=0.5), Spent(0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; 50 % are wished"),
+        ([NEXT], Wish(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "may lack"),  # whichever is met first
+        ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else is surely better"),
+        ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else"),
+        ([NEXT, option(Choice.AGAIN, 1.3)], QUALITY, NOTHING, 9, Choice.AGAIN, "1.30 dB"),
+        ([NEXT, option(Choice.AGAIN, 1.3, off=0.2)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else"),
+        ([NEXT, option(Choice.WIDE, 1.0, 5.0)], QUALITY, NOTHING, 9, Choice.WIDE, "1.00 dB (1.00 to 1.00) in 5 s"),
+        ([NEXT, option(Choice.RETAKE, 0.1, 0.5)], QUALITY, NOTHING, 9, Choice.RETAKE, "0.10 dB"),
+        # The next pass takes too long, a few retakes do not.
+        ([NEXT, option(Choice.RETAKE, 0.01, 1)], Wish(seconds=5), NOTHING, 9, Choice.RETAKE, "0.01 dB"),
+        ([option(Choice.WIDE, 0.0)], Wish(seconds=99), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+        ([option(Choice.NEXT, 0.0), option(Choice.WIDE, 1.0)], Wish(dose=1), NOTHING, 9, Choice.WIDE, "1.00 dB"),
+        ([], Wish(dose=1), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+    ],
+)
+def test_the_choice_and_its_reason(
+    offered: list[PassOption], wish: Wish, spent: Spent, rest: float, chosen: Choice, why: str
+) -> None:
+    choice, reason = choose([*offered, ENOUGH], wish, spent, Gain(rest, 0.0, 9.0))
+    assert choice is chosen and why in reason
+
+
+def test_the_rest_is_all_that_the_plan_still_has() -> None:
+    timeline = scan(wide=5)
+    assert rest_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
+    assert rest_gain(after(timeline, 1, retakes=3), LAW, first=1) == replace(LAW, n_views=24).gain(views=27, wide=True)
+    assert rest_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("done", "wish", "error", "sure"),
+    [
+        (1, Wish(1.0), 0.1, True),  # after the next one the rest of 24 still adds 2.4 dB at least
+        (1, Wish(2.5), 0.1, False),
+        (1, Wish(1.0), 0.4, False),
+        (2, Wish(1.0), 0.1, False),
+        (1, Wish(4.0), 0.0, False),  # it is chosen, but then met
+        (1, Wish(7.0), 0.0, False),  # met already
+        (1, Wish(seconds=99), 0.1, True),
+        (1, Wish(seconds=9), 0.1, False),
+    ],
+)
+def test_a_next_pass_is_sure_only_if_the_wish_is_not_met_after_it_even_at_the_low_end(
+    done: int, wish: Wish, error: float, sure: bool
+) -> None:
+    timeline = scan()
+    law, passes = ErrorLaw(12 * done, 1.0, error, 0.0), after(timeline, done)
+    offered = options(passes, law, timeline, seconds_of)
+    assert next_is_sure(passes, offered, wish, Spent(4.0, 0.0), law) is sure
+
+
+LAWS = st.builds(
+    ErrorLaw, st.just(12), st.floats(0, 2), st.floats(0, 0.3), st.floats(0, 0.6), st.floats(0, 0.4)
+)  # fmt: skip
+WISHES = st.builds(
+    Wish, st.none() | st.floats(0.01, 10), st.none() | st.floats(1, 100), st.none() | st.floats(0.05, 1)
+)  # fmt: skip
+TIMELINE = scan(wide=5)
+
+
+def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, Spent]:
+    """What is chosen to the end, by a law that stays: the choices, views and what was spent."""
+    passes, choices = after(TIMELINE, 1, retakes=3), list[Choice]()
+    seconds, dose = seconds_of(passes.done[0]), 12 * frame_dose(TIMELINE)
+    while passes.to_come or passes.wide or passes.retakes:
+        so_far = replace(law, n_views=passes.n_views)
+        offered = options(passes, so_far, TIMELINE, seconds_of)
+        choice, _ = choose(offered, wish, Spent(seconds, dose), rest_gain(passes, so_far))
+        choices.append(choice)
+        if choice is Choice.ENOUGH:
+            break
+        one = next(one for one in offered if one.choice is choice)
+        assert one.gain > 0  # nothing that brings nothing is taken before ENOUGH
+        seconds, dose = seconds + one.seconds, dose + one.dose
+        passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
+    return choices, passes.n_views, Spent(seconds, dose)
+
+
+@given(LAWS, WISHES)
+def test_a_scan_that_does_stays_within_its_wishes_and_the_plan(law: ErrorLaw, wish: Wish) -> None:
+    choices, views, spent = taken(law, wish)
+    first = seconds_of(after(TIMELINE, 1).done[0])
+    assert views <= 48 and choices.count(Choice.WIDE) <= 1
+    assert spent.seconds <= max(first, wish.seconds or math.inf) * (1 + 1e-9)
+    assert spent.dose <= max(12 * frame_dose(TIMELINE), wish.dose or math.inf) * (1 + 1e-6)
+
+
+@given(LAWS, st.floats(0.01, 10), st.floats(1, 3))
+def test_with_less_quality_to_reach_no_more_views_are_taken(law: ErrorLaw, wished: float, more: float) -> None:
+    assert taken(law, Wish(quality_db=more * wished))[1] <= taken(law, Wish(quality_db=wished))[1]
+
+
+@given(LAWS, st.floats(0.05, 1), st.floats(1, 3))
+def test_with_more_dose_to_spend_no_less_is_reached(law: ErrorLaw, dose: float, more: float) -> None:
+    assume(law.exponent > 0.05)
+    few, many = (taken(law, Wish(dose=share))[2].dose for share in (dose, min(1.0, more * dose)))
+    assert few <= many * (1 + 1e-6)
+
+
+@given(LAWS)
+def test_noise_alone_is_worth_the_same_angles_only_where_it_is_better_than_new_ones(law: ErrorLaw) -> None:
+    """New angles lower the noise, too: with an exponent of 1 or more they are never worse."""
+    choices, _, _ = taken(replace(law, exponent=max(1.0, law.exponent)), Wish())
+    assert Choice.AGAIN not in choices

@@ -1,0 +1,205 @@
+"""Scans that decide: a live reconstruction's laws, or the operator, choose what is measured; the file keeps why."""
+
+import json
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.config.load import Config
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Event
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import ConnectedDevices
+from beamline.plan.passes import Choice
+from beamline.scan import preflight
+from beamline.scan.control import State, Verb, ask, state_of
+from beamline.scan.live_process import LiveCommand
+from beamline.scan.preflight import scan_info
+from beamline.scan.resume import open_for_resume
+from beamline.scan.run import run_scan
+from beamline.storage.writers import layout
+from beamline.storage.writers.nxtomo import ScanInfo
+from tests.beamline.fakes import FakeInstrument
+from tests.beamline.ran import Ran
+from tests.clock import wait_until
+
+PASSES = (
+    "scan.angles={scheme: interlaced, views: 12, passes: 4}",
+    "scan.period_s=2",
+    "recon.live=true",
+    "scan.decide=do",
+)
+LIVE = """
+import json, pathlib, sys, time
+laws = json.loads(sys.argv[3])
+events = pathlib.Path(sys.argv[1]).with_name("events.jsonl")
+for n, law in enumerate(laws, start=1):
+    while sum('"block_done"' in line and '"projection"' in line for line in events.read_text().splitlines()) < n:
+        if '"scan_done"' in events.read_text():
+            sys.exit(1)
+        time.sleep(0.02)
+    print(json.dumps({"event": "error_law", "n_views": 3 * n, "noise": 0.1, "offset": 0.0, **law}), flush=True)
+while '"scan_done"' not in events.read_text():
+    time.sleep(0.02)
+print(json.dumps({"event": "done", "output": sys.argv[2]}), flush=True)
+"""
+
+
+def live(*laws: tuple[float, float, float | None]) -> Callable[[Path, Path], Sequence[str]]:
+    """A live reconstruction that measures these laws after the passes: exponent, its error, and dB gained."""
+    each = [{"exponent": exponent, "exponent_error": error, "gained": gained} for exponent, error, gained in laws]
+    ready = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
+    return lambda scan, output: [sys.executable, "-c", ready + LIVE, str(scan), str(output), json.dumps(each)]
+
+
+def written(ran: Ran) -> tuple[list[int], list[dict[str, Any]]]:
+    """The ends of passes in the file of a run, and its decisions."""
+    with h5py.File(ran.folder / "scan.h5") as file:
+        return file[layout.PASS_ENDS][()].tolist(), [json.loads(line) for line in file[layout.DECISIONS].asstr()[()]]
+
+
+def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(), *PASSES, live=live((1.0, 0.5, None), (1.0, 0.5, 2.5), (0.5, 0.0, 1.0)))
+    assert type(ran.error) is ScanStopped and "Stopped after 9 of 12 projections: the views are enough" in str(
+        ran.error
+    )
+    ends, decisions = written(ran)
+    assert ends == [8, 11, 14]  # after 3 darks and 2 flats
+    assert [(each["choice"], each["by"]) for each in decisions] == [("next", "program")] * 2 + [("enough", "program")]
+    assert (decisions[1]["predicted"], decisions[1]["gained"]) == (decisions[0]["options"][0]["gain"], 2.5)
+    assert [each.data | {"time": 0} for each in ran.of("next_chosen")] == [
+        {name: value for name, value in each.items() if value is not None} | {"time": 0} for each in decisions
+    ]
+    assert [each.data["number"] for each in ran.of("pass_ended")] == [1, 2, 3]
+    ran.assert_good_file(14, "stopped")
+    assert len(ran.of("recon_done")) == 1  # its volume is waited for
+
+
+def test_what_is_better_than_the_next_pass_is_measured_in_place_of_the_last_one(tmp_path: Path) -> None:
+    noisy = live((0.1, 0.0, None), (0.1, 0.0, None), (0.1, 0.0, None))
+    ran = Ran(
+        tmp_path, FakeInstrument(), *PASSES, "scan.wish={dose: 1}",
+        live=lambda scan, output: [word.replace('"noise": 0.1', '"noise": 0.8') for word in noisy(scan, output)],
+    )  # fmt: skip
+    assert ran.error is None
+    ends, decisions = written(ran)
+    assert ends == [8, 11, 14, 17] and [each["choice"] for each in decisions] == ["again"] * 3
+    assert ran.result.n_frames == 19
+
+
+def gone(scan: Path, output: Path) -> Sequence[str]:
+    return [sys.executable, "-c", "raise SystemExit(1)"]
+
+
+@pytest.mark.parametrize(
+    ("command", "cone", "why"),
+    [
+        (gone, False, "the live reconstruction has ended"),
+        (None, False, "there is no live reconstruction"),
+        (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
+    ],
+)
+def test_where_nothing_can_be_predicted_the_plan_stays_as_it_is_and_one_sentence_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: LiveCommand | None, cone: bool, why: str
+) -> None:
+    def info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
+        return replace(scan_info(config, instrument), source_distance_mm=10.0 if cone else None)
+
+    monkeypatch.setattr(preflight, "scan_info", info)
+    ran = Ran(tmp_path, FakeInstrument(), *PASSES, "scan.wish={seconds: 1}", live=command)
+    assert ran.error is None
+    ran.assert_good_file(19, "complete")
+    ends, (only,) = written(ran)
+    assert ends == [8, 11, 14, 17] and (only["by"], only["choice"], only["reason"]) == ("plan", "next", why)
+    assert len(ran.of("next_chosen")) == 1
+
+
+def test_without_decisions_nothing_is_predicted_or_written(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(), *PASSES[:2])
+    ran.assert_good_file(19, "complete")
+    assert not ran.of("pass_ended")
+    with h5py.File(ran.folder / "scan.h5") as file:
+        assert layout.PASS_ENDS not in file and layout.DECISIONS not in file
+
+
+def test_the_operator_is_asked_with_a_closed_shutter_and_answers_from_another_terminal(tmp_path: Path) -> None:
+    instrument, answers, seen = FakeInstrument(), [Choice.AGAIN, Choice.ENOUGH], list[tuple[str, bool]]()
+
+    def answer(event: Event) -> None:
+        if event.event == "state" and event.data["state"] == State.ASKING:
+            (run,) = tmp_path.iterdir()
+            seen.append((event.data["state"], instrument.is_open))
+            wait_until(lambda: state_of(run) is State.ASKING)
+            ask(run, answers.pop(0))
+
+    ran = Ran(
+        tmp_path, instrument, *PASSES, "scan.decide=ask", "scan.wait_s=10",
+        live=live((1.0, 0.1, None), (1.0, 0.1, None)), heard=answer,
+    )  # fmt: skip
+    assert type(ran.error) is ScanStopped and "the operator chose it" in str(ran.error)
+    assert seen == [("asking", False)] * 2
+    assert [each.data["by"] for each in ran.of("next_chosen")] == ["operator"] * 2
+    ran.assert_good_file(11, "stopped")
+    ran.assert_safe()
+
+
+def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
+    instrument, seen = FakeInstrument(), list[tuple[str, bool]]()
+
+    def react(event: Event) -> None:
+        state = event.data.get("state")
+        if event.event != "state" or state not in (State.ASKING, State.PAUSED):
+            return
+        (run,) = tmp_path.iterdir()
+        wait_until(lambda: state_of(run) is state)
+        seen.append((state, instrument.is_open))
+        ask(run, Verb.RESUME if state is State.PAUSED else Verb.PAUSE if len(seen) == 1 else Choice.ENOUGH)
+
+    asks = ("scan.decide=ask", "scan.wait_s=300", "scan.mode=step", "scan.pass_views=5")
+    ran = Ran(tmp_path, instrument, *PASSES[1:], *asks, live=live((1.0, 0.1, None)), heard=react)
+    assert isinstance(ran.error, ScanStopped)
+    assert seen == [("asking", False), ("paused", False), ("asking", False)]
+    assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
+    ran.assert_good_file(10, "stopped")
+
+
+@pytest.mark.parametrize("verb", ["stop", "abort"])
+def test_a_stop_or_an_abort_ends_the_question(tmp_path: Path, verb: str) -> None:
+    stop = StopRequest()
+
+    def end(event: Event) -> None:
+        if event.event == "state" and event.data["state"] == State.ASKING:
+            threading.Timer(0.1, getattr(stop, verb)).start()
+
+    ran = Ran(
+        tmp_path, FakeInstrument(), *PASSES, "scan.decide=ask", "scan.wait_s=300", live=live((1.0, 0.1, None)),
+        heard=end, stop=stop,
+    )  # fmt: skip
+    assert isinstance(ran.error, ScanStopped) and not ran.of("next_chosen")
+    assert ran.states[-1] == ("stopped" if verb == "stop" else "aborted")
+    ran.assert_safe()
+
+
+def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_took(tmp_path: Path) -> None:
+    laws = live((1.0, 0.1, None), (1.0, 0.1, None), (1.0, 0.1, None))
+    stop, words = StopRequest(), (*PASSES, "scan.wish={seconds: 28}")
+    ran = Ran(tmp_path, FakeInstrument(at={12: stop.stop}), *words, live=laws, stop=stop)  # in the third pass
+    assert isinstance(ran.error, ScanStopped) and len(written(ran)[1]) == 2
+    instrument, events = FakeInstrument(), list[Event]()
+    instrument.clock.sleep(1000.0)  # which does not count
+    with open_for_resume(ran.folder) as series:
+        with h5py.File(ran.folder / "scan.h5") as file:
+            assert series.seconds == pytest.approx(np.ptp(file[layout.TIME][()]))
+        last = live((1.0, 0.1, None))
+        words_of = lambda scan, output: [word.replace("3 * n", "9") for word in last(scan, output)]  # noqa: E731
+        with pytest.raises(ScanStopped, match="next would end the scan after"):
+            run_scan(series.config, series, [events.append], instrument=instrument.connected(), live=words_of)
+    (chosen,) = [event.data for event in events if event.event == "next_chosen"]
+    assert (chosen["number"], chosen["n_views"], chosen["choice"]) == (3, 9, "enough")
