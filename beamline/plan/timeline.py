@@ -208,8 +208,8 @@ def _blocks(
     yield views
     row += views.n
     for mm in plan.wide_places:
-        block = wide_block(views, plan.wide_views, mm)
-        yield replace(block, first_trigger=row, stored=_stored(plan, row - views.first_trigger, block.n))
+        stored = frozenset(i for i in range(plan.wide_views) if row - views.first_trigger + i in plan.stored)
+        yield replace(wide_block(views, plan.wide_views, mm), first_trigger=row, stored=stored)
         row += plan.wide_views
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
@@ -228,7 +228,7 @@ def _static(
 
 def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage: StageLimits) -> Block:
     counts = flight.counts() if flight else np.rint((plan.angles - scale.origin) / scale.per_count).astype(np.int64)
-    angles, stored = scale.angles(counts), _stored(plan, 0, plan.angles.size)
+    angles, stored = scale.angles(counts), plan.stored & {*range(counts.size)}
     if flight is None:
         return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period, stored=stored)
     # A pulse generator's speed is a whole number of counts a second, which fixes the possible periods.
@@ -237,11 +237,6 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
     taxi = max(taxi_angle(speed, stage.acceleration, step), before)
     return Block(FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed, taxi, stored)
-
-
-def _stored(plan: ScanPlan, first: int, n: int) -> frozenset[int]:
-    """Those of `n` frames that are stored, counted from 0; `first`: the trigger of the first one within the views."""
-    return frozenset(range(n)) & {trigger - first for trigger in plan.stored}
 
 
 def _half_width(camera: CameraTiming, axis_col: float | None) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,7 +65,6 @@ class Acquisition:
             devices, camera_settings, settle, clock, stop, sink, self._supervision, self.wait_while_paused
         )
         self._done: list[RecordedBlock] = []
-        self._retaken = 0  # views, or tried
         self.recovered = 0
         """Views that gave no frame at first, but when they were repeated."""
         self.unsafe = False
@@ -119,12 +118,11 @@ class Acquisition:
         self._raise_outcome()
 
     def _blocks(self) -> Iterator[Frame]:
-        plan = self._timeline.plan
-        place, filter_ = plan.filter, self._devices.filter
+        place, filter_ = self._timeline.plan.filter, self._devices.filter
         if filter_ is not None and place is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
             filter_.put(place)
-        energy, monochromator = plan.energy, self._devices.monochromator
+        energy, monochromator = self._timeline.plan.energy, self._devices.monochromator
         if monochromator is not None and energy is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
             monochromator.move_to(energy)
@@ -160,7 +158,11 @@ class Acquisition:
         rest = replace(views, stored=frozenset(range(views.n)) - triggers_of(*passes.done) | views.stored)
         due = [*([rest] if rest.left else []), *(wide if choice is Choice.WIDE else [])]
         while True:
-            yield from self._of_pass(due, passes.done[-1] in passes.done[:-1])
+            again = passes.done[-1] in passes.done[:-1]
+            for block in due:
+                done = RecordedBlock(block, BlockTally(), again)
+                yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(done)
+                self._recover(done.taken.rows)
             if choice is Choice.RETAKE:
                 yield from self._again(views)
             if self._stop.stopping:
@@ -177,16 +179,6 @@ class Acquisition:
                 return
             before, passes = passes, passes.after(choice)
             due = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
-
-    def _of_pass(self, blocks: Sequence[Block], again: bool) -> Iterator[Frame]:
-        """Views, once more or not, and wide views. A view that an earlier pass lacks is then not missing."""
-        for block in blocks:
-            if block.kind is FrameKind.WIDE_VIEW:
-                yield from self._wide(block)
-                continue
-            done = RecordedBlock(block, BlockTally(), again)
-            yield from self._block(done)
-            self._recover(done.taken.rows)
 
     def _block(self, done: RecordedBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
@@ -212,12 +204,11 @@ class Acquisition:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
         beyond = middle_of_exposure(views)[triggers]
-        first = views.n + self._retaken
-        self._retaken += len(retakes)
+        earlier = sum(done.block.n for done in self._done if done.again and done not in self._done_views)
         done = RecordedBlock(retake_block(views, triggers), BlockTally(), again=True)
         for frame in self._block(done):
             i = frame.trigger
-            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, first + i
+            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + earlier + i
             if frame.kind is FrameKind.INVALID:
                 yield replace(frame, trigger=trigger)
                 continue
@@ -225,8 +216,8 @@ class Acquisition:
                 trigger = retakes[i].trigger
                 self._recover([trigger])
             rows_astray = [astray_row for astray_row, _ in done.taken.astray.get(i, [])]
-            earlier = -1 if frame.replaces in rows_astray else frame.replaces
-            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, earlier))
+            tried = -1 if frame.replaces in rows_astray else frame.replaces
+            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, tried))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 

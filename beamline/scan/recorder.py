@@ -16,9 +16,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from queue import Empty, Full, Queue
-from typing import Any
 
 import numpy as np
 
@@ -143,7 +141,6 @@ class Recorder:
         self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
         pause, views = pause or PauseRequest(), timeline.views
-        self._n_views = views.n
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
         self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
@@ -182,9 +179,9 @@ class Recorder:
             self.wait()
             self._retaking = False
 
-    def decided(self, values: Mapping[str, Any]) -> None:
+    def decided(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass: the values of its event, if the scan decides."""
-        self._enqueue(partial(self._writer.decided, values))
+        self._enqueue(lambda: self._writer.decided(values))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; no frame may be put afterwards."""
@@ -222,13 +219,11 @@ class Recorder:
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each. A frame that
-        was taken again is not taken a third time."""
+        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
         warned = self._frames(
             lambda flag: flag.level is Level.WARN and flag.check in self._consequences.retaken_warnings
         )
-        rows = sorted((self._alarmed | warned) & self._triggers.keys())
-        return [Retake(row, self._triggers[row]) for row in rows if self._triggers[row] < self._n_views]
+        return [Retake(row, self._triggers[row]) for row in sorted((self._alarmed | warned) & self._triggers.keys())]
 
     @property
     def _alarmed(self) -> set[int]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -206,8 +207,8 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], tuple[str, ...]]:
     """Triggers of the views, and of the wide ones, that need not be taken: those in the files, and those that the scan
-    decided against. And what it chose after each pass that ended."""
-    views, wide, since, choices, ended, decides = set[int](), set[int](), set[int](), list[str](), 0, False
+    decided against. And what it chose after each pass that ended; where it says nothing, the plan went on."""
+    views, wide, since, chosen, ended, decides = set[int](), set[int](), set[int](), dict[Any, Any](), 0, False
     for part in parts:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             decides, ends = layout.PASS_ENDS in file, pass_ends_in(file)
@@ -215,19 +216,19 @@ def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], 
             views |= views_in(file)
             wide |= views_in(file, kind=FrameKind.ALIGNMENT)  # as which wide views are written
             ended += ends.size
-            chosen = (str(values.get("choice")) for values in decisions_in(file))
-            choices = [*choices, *chosen, *[Choice.NEXT] * ended][:ended]
+            chosen |= {values.get("number"): values.get("choice") for values in decisions_in(file)}
     if not decides:
         return views, wide, ()
-    plan = replace(plan_of(config), choices=(*choices,))
+    choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, ended + 1))
+    plan = replace(plan_of(config), choices=choices)
     stage, camera, to_counts = connect.describe(config)
     passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
     missing = triggers_of(*passes.done) - views | triggers_of(*passes.to_come)
-    if choices[-1:] == [Choice.AGAIN]:
+    if choices[-1:] == (Choice.AGAIN,):
         missing |= triggers_of(passes.done[-1]) - since
     n = plan.angles.size
     rejected = range(n, n + plan.wide_views * len(plan.wide_places)) if Choice.ENOUGH in choices else ()
-    return {*range(n)} - missing, wide.union(rejected), plan.choices
+    return {*range(n)} - missing, wide.union(rejected), choices
 
 
 def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:

@@ -480,8 +480,9 @@ class _Run:
         if not most:
             return (), 0
         recorder.wait()
-        lost = [Retake(-1, trigger) for trigger in missing]
-        bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
+        lost, n = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
+        once = [view for view in recorder.views_to_retake if view.trigger < n]  # others were taken again already
+        bad = sorted([*once, *lost], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
 
 

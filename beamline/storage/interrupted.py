@@ -16,6 +16,7 @@ from beamline.storage.parts import decisions_in, files_with_frames, joined_file_
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
+from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 
 
@@ -117,15 +118,14 @@ def _died(sure: bool) -> str:
 
 def _lacks_views(run: Path) -> bool:
     """Whether the files of a run, all closed, lack views of its plan."""
-    planned, views, chosen, complete = 0, set[int](), set[str](), False
+    planned, views, rejected = 0, set[int](), False  # rejected: the scan decided against views
     try:
         for part in files_with_frames(run):
             with hdf5.open_hdf5(part) as file, hdf5.readable(part):
                 planned = views_planned(file) or 0
                 views |= views_in(file)
-                chosen |= {str(values.get("choice")) for values in decisions_in(file)}
-                complete = ending_in(file).status == "complete"
+                enough = any(values.get("choice") == "enough" for values in decisions_in(file))
+                rejected |= layout.PASS_ENDS in file and (enough or ending_in(file).status == "complete")
     except (DataError, *hdf5.ALTERED):
         return False
-    rejected = "enough" in chosen or ("again" in chosen and complete)  # which takes the place of other views
     return len(views) < planned and not rejected

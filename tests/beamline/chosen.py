@@ -20,6 +20,7 @@ Chooser = Callable[[Passes], Choice]
 def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
     """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded."""
     recorders: list[Recorder] = []
+    numbers = [0]  # of the passes so far
 
     def recorder(*given: Any, **more: Any) -> Recorder:
         recorders.append(Recorder(*given, **more))
@@ -27,23 +28,25 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
 
     def next_pass(passes: Passes) -> Choice:
         choice = choose(passes)
-        recorders[-1].decided({"n_views": passes.n_views, "choice": choice, "predicted": float("nan")})
+        numbers[-1] += 1
+        values = {"number": numbers[-1], "n_views": passes.n_views, "choice": choice, "predicted": float("nan")}
+        recorders[-1].decided(values)
         return choice
+
+    def ready(*given: Any, **more: Any) -> Any:
+        made = preflight(*given, **more)
+        numbers.append(len(made.plan.choices))
+        return replace(made, info=replace(made.info, decides=True))
 
     with patch.context() as within:
         for module in ("preflight", "resume"):
             in_passes = lambda config: replace(plan_of(config), pass_views=pass_views)  # noqa: E731
             within.setattr(f"beamline.scan.{module}.plan_of", in_passes)
-        deciding = lambda *given, **more: _deciding(preflight(*given, **more))  # noqa: E731
-        within.setattr("beamline.scan.run.preflight", deciding)
+        within.setattr("beamline.scan.run.preflight", ready)
         within.setattr("beamline.scan.run.Recorder", recorder)
-        supervised = lambda *given, **more: Supervision(*given, **{**more, "next_pass": next_pass})  # noqa: E731
+        supervised = lambda *given, **more: Supervision(*given, **more | {"next_pass": next_pass})  # noqa: E731
         within.setattr("beamline.scan.run.Supervision", supervised)
         yield
-
-
-def _deciding(ready: Any) -> Any:
-    return replace(ready, info=replace(ready.info, decides=True))
 
 
 class Asked:

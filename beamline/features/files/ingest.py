@@ -134,9 +134,9 @@ def _copy(
         file[layout.PART_STARTS] = source.part_starts
     if info.decides:
         lines = [json.dumps(values).encode() for values in source.decisions]
-        for path, values in ((layout.PASS_ENDS, source.pass_ends), (layout.DECISIONS, lines)):
-            file[path].resize(len(values), 0)
-            file[path][...] = np.array(values, file[path].dtype)
+        for path, column in ((layout.PASS_ENDS, source.pass_ends), (layout.DECISIONS, lines)):
+            file[path].resize(len(column), 0)
+            file[path][...] = np.array(column, file[path].dtype)
     rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0

@@ -72,6 +72,7 @@ class ScanSource(ABC):
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
         pass_ends: int64 [pass], rows in the file at the end of each pass of views; empty where the file says none.
+        decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
         stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
     """
 
@@ -102,6 +103,7 @@ class ScanSource(ABC):
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None
     pass_ends: NDArray[np.int64] = np.zeros(0, np.int64)
+    decisions: tuple[Mapping[str, Any], ...] = ()
     stated_shifts: NDArray[np.float64] | None = None
     stated_ending: ScanEnding = ScanEnding()
 
@@ -165,12 +167,6 @@ class ScanSource(ABC):
         None if no view was repeated.
         """
         return None
-
-    @property
-    def decisions(self) -> tuple[Mapping[str, Any], ...]:
-        """What was chosen after each pass: the values of the event `next_chosen`, oldest first; empty where nothing
-        was."""
-        return ()
 
     @property
     def part_starts(self) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ _Sizes = NDArray[np.int64]
 _AT_REFRESH = ("image_key", "angles", "exposures")
 BY_FRAME = ("currents", "energies", "times", "shifts", "aside_mm")
 _OF_FRAMES = (*_AT_REFRESH, *BY_FRAME)
-_PRESENT = {"unreadable", "facts", "stated_shifts", "stated_ending", "pass_ends", *_OF_FRAMES}
+_PRESENT = {"unreadable", "facts", "stated_shifts", "stated_ending", "pass_ends", "decisions", *_OF_FRAMES}
 _COPIED = {*ScanSource.__annotations__} - _PRESENT
 
 
@@ -118,5 +118,5 @@ _JOINED: dict[str, Callable[[Any, _Sizes], Any]] = {
 }
 """How what several sources say becomes one value; else it is that of the last."""
 _PROPERTIES = (name for name, value in vars(ScanSource).items() if isinstance(value, property))
-for _name in (*BY_FRAME, "pass_ends", *_PROPERTIES):
+for _name in (*BY_FRAME, "pass_ends", "decisions", *_PROPERTIES):
     setattr(Frames, _name, property(partial(Frames.known, name=_name)))

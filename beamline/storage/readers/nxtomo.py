@@ -174,7 +174,8 @@ class NXtomoSource(ScanSource):
             self.aside_mm = datasets.values_of(moved)[:n]
             self.image_key[(self.image_key == FrameKind.ALIGNMENT) & (self.aside_mm != 0)] = FrameKind.WIDE_VIEW
         self.image_key[[*self._altered]] = FrameKind.INVALID
-        self.n, self.angles, self.pass_ends = n, angles[:n], pass_ends_in(self._file) if self._ours else self.pass_ends
+        self.n, self.angles = n, angles[:n]
+        self.pass_ends, self.decisions = pass_ends_in(self._file), decisions_in(self._file)
         self._checksums = self._column("digest/checksum", np.empty(0))[:n] if self._ours else np.empty(0)
         seconds = self._seconds(places.detector, "count_time")
         self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
@@ -295,11 +296,6 @@ class NXtomoSource(ScanSource):
         rows = self._column(f"frame_log/{name}", default)[: self.n].astype(np.int64)
         rows[[*self._altered]] = -1
         return rows
-
-    @property
-    @_guarded
-    def decisions(self) -> tuple[dict[str, Any], ...]:
-        return decisions_in(self._file) if self._ours else ()
 
     @property
     @_guarded

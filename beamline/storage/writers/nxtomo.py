@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -202,22 +202,18 @@ class NXtomoWriter:
         """
         self._add(layout.PASS_ENDS, self._rows)
 
-    def decided(self, values: Mapping[str, Any]) -> None:
+    def decided(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass, likewise."""
-        from pydantic_core import to_jsonable_python  # here, because most scans write no line
-
-        line = json.dumps(to_jsonable_python(values, inf_nan_mode="null"))
-        self._add(layout.DECISIONS, line.encode())
+        self._add(layout.DECISIONS, json.dumps(values, default=str).encode())
 
     def _add(self, path: str, value: int | bytes) -> None:
         if self._broken or path not in self._last:
             return
         try:
-            self.flush()
             column = self._last[path]
             column.resize(len(column) + 1, 0)
             column[-1] = value
-            column.flush()
+            self.flush()
         except FAILURES as error:
             self._broken = True
             raise self._disk_error("take the end of a pass", error) from error

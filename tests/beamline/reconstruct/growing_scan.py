@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -56,19 +56,27 @@ def schedule(
     axis_col: float | None = None,
     pause: float = 0.0,
     flags: Mapping[int, Flag] = MappingProxyType({}),
+    passes: Sequence[int] = (),
     **info: Any,
 ) -> None:
     """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
-    last one; status None never finishes it. `flags` come with the row that they are named by. `info`: of the file."""
+    last one; status None never finishes it. `flags` come with the row that they are named by. `passes`: rows at
+    the ends of passes, of a scan that decides. `info`: of the file."""
     writers: list[NXtomoWriter] = []
-    of_file = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, **info)
+    of_file = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, decides=bool(passes), **info)
 
     def create() -> None:
         writers.append(NXtomoWriter(path, of_file, frames[0].counts.shape, clock=StandingClock()))
 
     def append(frame: Frame) -> Callable[[], None]:
         said = [flags[frame.index]] if frame.index in flags else []
-        return lambda: writers[0].append(frame, digest(frame.counts), said)
+
+        def write() -> None:
+            writers[0].append(frame, digest(frame.counts), said)
+            if frame.index + 1 in passes:
+                writers[0].end_pass()
+
+        return write
 
     start = clock.time + begin
     clock.due.append((start, create))

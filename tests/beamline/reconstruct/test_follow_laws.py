@@ -19,7 +19,6 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.error_law import ErrorLaw
@@ -61,19 +60,6 @@ def laws(monkeypatch: pytest.MonkeyPatch) -> Laws:
     return made
 
 
-@pytest.fixture
-def passes(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Sets the ends of the passes of files, by name."""
-
-    def ends_of(**ends: Sequence[int]) -> None:
-        def so_far(source: NXtomoSource) -> np.ndarray:
-            return np.array([end for end in ends.get(Path(source.path).stem, ()) if end <= source.n], np.int64)
-
-        monkeypatch.setattr(NXtomoSource, "pass_ends", property(so_far))
-
-    return ends_of
-
-
 @dataclass
 class Followed:
     """A scan of a frame a second, and who follows it."""
@@ -95,9 +81,14 @@ class Followed:
 def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
     made: list[Followed] = []
 
-    def begin(frames: Sequence[Frame] = FRAMES, changes: dict[str, Any] | None = None, **how: Any) -> Followed:
+    def begin(
+        frames: Sequence[Frame] = FRAMES,
+        passes: Sequence[int] = ENDS,
+        changes: dict[str, Any] | None = None,
+        **how: Any,
+    ) -> Followed:
         clock, events = ScanClock(), list[Event]()
-        schedule(clock, tmp_path / "scan.h5", list(frames), period=1.0, **how)
+        schedule(clock, tmp_path / "scan.h5", list(frames), period=1.0, passes=passes, **how)
         clock.sleep(1.0)
         wanted = options(tmp_path, **(changes or {}))
         source = wanted.source.open(follow=True)
@@ -111,10 +102,7 @@ def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
         close(each.clock)
 
 
-def test_one_law_a_pass_of_all_views_until_its_end(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], tmp_path: Path
-) -> None:
-    passes(scan=ENDS)
+def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[..., Followed], tmp_path: Path) -> None:
     scan = follow()
     scan.seconds(13)
     assert not laws.asked  # a view is missing
@@ -137,18 +125,16 @@ def test_one_law_a_pass_of_all_views_until_its_end(
 
 
 def test_a_pass_that_the_next_one_overtakes_is_left_out_and_later_views_have_no_part(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+    laws: Laws, follow: Callable[..., Followed]
 ) -> None:
-    passes(scan=ENDS)
     follow().seconds(28)
     assert laws.sizes == [[10, 20]] and len(laws.asked[0][0]) == laws.asked[0][1].n_views == 20
 
 
 def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
+    laws: Laws, follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_fit, "BATCH_VIEWS", 8)
-    passes(scan=ENDS)
     scan, asked = follow(), []
     for n in (28, 0, 0):
         scan.seconds(n)
@@ -163,19 +149,17 @@ def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> N
     assert not laws.asked and events[-1].event == "done"
 
 
-def test_laws_come_while_the_volume_grows(laws: Laws, passes: Callable[..., None], tmp_path: Path) -> None:
-    passes(scan=ENDS)
+def test_laws_come_while_the_volume_grows(laws: Laws, tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
-    schedule(clock, tmp_path / "scan.h5", FRAMES, period=0.3, pause=2.0)
+    schedule(clock, tmp_path / "scan.h5", FRAMES, period=0.3, pause=2.0, passes=ENDS)
     reconstruct_file(options(tmp_path, method=BRIEF), events.append, clock)
     assert [event.data["n_views"] for event in events if event.event == "error_law"] == [10, 20, 30]
 
 
 @pytest.mark.parametrize("error", [ValueError("the views show no matter"), MemoryError()])
 def test_what_prevents_a_law_is_one_sentence_and_the_fit_goes_on(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], error: Exception
+    laws: Laws, follow: Callable[..., Followed], error: Exception
 ) -> None:
-    passes(scan=ENDS)
     laws.error = error
     scan = follow()
     for n in (14, 10, 10):
@@ -185,25 +169,22 @@ def test_what_prevents_a_law_is_one_sentence_and_the_fit_goes_on(
     assert scan.follower.n_views_taken == 30 and not scan.of("error_law")
 
 
-def test_a_mistake_is_not_taken_for_a_scan_without_a_law(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
-) -> None:
-    passes(scan=ENDS)
+def test_a_mistake_is_not_taken_for_a_scan_without_a_law(laws: Laws, follow: Callable[..., Followed]) -> None:
     laws.error = ZeroDivisionError()
     with pytest.raises(ZeroDivisionError):
         follow().seconds(14)
 
 
 def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+    laws: Laws, follow: Callable[..., Followed]
 ) -> None:
     """Here rows 6 and 13, which have an alarm, and wide views. The second pass has the angles of the first."""
     views = FRAMES[4:14]
     wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0) for frame in views[:3]]
     order = [*FRAMES[:14], *wide, *views]
-    passes(scan=(14, 27))
     laws.offset = 0.2
-    scan = follow([replace(frame, index=i) for i, frame in enumerate(order)], flags=alarms(6, 13), wide_views=True)
+    frames = [replace(frame, index=i) for i, frame in enumerate(order)]
+    scan = follow(frames, (14, 27), flags=alarms(6, 13), wide_views=True)
     for n in (14, 13):
         scan.seconds(n)
     assert laws.sizes == [[8], [8, 18]]
@@ -214,10 +195,9 @@ def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
 
 
 def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
+    laws: Laws, follow: Callable[..., Followed]
 ) -> None:
-    passes(scan=(14, 15))
-    scan = follow([*FRAMES[:14], replace(FRAMES[5], index=14, replaces=5)])
+    scan = follow([*FRAMES[:14], replace(FRAMES[5], index=14, replaces=5)], (14, 15))
     for n in (14, 1):
         scan.seconds(n)
     assert laws.sizes == [[10], [9, 10]]
@@ -225,10 +205,7 @@ def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(
     np.testing.assert_allclose(laws.asked[1][1].angles, [angles[0], *angles[2:10], angles[1]], atol=1e-6)
 
 
-def test_a_selection_of_views_stands_for_all(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
-) -> None:
-    passes(scan=ENDS)
+def test_a_selection_of_views_stands_for_all(laws: Laws, follow: Callable[..., Followed]) -> None:
     scan = follow(changes={"selection": Selection(views="every:2", axis_col=SCAN.axis_col)})
     for n in (14, 10):
         scan.seconds(n)
@@ -236,19 +213,13 @@ def test_a_selection_of_views_stands_for_all(
     assert [law["n_views"] for law in scan.of("error_law")] == [10, 20]
 
 
-def test_a_pass_without_a_view_that_can_be_used_has_no_law(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
-) -> None:
-    passes(scan=ENDS)
+def test_a_pass_without_a_view_that_can_be_used_has_no_law(laws: Laws, follow: Callable[..., Followed]) -> None:
     follow(flags=alarms(*range(4, 14))).seconds(14)
     assert not laws.asked
 
 
-def test_before_the_axis_is_known_there_is_no_law(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed]
-) -> None:
-    passes(scan=(7, 24))
-    scan = follow(changes={"selection": Selection()})
+def test_before_the_axis_is_known_there_is_no_law(laws: Laws, follow: Callable[..., Followed]) -> None:
+    scan = follow(passes=(7, 24), changes={"selection": Selection()})
     for n in (7, 1):
         scan.seconds(n)
     (warning,) = scan.of("warning")
@@ -257,16 +228,13 @@ def test_before_the_axis_is_known_there_is_no_law(
     assert laws.sizes == [[3, 20]]
 
 
-def test_a_resumed_run_has_the_passes_of_all_parts(
-    laws: Laws, passes: Callable[..., None], follow: Callable[..., Followed], tmp_path: Path
-) -> None:
-    passes(first=(14,), scan=(8, 18))
+def test_a_resumed_run_has_the_passes_of_all_parts(laws: Laws, follow: Callable[..., Followed], tmp_path: Path) -> None:
     clock = ScanClock()
-    schedule(clock, tmp_path / "first.h5", FRAMES[:20], status="stopped")
+    schedule(clock, tmp_path / "first.h5", FRAMES[:20], status="stopped", passes=(14,))
     close(clock)
     later = [replace(frame, index=i) for i, frame in enumerate([*FRAMES[:4], *FRAMES[20:]])]
     source = SourceOptions(tmp_path / "scan.h5", earlier=(tmp_path / "first.h5",))
-    scan = follow(later, changes={"source": source})
+    scan = follow(later, (8, 18), changes={"source": source})
     for n in (1, 8, 10):
         scan.seconds(n)
         scan.seconds(0)
