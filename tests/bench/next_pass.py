@@ -14,6 +14,8 @@ from __future__ import annotations
 
 import argparse
 import fcntl
+import hashlib
+import inspect
 import json
 import math
 import sys
@@ -28,10 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import recon
+from recon.assess.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse
 from recon.methods import DEFAULT
-from tests.bench.next_pass_scenes import COLS, CRUMBED, DEV, PASS, PASSES, RECIPES, VIEWS, noisy, scene_of
+from recon.voxels.measured_law import measured_law
+from tests.bench.next_pass_scenes import COLS, CRUMBED, DEV, PASS, PASSES, RECIPES, VIEWS, noisy, open_beam, scene_of
 
 F32 = NDArray[np.float32]
 VERSION = 1
@@ -125,58 +129,116 @@ def measured(number: int, seed: int, state: State, method: str) -> Score:
     return Score(*judged(volume, _scene(number).truth), time.process_time() - begin)
 
 
+class Law(NamedTuple):
+    """The values of an `ErrorLaw`, dB by the last pass as it measures them, and CPU seconds."""
+
+    n_views: int
+    exponent: float
+    exponent_error: float
+    noise: float
+    offset: float
+    gained: float | None
+    seconds: float
+
+
+def law_of(number: int, seed: int, state: State) -> Law:
+    """The law at the end of a pass, of the views that a live reconstruction has then."""
+    views, geometry = views_of(number, seed, state)
+    earlier = (views_of(number, seed, State(passes))[0] for passes in range(1, state.passes))
+    sizes = [*map(len, earlier), len(views)]
+    begin = time.process_time()
+    made = measured_law(views, geometry, sizes, np.random.default_rng(seed), open_beam(number, seed))
+    seconds, law = time.process_time() - begin, made.law
+    return Law(law.n_views, law.exponent, law.exponent_error, law.noise, law.offset, made.gained, seconds)
+
+
+@lru_cache(maxsize=1)
+def _law_code() -> str:
+    return hashlib.sha256(inspect.getsource(inspect.getmodule(measured_law) or measured_law).encode()).hexdigest()[:8]
+
+
 class Kept:
-    """Scores in a file, which several processes may add to."""
+    """Scores and laws in a file, which several processes may add to."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.scores = self._read()
+        self.scores, self.laws = self._read()
 
-    def _read(self) -> dict[str, Score]:
+    def _read(self) -> tuple[dict[str, Score], dict[str, Law]]:
         """Raises ValueError: the file was not written by this version of the bench, or is damaged."""
         if not self.path.exists():
-            return {}
+            return {}, {}
         try:
             document = json.loads(self.path.read_text(encoding="utf-8"))
-            version, rows = document["version"], {key: Score(*row) for key, row in document["next_pass"].items()}
+            version, scores = document["version"], {key: Score(*row) for key, row in document["next_pass"].items()}
+            laws = {key: Law(*row) for key, row in document.get("laws", {}).items()}
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{self.path} does not hold scores of next_pass ({error!r}); give another file") from error
         if version != VERSION:
             raise ValueError(f"{self.path} has scores of version {version}, and these are {VERSION}; give another file")
-        return rows
+        return scores, laws
+
+    def _add(self, scores: dict[str, Score], laws: dict[str, Law]) -> None:
+        """Add to what is in the file by now."""
+        with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            before = self._read()
+            self.scores, self.laws = before[0] | scores, before[1] | laws
+            document = {"version": VERSION, "next_pass": self.scores, "laws": self.laws}
+            part = self.path.with_suffix(".part")
+            part.write_text(json.dumps(document, indent=0), encoding="utf-8")
+            part.replace(self.path)
 
     def score(self, number: int, state: State, seed: int = 0, method: str = DEFAULT) -> Score:
         """Of the file, or made now."""
         key = f"{number}|{seed}|{method}|{state}"
         if key not in self.scores:
-            made = measured(number, seed, state, method)
-            print(key, *(round(value, 3) for value in made), file=sys.stderr, flush=True)
-            with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                self.scores = self._read() | {key: made}
-                part = self.path.with_suffix(".part")
-                part.write_text(json.dumps({"version": VERSION, "next_pass": self.scores}, indent=0), encoding="utf-8")
-                part.replace(self.path)
+            score = measured(number, seed, state, method)
+            print(key, *(round(value, 3) for value in score), file=sys.stderr, flush=True)
+            self._add({key: score}, {})
         return self.scores[key]
 
+    def has(self, number: int, state: State) -> bool:
+        """Whether the file has the score of a state."""
+        return f"{number}|0|{DEFAULT}|{state}" in self.scores
 
-def curve(number: int) -> list[State]:
-    """The states that fixed plans and the best choice in hindsight may end in."""
-    recipe = RECIPES[number]
-    plain = [State(passes) for passes in (8, 2, 4, 1, 3, 5, 6, 7)]
-    states = [*plain, State(1, (0,)), State(2, (1,))]
-    if recipe.over > 1:
-        states += [State(one.passes, wide=True) for one in plain]
-    if recipe.crumb:
-        states += [State(one.passes, retaken=True) for one in plain if one.passes * PASS > CRUMBED.start]
-    return states
+    def law(self, number: int, seed: int, state: State) -> ErrorLaw:
+        """Of the file, or measured now; its key has a sum of the code that measures."""
+        key = f"{number}|{seed}|{_law_code()}|{state}"
+        if key not in self.laws:
+            law = law_of(number, seed, state)
+            print(key, *law, file=sys.stderr, flush=True)
+            self._add({}, {key: law})
+        return ErrorLaw(*self.laws[key][:5])
 
 
 def hindsight(number: int, kept: Kept, below: float = WISH) -> State:
-    """The state of the fewest frames among those of `curve` that is at most `below` dB under the whole plan's."""
-    least = kept.score(number, whole_plan(number)).quality - below
-    reached = [state for state in curve(number) if kept.score(number, state).quality >= least]
-    return min(reached, key=lambda state: state.frames(number))
+    """The state of the fewest frames that is at most `below` dB under the whole plan's.
+
+    Each of the plan's passes is taken to improve the volume, so that few states are looked at. States with passes taken
+    twice count where the file has them.
+    """
+    whole = whole_plan(number)
+    least = kept.score(number, whole).quality - below
+
+    def fewest(of: State) -> State:
+        first, last = 0, PASSES  # the first is too few, the last suffices
+        while last - first > 1:
+            middle = (first + last + 1) // 2
+            enough = kept.score(number, _with(of, middle)).quality >= least
+            first, last = (first, middle) if enough else (middle, last)
+        return _with(of, last)
+
+    best = fewest(whole)
+    plain = State(best.passes) if whole.wide else fewest(State(PASSES))
+    twice = [state for state in (State(1, (0,)), State(2, (1,))) if kept.has(number, state)]
+    reached = [state for state in (plain, *twice) if kept.score(number, state).quality >= least]
+    return min((best, *reached), key=lambda state: state.frames(number))
+
+
+def _with(state: State, passes: int) -> State:
+    """A state of so many passes; before the crumb there is nothing to take again."""
+    return state._replace(passes=passes, retaken=state.retaken and passes * PASS > CRUMBED.start)
 
 
 def fixed(number: int, kept: Kept, frames: int) -> float:
@@ -184,8 +246,10 @@ def fixed(number: int, kept: Kept, frames: int) -> float:
     whole = whole_plan(number)
     if frames >= VIEWS:
         return kept.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality
-    at = [kept.score(number, State(passes)).quality for passes in range(1, PASSES + 1)]
-    return float(np.interp(frames / PASS, range(1, PASSES + 1), at))
+    low = max(1, frames // PASS)
+    share = frames / PASS - low
+    below = kept.score(number, State(low)).quality
+    return below + share * (kept.score(number, State(low + 1)).quality - below) if share else below
 
 
 def table(kept: Kept, numbers: Sequence[int]) -> str:
@@ -194,7 +258,8 @@ def table(kept: Kept, numbers: Sequence[int]) -> str:
     lines = ["| scene | " + " | ".join(heads) + " | whole plan | hindsight | middle |", "|---" * (len(heads) + 4) + "|"]
     for number in numbers:
         whole, best = whole_plan(number), hindsight(number, kept)
-        shown = [f"{kept.score(number, State(passes)).quality:.2f}" for passes in range(1, PASSES + 1)]
+        states = [State(passes) for passes in range(1, PASSES + 1)]
+        shown = [f"{kept.score(number, state).quality:.2f}" if kept.has(number, state) else "" for state in states]
         score = kept.score(number, whole)
         shown += [f"{score.quality:.2f} ({whole.frames(number)})", f"{best.frames(number)} ({best})"]
         lines.append(f"| {number} {RECIPES[number]} | " + " | ".join([*shown, f"{score.middle:.3f}"]) + " |")

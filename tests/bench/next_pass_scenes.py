@@ -217,3 +217,10 @@ def noisy(number: int, scene: Scene, seed: int, take: int = 0) -> F32:
         lines[CRUMBED.start : CRUMBED.stop] += scene.crumb
     counts = np.random.default_rng([number, seed, take]).poisson(photons * np.exp(-lines.astype(np.float64)))
     return -np.log(np.maximum(counts, 1) / photons).astype(np.float32)
+
+
+def open_beam(number: int, seed: int, frames: int = 20) -> F32:
+    """Line integrals [frame, row, col] of frames without the sample, noise alone."""
+    photons = RECIPES[number].photons
+    counts = np.random.default_rng([number, seed, 99]).poisson(photons, (frames, ROWS, COLS))
+    return -np.log(np.maximum(counts, 1) / counts.mean(axis=0)).astype(np.float32)
