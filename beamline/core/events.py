@@ -242,7 +242,7 @@ class LawMeasured(Event, event="error_law"):
     """How the error of the volume falls with further views, by the live reconstruction at the end of a pass.
 
     Attributes:
-        n_views, exponent, exponent_error, noise, offset: as of `recon.assess.error_law.ErrorLaw`.
+        n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`.
         gained: dB by the last pass, as views held out measure it; None: not known.
         seconds: that it took.
         reason: why these views have no law; then the other numbers are NaN.

@@ -10,7 +10,7 @@ from typing import Any
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Block, Timeline
 from drivers.base.frame import FrameKind
-from recon.assess.error_law import ErrorLaw, Gain
+from recon.base.error_law import ErrorLaw, Gain
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL
-from recon.assess.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw
 
 
 @dataclass(eq=False, kw_only=True)

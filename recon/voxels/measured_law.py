@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.error_law import ErrorLaw
 from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Decisions
+from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.beyond_field import offset_error, sample_radius

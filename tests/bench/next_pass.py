@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import recon
-from recon.assess.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse
 from recon.methods import DEFAULT

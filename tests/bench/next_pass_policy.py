@@ -24,7 +24,7 @@ from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.base.frame import FrameKind
-from recon.assess.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw
 from tests.bench.next_pass import WISH, Kept, State, fixed, hindsight, whole_plan
 from tests.bench.next_pass_devices import config_of
 from tests.bench.next_pass_scenes import CRUMBED, DEV, PASS, PASSES, RECIPES

@@ -11,7 +11,7 @@ from beamline.plan.choose import PassOption, Spent, Wish, choose, frame_dose, ne
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.plan.timeline import block_seconds
-from recon.assess.error_law import ErrorLaw, Gain
+from recon.base.error_law import ErrorLaw, Gain
 from tests.beamline.fakes import FakeInstrument
 
 NOTHING = Spent(0.0, 0.0)

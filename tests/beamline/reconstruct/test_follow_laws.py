@@ -19,7 +19,7 @@ from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
-from recon.assess.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.voxels.measured_law import MeasuredLaw
 from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule

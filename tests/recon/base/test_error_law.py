@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.assess.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw
 
 SHARE = st.floats(0, 0.5)
 LAWS = st.builds(ErrorLaw, st.integers(1, 2000), st.floats(0, 2), st.floats(0, 0.2), SHARE, SHARE)
