@@ -250,12 +250,14 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.
+        """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind, or
+        these at the start alone, and only that its views are enough stops it.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {done.block.kind for done in self._done if done.taken.frames}
-        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
+        unhurried = self._stop.enough and not self._stop.by_person
+        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and (unhurried or block.kind not in kinds)
 
     def _set_shutter_and_sample(self, block: Block) -> None:
         """Bring shutter and sample where the block needs them; a shutter that does not move ends the scan."""

@@ -210,8 +210,7 @@ class _Run:
             at = devices.stage.position() if at is None else at
             return block_seconds(block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, at)
 
-        i = timeline.blocks.index(timeline.views)
-        due = set(REFERENCES) - {block.kind for block in timeline.blocks[:i]}  # also after views that are enough
+        after = timeline.blocks[timeline.blocks.index(timeline.views) :]
         return Decider(
             asks=scan.decide == "ask",
             wish=Wish(**dict(scan.wish)),
@@ -222,7 +221,7 @@ class _Run:
             states=self.states,
             stop=self.stop,
             sink=self.sink,
-            seconds=sum(seconds_of(block, 0.0) for block in timeline.blocks[i:] if block.kind in due)
+            seconds=sum(seconds_of(block, 0.0) for block in after if block.kind in REFERENCES)
             + (self.series.seconds if self.series else 0.0),
             frames=sum(len(block.stored) for block in wide),
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),

@@ -78,7 +78,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
         {name: value for name, value in each.items() if value is not None} | {"time": 0} for each in decisions
     ]
     assert [each.data["number"] for each in ran.of("pass_ended")] == [1, 2, 3]
-    ran.assert_good_file(14, "stopped")
+    ran.assert_good_file(16, "stopped")  # with the flats of the end
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 
@@ -146,7 +146,7 @@ def test_the_operator_is_asked_with_a_closed_shutter_and_answers_from_another_te
     assert type(ran.error) is ScanStopped and "the operator chose it" in str(ran.error)
     assert seen == [("asking", False)] * 2
     assert [each.data["by"] for each in ran.of("next_chosen")] == ["operator"] * 2
-    ran.assert_good_file(11, "stopped")
+    ran.assert_good_file(13, "stopped")
     ran.assert_safe()
 
 
@@ -167,7 +167,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     assert isinstance(ran.error, ScanStopped)
     assert seen == [("asking", False), ("paused", False), ("asking", False)]
     assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
-    ran.assert_good_file(10, "stopped")
+    ran.assert_good_file(12, "stopped")
 
 
 @pytest.mark.parametrize("verb", ["stop", "abort"])

@@ -87,7 +87,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         assert [decode(frame.counts)[3] for frame in frames] == list(range(len(frames)))
         enough = Choice.ENOUGH in asked.answers
-        assert len(frames) == FIRST + len(views) + (0 if enough else 2)  # flats of the end
+        assert len(frames) == FIRST + len(views) + 2  # flats of the end
         assert (ran.error is None) is not enough
         status = "stopped" if enough else "complete"
         if enough:
@@ -177,7 +177,7 @@ CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choi
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
-@settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
@@ -194,8 +194,8 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
                 with suppress(ScanStopped, NothingMissing, NotJoined), open_for_resume(ran.folder) as series:
                     run_scan(series.config, series, stop=stop, instrument=instrument.connected())
         recover_run(ran.folder)
-        with suppress(NothingMissing), open_for_resume(ran.folder) as series:
-            assert Choice.ENOUGH in asked.answers and series.end_references  # which no stop waits for
+        with pytest.raises(NothingMissing), open_for_resume(ran.folder):
+            ...
         sets = expected(sizes, asked.answers)
         path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
         frames = frames_of(path)

@@ -15,6 +15,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
+from beamline.plan.passes import Choice
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -86,6 +87,23 @@ def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: SteppedClo
     assert done.returncode == 0, done.stderr.decode()
     assert {"Prüfkörper µ", "NXtomo", "running", "NXentry", "degree", "PM16C"} <= set(said)
     writer.close()
+
+
+def test_ends_of_passes_and_decisions_are_there_while_the_file_grows(
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
+) -> None:
+    path, decided = tmp_path / "s.h5", {"number": 1, "choice": Choice.AGAIN, "reason": "Prüfkörper µ", "gained": None}
+    with NXtomoWriter(path, replace(INFO, decides=True), SHAPE, clock=clock, flush_every=100) as writer:
+        append(writer, *frames[:8])
+        with open_scan(path, follow=True) as source:
+            assert (source.pass_ends.tolist(), source.decisions) == ([], ())
+            writer.end_pass()
+            assert (source.refresh(), source.pass_ends.tolist()) == (8, [8])
+            writer.decided(decided)
+            append(writer, *frames[8:])
+            writer.end_pass()
+            assert (source.refresh(), source.pass_ends.tolist()) == (len(frames), [8, len(frames)])
+            assert source.decisions == (decided,)
 
 
 def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, clock: SteppedClock) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -43,6 +44,22 @@ def test_a_full_disk_is_named_and_earlier_rows_stay(
     assert not writer.remarks
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
+
+
+def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
+    tmp_path: Path, frames: list[Frame], clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = NXtomoWriter(tmp_path / "s.h5", replace(INFO, decides=True), SHAPE, clock=clock)
+    append(writer, *frames[:3])
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.Dataset, "resize", Mock(side_effect=OSError(28, "No space left on device")))
+        with pytest.raises(DataError, match=r"s\.h5 could not take the end of a pass.*No space left.*first 3 frames"):
+            writer.end_pass()
+    writer.decided({"choice": "next"})  # nothing more is written
+    writer.close()
+    with open_scan(tmp_path / "s.h5") as source:
+        assert (source.refresh(), source.attributes["status"], source.pass_ends.size) == (3, "failed", 0)
+        assert source.decisions == ()
 
 
 def no_room(call: str = "take") -> RuntimeError:
