@@ -23,7 +23,7 @@ from recon.base.empirical import (
     SHARE_OF_NOISE,
 )
 from recon.base.geometry import Geometry
-from recon.base.noise import noise_beside_structure, noise_level
+from recon.base.noise import noise_beside_structure
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.projector import Projector
@@ -74,18 +74,15 @@ class NoiseBalance:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, sweeps: int, evenly: bool = True) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
         """The weight for a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
             sweeps: of the method.
-            evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
-                views is alike.
         """
 
         def noise_of(views: F32) -> float:
-            seen = whitened(views, problem.weight)
-            return noise_beside_structure(seen, problem.projector.geometry) if evenly else noise_level(seen)
+            return noise_beside_structure(whitened(views, problem.weight), problem.projector.geometry)
 
         noise = noise_of(problem.views)
         first = problem.filtered("hann")
