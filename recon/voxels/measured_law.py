@@ -40,10 +40,11 @@ _BY_NOISE, _BY_ELSE = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to
 _NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
 _SPREAD = 0.25  # relative standard error of an exponent, on the same scans
 _SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles
+_SHOWN = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
 _FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
 _DENSITY = 3.0  # times the square error by the uncertainty of the density beside the field
 _MOST_OFFSET = 0.4  # share of the error
-_ROWS, _WORK = 8, 360 * 512**2  # rows of the slab; views times square of the columns: more are binned
+_ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
 _FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
@@ -81,7 +82,7 @@ def measured_law(
     sample = sample_radius(data, geometry)
     scan = _Scan.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
     most, held_out = split_views(scan.geometry)
-    parts = np.sort(_in_angle(scan.geometry)[1::2]), most
+    parts = np.sort(scan.in_angle[1::2]), most
     weight = scan.chosen_weight()
     measured = [scan.volume(scan.views, some, weight) for some in parts]
     if not measured[1].any():
@@ -90,26 +91,26 @@ def measured_law(
     copied = [scan.volume(copy, some, weight) for some in parts]
     errors = [scan.square_error(volume, measured[1]) for volume in copied]
     noise = scan.square_error(copied[0], scan.volume(other, parts[0], weight)) / 2 / max(errors[0], _TINY)
+    fall = None
     if scan.noise is not None:
         real = [scan.unseen_power(volume, scan.views, held_out) for volume in measured]
-        ideal = [scan.unseen_power(volume, copy, held_out) for volume in copied]
-        noise *= _fall(real, ideal)
-    else:
-        noise *= _FALL
-    exponent = float(np.interp(noise, _NOISY, (_BY_ELSE, _BY_NOISE)))
+        fall = _fall(real, [scan.unseen_power(volume, copy, held_out) for volume in copied])
+    exponent = float(np.interp(noise * (fall or _FALL), _NOISY, (_BY_ELSE, _BY_NOISE)))
     if n < geometry.detector_shape[1]:  # gaps between the views make the error
         exponent = _BY_NOISE
     beside = _DENSITY * offset_error(Volume(measured[1], scan.box), scan.geometry, sample)
     offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    gained = law.exponent * 10 * math.log10(n / sizes[-2]) if len(sizes) > 1 else None
-    return MeasuredLaw(law, gained)
+    if fall is None or len(sizes) < 2 or min(errors) <= 0:
+        return MeasuredLaw(law, None)
+    measured_exponent = _SHOWN * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
+    return MeasuredLaw(law, measured_exponent * 10 * math.log10(n / sizes[-2]))
 
 
-def _fall(real: Sequence[float], ideal: Sequence[float]) -> float:
-    """The fall of the error from the first volume to the second, over that in the copy; 0 to 1."""
+def _fall(real: Sequence[float], ideal: Sequence[float]) -> float | None:
+    """The fall of the error from the first volume to the second, over that in the copy, 0 to 1; None: not known."""
     if not ideal[0] > ideal[1] > 0:
-        return _FALL
+        return None
     fall = math.log(max(real[0], ideal[0] / 10) / max(real[1], ideal[1] / 10))
     return min(max(fall / math.log(ideal[0] / ideal[1]), 0.0), 1.0)
 
@@ -163,7 +164,7 @@ class _Scan:
             noise = None if noise is None else bin_views(noise, factor)
         geometry, field = slab_of(geometry, Grid.matching(geometry), 0, geometry.detector_shape[0])
         box = field.reaching(width * geometry.reach, geometry) if width > 1 else field
-        some = _some_views(geometry)
+        some = np.sort(np.argsort(np.mod(geometry.angles, np.pi))[:: -(-geometry.n_views // _TRIAL_VIEWS)])
         decide, part = Decisions(), geometry.select(some)
         solve(
             _TotalVariation(None),
@@ -184,7 +185,7 @@ class _Scan:
 
     def chosen_weight(self) -> float:
         """The weight that predicts views held out best, for one view."""
-        some = _some_views(self.geometry)
+        some = np.sort(self.in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         seen, unseen = (some[part] for part in split_views(self.geometry.select(some)))
         projector = Projector(self.geometry.select(unseen), self.box)
         judges = projection_lines(self.views[unseen])
@@ -195,6 +196,11 @@ class _Scan:
 
         best = preferred_strength(residuals, self.weight) if self.weight > 0 else None
         return self.weight if best is None else best.strength
+
+    @property
+    def in_angle(self) -> NDArray[np.intp]:
+        """Views in the order of their angles over half a turn."""
+        return np.argsort(np.mod(self.geometry.angles, np.pi), kind="stable")
 
     def copies(self, sample: F32, fitted: NDArray[np.intp], rng: np.random.Generator) -> tuple[F32, F32]:
         """Two scans [view, row, col] of a sample, with different noise like that of the open beam; without one, like
@@ -228,15 +234,6 @@ class _Scan:
         resolution = Projector(self.geometry.select(some), self.box).resolution
         noise = _ramp_power(at_voxel_resolution(projection_lines(self.noise), resolution))
         return _ramp_power(left) - noise * float(np.exp(seen, dtype=np.float64).mean())
-
-
-def _in_angle(geometry: Geometry) -> NDArray[np.intp]:
-    return np.argsort(np.mod(geometry.angles, np.pi), kind="stable")
-
-
-def _some_views(geometry: Geometry) -> NDArray[np.intp]:
-    """Views of the trials of a weight, evenly spread."""
-    return np.sort(_in_angle(geometry)[:: -(-geometry.n_views // _TRIAL_VIEWS)])
 
 
 def _first(views: F32, geometry: Geometry, box: Grid) -> Volume:
