@@ -21,8 +21,7 @@ from drivers.base.errors import DeviceError
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
-CHOICES = ("next", "again", "wide", "retake", "enough")
-"""What can be measured next, as of `beamline.plan.passes.Choice`, which help does not need."""
+CHOICES = ("next", "again", "wide", "retake", "enough")  # those of `beamline.plan.passes`, which help does not load
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 

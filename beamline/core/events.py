@@ -245,6 +245,7 @@ class LawMeasured(Event, event="error_law"):
         n_views, exponent, exponent_error, noise, offset: as of `recon.assess.error_law.ErrorLaw`.
         gained: dB by the last pass, as views held out measure it; None: not known.
         seconds: that it took.
+        reason: why these views have no law; then the other numbers are NaN.
     """
 
     n_views: int
@@ -254,6 +255,7 @@ class LawMeasured(Event, event="error_law"):
     offset: float
     gained: float | None = None
     seconds: float = math.nan
+    reason: str = ""
 
 
 class PassEnded(Event, event="pass_ended"):

@@ -175,11 +175,15 @@ def _gain_per_minute(option: Mapping[str, Any]) -> str:
     return "-" if gain is None or not seconds else f"{60 * gain / seconds:+.2f}"
 
 
-_DECIDED = {"program": "chosen by the program", "operator": "chosen by the operator", "plan": "as planned"}
+_DECIDED = {
+    "program": "chosen by the program: ",
+    "operator": "",
+    "plan": "as planned: ",
+}  # the operator's reason says so
 
 
 def _decision(chosen: NextChosen) -> str:
-    said = f"After pass {chosen.number}: {chosen.choice}, {_DECIDED.get(chosen.by, chosen.by)}: {chosen.reason}"
+    said = f"After pass {chosen.number}: {chosen.choice}, {_DECIDED.get(chosen.by, '')}{chosen.reason}"
     if chosen.gained is None:
         return said
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "

@@ -18,7 +18,8 @@ from beamline.core.events import event_in
 from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched
-from beamline.scan.control import State, Verb
+from beamline.plan.passes import Choice
+from beamline.scan.control import State
 from beamline.scan.runs import newest
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.run_record import DIED
@@ -80,17 +81,13 @@ class RunValues:
     measured_gain: float = published("MeasuredGain", "by an earlier choice, as measured", math.nan, "dB")
 
 
-def answer_of(values: RunValues, word: str) -> Verb:
-    """The verb by which a word of an operator answers the scan.
-
-    Raises:
-        ConfigError: the scan asks nothing now, or the word is none of its options.
-    """
-    if not values.wait:
-        raise ConfigError(f"the scan asks nothing now, so that {one_line(word)!r} is no answer. Nothing was changed.")
-    if word not in values.options:
-        raise ConfigError(f"{one_line(word)!r} is none of {', '.join(values.options)}. Nothing was changed.")
-    return Verb(word)
+def choice_of(values: RunValues, word: str) -> Choice:
+    """What an operator's word chooses. Raises ConfigError if it is none of what can be measured next."""
+    for choice in Choice:
+        if choice == word and word in values.options:
+            return choice
+    options = ", ".join(values.options) or "no pass has ended yet"
+    raise ConfigError(f"{one_line(word)!r} is none of what can be measured next: {options}. Nothing was changed.")
 
 
 class Severity(IntEnum):
@@ -174,7 +171,7 @@ _ALARMED = ("state", "message", "last_flag", "warnings", "alarms")
 """Values whose severity is that of the event that set them."""
 _OF_STATE: Mapping[str, Severity] = {
     State.FAILED: Severity.MAJOR, DIED: Severity.MAJOR, State.ABORTED: Severity.MAJOR,
-    State.STOPPED: Severity.MINOR, State.PAUSED: Severity.MINOR,
+    State.STOPPED: Severity.MINOR, State.PAUSED: Severity.MINOR, State.ASKING: Severity.MINOR,
 }  # fmt: skip
 _OF_LEVEL = {"alarm": Severity.MAJOR, "warn": Severity.MINOR}
 
@@ -274,7 +271,8 @@ def _run(before: RunValues, event: Event) -> dict[str, Any]:
 def _state(before: RunValues, event: Event) -> dict[str, Any]:
     if event.get("source") == "recon":  # of the live volume
         return {}
-    return {"state": str(event["state"]), "message": str(event.get("message", ""))}
+    over = {"wait": 0.0} if event["state"] == State.FINISHING else {}
+    return {"state": str(event["state"]), "message": str(event.get("message", "")), **over}
 
 
 def _frame(before: RunValues, event: Event) -> dict[str, Any]:
@@ -326,5 +324,5 @@ _BY_KIND: dict[str, Callable[[RunValues, Event], dict[str, Any]]] = {
     "snapshot": lambda before, event: {"views": int(event["n_views"]), "residual": _number(event.get("unlearnt"))},
     "pass_ended": _pass,
     "next_chosen": _chosen,
-    "scan_done": lambda before, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan, "wait": 0.0},
+    "scan_done": lambda before, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan},
 }

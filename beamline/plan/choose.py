@@ -101,7 +101,8 @@ def choose(offered: Sequence[PassOption], wish: Wish, spent: Spent, rest: Gain) 
         rest: by all that the plan still has.
     """
     if wish.quality_db is not None and rest.mean <= wish.quality_db:
-        return Choice.ENOUGH, f"all that is left would add {_in_words(rest)}; {wish.quality_db:g} dB may lack"
+        left = f"{rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f})"
+        return Choice.ENOUGH, f"all that is left would add {left}; {wish.quality_db:g} dB may lack"
     useful = [one for one in offered if one.gain > 0]
     within = [one for one in useful if not _beyond(one, wish, spent)]
     if not within:
@@ -111,7 +112,7 @@ def choose(offered: Sequence[PassOption], wish: Wish, spent: Spent, rest: Gain) 
     following = next((one for one in within if one.choice is Choice.NEXT), best)
     if best.low / best.seconds <= following.high / following.seconds:
         best = following
-    gain = _in_words(Gain(best.gain, best.low, best.high))
+    gain = f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f})"
     return best.choice, f"{gain} in {best.seconds:.0f} s; nothing else is surely better for its time"
 
 
@@ -137,7 +138,3 @@ def _beyond(one: PassOption, wish: Wish, spent: Spent) -> str:
     if wish.dose is not None and dose > 100.0000001 * wish.dose:
         return f"{one.choice} would make it {dose:.3g} % of the plan's dose; {100 * wish.dose:g} % are wished"
     return ""
-
-
-def _in_words(gain: Gain) -> str:
-    return f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"

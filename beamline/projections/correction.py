@@ -180,6 +180,16 @@ class ScanCorrection:
         part = None if self._stream is None else self._stream.provisional()
         return None if part is None else self._filters.apply(part, None)
 
+    def open_beam(self, most: int) -> NDArray[np.float32] | None:
+        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
+
+        None: the scan has line integrals already.
+
+        Raises:
+            DataError: as `at_once`.
+        """
+        return None if self._beam is None else self.quiet().at_once(self._beam.used.flats[-1][:most]).data
+
     @property
     def done(self) -> dict[str, StepDone]:
         """What each correction step did, by the name of the step."""

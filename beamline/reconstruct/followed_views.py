@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 
@@ -25,6 +26,7 @@ from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.measured_law import measured_law
 
 
 class FollowState(Enum):
@@ -169,6 +171,9 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
+_OPEN_BEAM = 8  # flats that show the noise of a frame
+
+
 class PassLaws:
     """Measures the law of the error at the end of each pass, once all usable views until then are corrected.
 
@@ -180,12 +185,12 @@ class PassLaws:
         self._rng = np.random.default_rng(seed)
         self._end = 0  # rows of the file at the end of the last pass that was looked at
 
-    def look(self, cursor: Cursor, axis_col: float | None) -> None:
+    def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
         """Measure and report the law of the newest pass, if it is over and was not looked at yet.
 
         The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
         depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
-        known. What prevents a law becomes a warning.
+        known. What prevents a law becomes a warning, and the reason of an event without one.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -194,8 +199,6 @@ class PassLaws:
             self._warn(_NO_AXIS_NO_LAW)
         if axis_col is None or cursor.taken < end:
             return
-        from recon.voxels.measured_law import measured_law  # here: only scans that decide need it
-
         self._end, begin = end, self._clock.now()
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
@@ -206,15 +209,18 @@ class PassLaws:
             if row in usable
         }
         rows = np.array([*images], np.int64)
-        if not rows.size:
+        if not rows.size or correction is None:
             return
-        sizes = np.unique(np.searchsorted(rows, ends)).tolist()
+        sizes = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
-            measured = measured_law(np.stack([*images.values()]), geometry, [n for n in sizes if n], self._rng)
-        except (ValueError, MemoryError) as error:
+            open_beam = correction.open_beam(_OPEN_BEAM)
+            measured = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
+        except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
-            self._warn(f"The law of the error is not known, so that no gain by further views is predicted: {why}.")
+            self._warn(f"No gain by further views is predicted: {why}.")
+            none = LawMeasured(len(usable), math.nan, math.nan, math.nan, math.nan, reason=why)
+            self._sink(replace(none, time=self._clock.now()))
             return
         law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:

@@ -284,7 +284,7 @@ class ScanFollower:
 
     def measure_law(self) -> None:
         """Once a pass of views is corrected, measure and report the law of the error."""
-        self._laws.look(self._cursor, self.axis_col)
+        self._laws.look(self._cursor, self.axis_col, self._correction)
 
     def draw_slices(self, pause: float | None = None) -> None:
         """Draw slices of the views so far, if there are new ones and `pause` s have passed (None: now).

@@ -56,20 +56,19 @@ class Decider:
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
     _laws: deque[LawMeasured] = field(default_factory=lambda: deque(maxlen=1))  # that came: the newest
-    _law: ErrorLaw | None = None  # the newest that was taken up,
-    _law_of: int = 0  # with the number of its pass,
+    _law: ErrorLaw | None = None  # the newest that was taken up; None: for a reason there is none
+    _reason: str = ""
+    _law_of: int = 0  # the number of its pass,
     _lost: int = 0  # and the frames that it lacks, as flagged ones are not in a law
-    _ends: list[int] = field(default_factory=list)  # frames at the end of each pass, of views alone
-    _predicted: list[float | None] = field(default_factory=list)  # dB by each choice
+    _ended: list[tuple[int, float | None]] = field(default_factory=list)  # passes: frames of views, dB of what followed
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # what came of a choice, as `NextChosen` has it
     _unable: str = ""  # the reason that was given last
     _answers: frozenset[Choice] = frozenset()  # that the operator can give now
     _answer: Choice | None = None
 
     def add_law(self, law: LawMeasured) -> None:
-        """Take a law from the live reconstruction; any thread. One without a number is none."""
-        if None not in (law.exponent, law.exponent_error, law.noise, law.offset):
-            self._laws.append(law)
+        """Take a law from the live reconstruction; any thread."""
+        self._laws.append(law)
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not asked for becomes a warning."""
@@ -81,11 +80,9 @@ class Decider:
 
     def __call__(self, passes: Passes) -> Choice:
         """What is measured next, after a wait for the law and, where it asks, for the operator."""
-        known, plan = self._unable, self.timeline.plan
-        self._ends = self._ends or [passes.n_views - passes.done[-1].left] * len(plan.choices)  # of earlier parts
-        self._predicted = self._predicted or [None] * len(plan.choices)
-        self._ends.append(passes.n_views)
-        self._predicted.append(None)
+        plan, known = self.timeline.plan, self._unable
+        earlier = [(passes.n_views - passes.done[-1].left, None)] * len(plan.choices)  # parts of the run
+        self._ended = [*(self._ended or earlier), (passes.n_views, None)]
         self._take_law()
         self._unable = self.unable()
         if self._unable and self._unable == known:
@@ -97,9 +94,11 @@ class Decider:
             by, (choice, reason) = "program", choose(offered, self.wish, self._spent(passes), rest_gain(passes, law))
         else:
             self._unable = self.unable()
-            by, choice, reason = "plan", Choice.NEXT, self._unable or f"no law of the error within {self.wait:g} s"
-        asks, remark = self.asks and not self._unable, "" if law else f"No gain is predicted: {reason}."
-        facts = len(self._ends), passes.n_views // plan.frames_per_view
+            why = self._reason if self._law_of == len(self._ended) else ""
+            by, choice = "plan", Choice.NEXT
+            reason = self._unable or why or f"no prediction within {self.wait:g} s"
+        asks, remark = self.asks and not self._unable, "" if law else f"Gains are not known: {reason}."
+        facts = len(self._ended), passes.n_views // plan.frames_per_view
         values = [{name: None if value != value else value for name, value in vars(one).items()} for one in offered]
         self.sink(PassEnded(*facts, values, choice, self.wait if asks else 0.0, remark))
         if asks:
@@ -108,7 +107,7 @@ class Decider:
                 return Choice.NEXT
         for one in offered:
             if one.choice is choice:
-                self._predicted[-1] = one.gain if law else None
+                self._ended[-1] = passes.n_views, one.gain if law else None
                 self.frames += one.frames * (choice in (Choice.WIDE, Choice.RETAKE))
         event = NextChosen(*facts, choice, by, reason, values, **self._outcome)
         self._outcome = {}
@@ -133,8 +132,8 @@ class Decider:
         known = law and not (self.asks or self._unable)
         if law and known and next_is_sure(passes, offered, self.wish, self._spent(passes), law):
             return law, offered
-        self._wait(lambda: self._law_of == len(self._ends) or self._take_law() or bool(self.unable()))
-        law = self._law and replace(self._law, n_views=passes.n_views) if self._law_of == len(self._ends) else None
+        self._wait(lambda: self._law_of == len(self._ended) or self._take_law() or bool(self.unable()))
+        law = self._law and replace(self._law, n_views=passes.n_views) if self._law_of == len(self._ended) else None
         return law, options(passes, law, self.timeline, self.seconds_of)
 
     def _take_law(self) -> bool:
@@ -143,12 +142,13 @@ class Decider:
             return False
         law = self._laws.pop()
         frames = law.n_views * self.timeline.plan.frames_per_view
-        number = min(range(len(self._ends)), key=lambda i: (abs(self._ends[i] - frames - self._lost), -i)) + 1
-        self._law_of, self._lost = number, self._ends[number - 1] - frames
-        self._law = ErrorLaw(frames, law.exponent, law.exponent_error, law.noise, law.offset)
+        number = min(range(len(self._ended)), key=lambda i: (abs(self._ended[i][0] - frames - self._lost), -i)) + 1
+        self._law_of, self._lost = number, self._ended[number - 1][0] - frames
+        self._reason, of_law = law.reason, (law.exponent, law.exponent_error, law.noise, law.offset)
+        self._law = None if law.reason or None in of_law else ErrorLaw(frames, *of_law)
         if law.gained is not None and number > 1:
-            self._outcome = {"predicted": self._predicted[number - 2], "gained": law.gained, "judged": number - 1}
-        return number == len(self._ends)
+            self._outcome = {"predicted": self._ended[number - 2][1], "gained": law.gained, "judged": number - 1}
+        return number == len(self._ended)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait at most as long as it may, or until a stop."""

@@ -435,11 +435,9 @@ class _Run:
 
     def _unable_to_predict(self, follower: LiveReconstruction | None) -> str:
         """Why the live reconstruction measures no law of the error; "" where it may."""
-        if follower is None:
-            return "there is no live reconstruction"
         if self.ready.info.source_distance_mm is not None:
             return "the beam is a cone, in which no gain is predicted"
-        return "the live reconstruction has ended" if follower.ended else ""
+        return "no live reconstruction is running" if follower is None or follower.ended else ""
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""

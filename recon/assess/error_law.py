@@ -43,7 +43,7 @@ class ErrorLaw:
         def of(exponent: float) -> float:
             noise = self.noise * self.n_views / (self.n_views + again)
             left = (1 - self.noise - self.offset + noise) * (1 + views / self.n_views) ** -exponent
-            return -10 * math.log10(left + (0.0 if wide else self.offset))
+            return -10 * math.log10(left + (0.0 if wide else self.offset)) or 0.0  # never -0.0
 
         low, high = (max(0.0, self.exponent + sign * 2 * self.exponent_error) for sign in (-1, 1))
         return Gain(of(self.exponent), of(low), of(high))

@@ -1,19 +1,20 @@
 """The law of the error of a volume, measured in its views: what further views would bring, without a truth.
 
-Volumes of total variation are made of half and of seven eighths of the views, and judged by the eighth held out: the
-power of the residual, filtered by the root of the ramp (which makes it the square error in the volume, by Parseval's
-theorem and the central slice theorem), less that of the noise of the open beam. How far the error falls from the one to
-the other is compared with a copy of the scan in which the second volume is the sample and noise alone is added (a
-parametric bootstrap; Efron & Tibshirani 1993, ch. 6.5). In that copy more views always help, by n^-0.65. Where the
-measured error falls less than in the copy, it has parts that further views do not take away: edges between voxels,
-fringes, a motion, a detector that is not as assumed.
+Where noise makes the error, the square error of a volume of total variation falls as n^-0.6 with the views; where edges
+between voxels, fringes, a motion or matter beside the field make it, as n^-0.3 or less. Which of the two is so is
+measured. A volume of seven eighths of the views stands for the sample, and in a copy of the scan noise alone is added
+to its projections (a parametric bootstrap; Efron & Tibshirani 1993, ch. 6.5). The copy tells the share of the noise in
+the error. Then volumes of half and of seven eighths of the views are judged by the eighth held out, in the scan and in
+the copy: by the power of their residual, filtered by the root of the ramp (which makes it the square error of the
+volume, by the theorems of Parseval and of the central slice), less that of the noise of the open beam. Where the error
+falls less in the scan than in the copy, it has parts that further views do not take away.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,16 +35,18 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 
-EXPONENT = 0.65
-"""Of the fall of the error by noise and gaps with the views: 0.59 to 0.69 in copies of ten scans (tests/bench)."""
 LEAST_VIEWS = 48
-_TRUST = 1.5  # times the measured share of the fall: half of the views in gaps of the others show too little of it
-_LEAST, _UNKNOWN = 0.15, 0.75  # shares: at least, and where the views fit no volume of absorption (fringes)
-_NO_FIT = 4.0  # times the error in the copy, from which they do not
-_SPREAD = 0.25  # relative standard error of an exponent (tests/bench/next_pass.py)
+_BY_NOISE, _BY_ELSE = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
+_NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
+_SPREAD = 0.25  # relative standard error of an exponent, on the same scans
+_SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles
+_FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
+_DENSITY = 3.0  # times the square error by the uncertainty of the density beside the field
+_MOST_OFFSET = 0.4  # share of the error
 _ROWS, _WORK = 8, 360 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
 _FRAMES = 3  # of the open beam, at least
+_TINY = 1e-30
 _BY_VIEWS = 0.6  # the weight of total variation grows with the views to this power
 _CIRCLE = 0.95  # of the field's radius, where errors count
 
@@ -85,30 +88,30 @@ def measured_law(
         raise ValueError("the error of a volume is not measured: these views show no matter")
     copy, other = scan.copies(measured[1], most, rng)
     copied = [scan.volume(copy, some, weight) for some in parts]
-    again = scan.volume(other, parts[0], weight)
     errors = [scan.square_error(volume, measured[1]) for volume in copied]
-    noise = min(scan.square_error(copied[0], again) / 2 / errors[0], 1.0) if errors[0] > 0 else 0.0
-    share = 1.0
+    noise = scan.square_error(copied[0], scan.volume(other, parts[0], weight)) / 2 / max(errors[0], _TINY)
     if scan.noise is not None:
         real = [scan.unseen_power(volume, scan.views, held_out) for volume in measured]
         ideal = [scan.unseen_power(volume, copy, held_out) for volume in copied]
-        share = _share(real, ideal)
-    offset = offset_error(Volume(measured[1], scan.box), scan.geometry, sample)
-    law = ErrorLaw(n, EXPONENT * share, _SPREAD * EXPONENT * share, noise * share, offset / (errors[1] + offset))
-    if offset:
-        law = replace(law, noise=law.noise * (1 - law.offset))
+        noise *= _fall(real, ideal)
+    else:
+        noise *= _FALL
+    exponent = float(np.interp(noise, _NOISY, (_BY_ELSE, _BY_NOISE)))
+    if n < geometry.detector_shape[1]:  # gaps between the views make the error
+        exponent = _BY_NOISE
+    beside = _DENSITY * offset_error(Volume(measured[1], scan.box), scan.geometry, sample)
+    offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
+    law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
     gained = law.exponent * 10 * math.log10(n / sizes[-2]) if len(sizes) > 1 else None
     return MeasuredLaw(law, gained)
 
 
-def _share(real: Sequence[float], ideal: Sequence[float]) -> float:
-    """The share of the copy's fall, from the first error to the second, that the views show."""
-    if real[1] > _NO_FIT * ideal[1]:
-        return _UNKNOWN
+def _fall(real: Sequence[float], ideal: Sequence[float]) -> float:
+    """The fall of the error from the first volume to the second, over that in the copy; 0 to 1."""
     if not ideal[0] > ideal[1] > 0:
-        return 1.0
+        return _FALL
     fall = math.log(max(real[0], ideal[0] / 10) / max(real[1], ideal[1] / 10))
-    return min(max(_TRUST * fall / math.log(ideal[0] / ideal[1]), _LEAST), 1.0)
+    return min(max(fall / math.log(ideal[0] / ideal[1]), 0.0), 1.0)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,9 @@ from beamline.core.files import RUNS
 @click.option(
     "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
 )
-@click.option("--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan.")
+@click.option(
+    "--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan, and choose what is next."
+)
 def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     """Serve the newest run of the folder RUNS (default ./runs) as EPICS process variables, by PVAccess.
 

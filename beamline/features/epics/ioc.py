@@ -12,7 +12,7 @@ from typing import Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.core.text import one_line
-from beamline.page.followed_run import LONGEST, FollowedRun, RunValues, Severity, Stamp, answer_of
+from beamline.page.followed_run import LONGEST, FollowedRun, RunValues, Severity, Stamp, choice_of
 from beamline.plan.passes import Choice
 from beamline.scan.control import Asked, Verb, ask
 from beamline.scan.runs import newest
@@ -69,8 +69,7 @@ class RunServer:
         self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, begun))
         provider.add(prefix + "Heartbeat", self._heartbeat)
         untold = _posted(False, begun)
-        verbs = [verb for verb in Verb if verb not in [*Choice]] if control else []
-        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in verbs}
+        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in (Verb if control else ())}
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
@@ -121,9 +120,9 @@ class RunServer:
 
     def _take_answer(self, pv: Any, op: Any) -> None:
         """The handler of the PV whose text answers the scan: one of its options, while it asks."""
-        self._send(pv, op, lambda: answer_of(self._run.stamped.values, op.value().raw.value))
+        self._send(pv, op, lambda: choice_of(self._run.stamped.values, op.value().raw.value))
 
-    def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb]) -> None:
+    def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb | Choice]) -> None:
         """Send a verb to the run at once; `look` answers the client."""
         try:
             verb = verb_of()

@@ -35,6 +35,7 @@ from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import number_of, region_of, tile_of
 from beamline.page.volume import ShownVolume
+from beamline.plan.passes import Choice
 from beamline.scan.control import POLL, Verb, ask
 
 if TYPE_CHECKING:
@@ -258,17 +259,16 @@ class _Server:
         """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
         folder, act = self._reader.what.folder, self._access.act
         client = request.client.host if request.client else "?"
-        name = next(
-            (str(verb) for verb in Verb if verb == request.path_params["verb"]), _NO_VERB
-        )  # never what was sent
+        verb = next((verb for verb in (*Verb, *Choice) if verb == request.path_params["verb"]), None)
+        name = _NO_VERB if verb is None else str(verb)  # never what was sent
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
             self._log(f"refused: {name} from {client}, without the token for acting")
             return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
-        if folder is None or name == _NO_VERB:
+        if folder is None or verb is None:
             return JSONResponse({"message": f"Nothing here can {name}: no scan runs in this folder."}, 404)
         self._log(f"{name}, asked for from {client}")
-        asked = ask(folder, Verb(name))
+        asked = ask(folder, verb)
         while (state := await run_in_threadpool(asked.state)) is None:
             await asyncio.sleep(POLL)
         return JSONResponse({"state": str(state)})

@@ -26,7 +26,9 @@ def _device_name(ctx: click.Context, param: click.Parameter, value: str) -> str:
     "--instance", metavar="NAME",
     help="Serve the devices that the database at TANGO_HOST holds for the server splatline/NAME; --device is not used.",
 )  # fmt: skip
-@click.option("--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan.")
+@click.option(
+    "--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan, and choose what is next."
+)
 def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, control: bool) -> None:
     """Serve the running scan as a Tango device: the newest run of the folder RUNS (default ./runs).
 

@@ -14,7 +14,7 @@ from tango.server import Device, attribute, command
 from tango.server import run as run_server
 
 from beamline.core.errors import BeamlineError, DataError, user_message
-from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity, StampedValues, answer_of
+from beamline.page.followed_run import PERIOD, FollowedRun, RunValues, Severity, StampedValues, choice_of
 from beamline.plan.passes import Choice
 from beamline.scan.control import State, Verb, ask
 from beamline.scan.runs import newest
@@ -33,14 +33,15 @@ _TYPES: dict[str, dict[str, Any]] = {
 }
 _RAISED = {"warnings": tango.AttrQuality.ATTR_WARNING, "alarms": tango.AttrQuality.ATTR_ALARM}
 _STATES: dict[str, str] = {
-    **dict.fromkeys((State.FAILED, State.ABORTED, "died"), "FAULT"), State.PAUSED: "STANDBY", State.PREPARING: "INIT",
+    **dict.fromkeys((State.FAILED, State.ABORTED, "died"), "FAULT"), State.PREPARING: "INIT",
+    **dict.fromkeys((State.PAUSED, State.ASKING), "STANDBY"),
     **dict.fromkeys((State.IDLE, State.DONE, State.STOPPED), "ON"),
 }  # fmt: skip
 
 
 def device_state(values: RunValues) -> tango.DevState:
-    """RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused, ON when none runs, FAULT after one
-    that failed.
+    """RUNNING, ALARM if the monitor has alarms, STANDBY while the scan is paused or asks, ON when none runs, FAULT
+    after one that failed.
     """
     return getattr(tango.DevState, _STATES.get(values.state, "ALARM" if values.alarms else "RUNNING"))
 
@@ -106,7 +107,7 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     for each in ATTRIBUTES:
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
         body[each.metadata["name"]] = attribute(fget=reader(each.name), **facts)
-    for verb in [verb for verb in Verb if verb not in [*Choice]] if control else ():
+    for verb in Verb if control else ():
         body[verb.value.capitalize()] = command(_sender(run, verb))
     if control:
         body["Decide"] = command(_decider(run), dtype_in=str, doc_in="one of Options")
@@ -126,13 +127,13 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
 
 def _decider(run: FollowedRun) -> Callable[[Any, str], None]:
     def Decide(device: Any, choice: str) -> None:  # noqa: N802 - the name of the command
-        """What `beamline decide` does, while AnswerWithin is above 0. Returns at once."""
-        _send(run, lambda: answer_of(run.stamped.values, choice), "Decide")
+        """What `beamline decide` does. Returns at once."""
+        _send(run, lambda: choice_of(run.stamped.values, choice), "Decide")
 
     return Decide
 
 
-def _send(run: FollowedRun, verb_of: Callable[[], Verb], command: str) -> None:
+def _send(run: FollowedRun, verb_of: Callable[[], Verb | Choice], command: str) -> None:
     try:
         ask(newest(run.runs), verb_of())
     except (BeamlineError, OSError) as error:

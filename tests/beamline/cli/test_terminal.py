@@ -150,7 +150,11 @@ EVENTS = [
         "After pass 3: again, chosen by the program: it brings most a second. The choice before: predicted +0.80 dB, "
         "measured +0.71 dB",
     ),
-    ("next_chosen", {**CHOSEN, "by": "operator", "gained": -0.1}, "by the operator: it brings most a second. The c"),
+    (
+        "next_chosen",
+        {**CHOSEN, "by": "operator", "reason": "the operator chose it", "gained": -0.1},
+        "again, the operator chose it. The c",
+    ),
     ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),
     ("failed", {"message": "no beam"}, "Failed: no beam"),

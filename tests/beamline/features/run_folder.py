@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from beamline.core.files import CONFIG
+from beamline.core.stop import PauseRequest, StopRequest
+from beamline.scan.control import verbs_taken
+from beamline.storage.run_record import RecordFile, RunRecord
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 STARTED = {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98}
@@ -24,3 +30,18 @@ def write_run(run: Path, *events: dict[str, Any]) -> Path:
     lines = "".join(f"{json.dumps(event)}\n" for event in events)
     (run / "events.jsonl").write_text(lines, encoding="utf-8")
     return run
+
+
+@contextmanager
+def asking(run: Path) -> Iterator[list[str]]:
+    """A run whose scan asks what is next, until it is answered; the answers so far."""
+    answers: list[str] = []
+    (run / CONFIG).touch()
+    with closing(RecordFile(run, RunRecord("asking"))) as record:
+
+        def take(choice: str) -> None:
+            record.put(RunRecord("acquiring"), at_once=True)
+            answers.append(str(choice))
+
+        with verbs_taken(run, StopRequest(), PauseRequest(), take):
+            yield answers

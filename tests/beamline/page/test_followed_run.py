@@ -19,8 +19,7 @@ from beamline.core.events import (
     Warned,
 )
 from beamline.core.flag import Flag, Level
-from beamline.page import followed_run
-from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues, answer_of
+from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues, choice_of
 from beamline.plan.passes import Choice
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
@@ -92,14 +91,19 @@ def test_what_can_be_measured_next_stands_in_lists_until_it_is_chosen() -> None:
     assert chosen.decision == "enough, by the operator: as asked"
 
 
-def test_an_answer_is_an_option_of_a_scan_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(followed_run, "Verb", Choice)
-    assert answer_of(_after(STARTED, ASKED), "enough") == "enough"
-    with pytest.raises(ConfigError, match="'wide' is none of next, enough"):
-        answer_of(_after(STARTED, ASKED), "wide")
-    for events in ((), (STARTED, replace(ASKED, wait=0.0)), (STARTED, ASKED, CHOSEN)):
-        with pytest.raises(ConfigError, match="asks nothing now"):
-            answer_of(_after(*events), "next")
+def test_a_choice_is_one_of_the_options() -> None:
+    assert choice_of(_after(STARTED, ASKED), "enough") is Choice.ENOUGH
+    with pytest.raises(ConfigError, match="'wide' is none of what can be measured next: next, enough"):
+        choice_of(_after(STARTED, ASKED), "wide")
+    with pytest.raises(ConfigError, match="no pass has ended yet"):
+        choice_of(_after(STARTED), "next")
+    with pytest.raises(ConfigError, match="none of"):  # of a log of another version
+        choice_of(_after(STARTED, replace(ASKED, options=[{**NEXT, "choice": "later"}])), "later")
+
+
+def test_nobody_is_asked_by_a_scan_that_ends() -> None:
+    assert _after(STARTED, ASKED, StateEntered("paused", "")).wait == 30.0
+    assert _after(STARTED, ASKED, StateEntered("finishing", "")).wait == 0.0
     died = _stamped(STARTED, ASKED).with_file({**SEEN, "status": "died", "next": "resume it"}, 0.0, 1300.0)
     assert died.values.wait == 0.0
 
@@ -122,6 +126,7 @@ def test_each_value_has_the_time_of_what_set_it() -> None:
     [
         (StateEntered("acquiring", ""), "state", Severity.NO_ALARM),
         (StateEntered("paused", "no beam"), "state", Severity.MINOR),
+        (StateEntered("asking", ""), "state", Severity.MINOR),
         (StateEntered("stopped", ""), "state", Severity.MINOR),
         (StateEntered("aborted", ""), "state", Severity.MAJOR),
         (StateEntered("failed", ""), "state", Severity.MAJOR),

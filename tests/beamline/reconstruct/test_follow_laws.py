@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,8 +21,9 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.error_law import ErrorLaw
 from recon.base.geometry import Geometry
+from recon.voxels.measured_law import MeasuredLaw
 from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule
-from tests.beamline.scans import frames_of
+from tests.beamline.scans import BEAM, frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -41,12 +40,18 @@ class Laws:
     offset: float = 0.0
 
     def __call__(
-        self, data: np.ndarray, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator
-    ) -> SimpleNamespace:
+        self,
+        data: np.ndarray,
+        geometry: Geometry,
+        sizes: Sequence[int],
+        rng: np.random.Generator,
+        open_beam: np.ndarray,
+    ) -> MeasuredLaw:
         self.asked.append((data, geometry, list(sizes)))
+        self.open_beam = open_beam
         if self.error is not None:
             raise self.error
-        return SimpleNamespace(law=ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), gained=0.5 * len(sizes))
+        return MeasuredLaw(ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), 0.5 * len(sizes))
 
     @property
     def sizes(self) -> list[list[int]]:
@@ -56,7 +61,7 @@ class Laws:
 @pytest.fixture
 def laws(monkeypatch: pytest.MonkeyPatch) -> Laws:
     made = Laws()
-    monkeypatch.setitem(sys.modules, "recon.voxels.measured_law", SimpleNamespace(measured_law=made))
+    monkeypatch.setattr("beamline.reconstruct.followed_views.measured_law", made)
     return made
 
 
@@ -142,6 +147,37 @@ def test_a_law_waits_until_every_view_of_its_pass_is_corrected(
     assert asked == [0, 0, 1] and laws.sizes == [[10, 20]]
 
 
+def _noisy(frames: Sequence[Frame]) -> list[Frame]:
+    """The frames after three more flats, with the noise of photons."""
+    rng = np.random.default_rng(0)
+    order = [*frames[:4], *[frames[2]] * 3, *frames[4:]]
+    return [
+        replace(frame, counts=rng.poisson(frame.counts).astype(np.uint16), index=i) for i, frame in enumerate(order)
+    ]
+
+
+def test_flats_show_the_noise_of_a_frame(laws: Laws, follow: Callable[..., Followed]) -> None:
+    scan = follow(_noisy(FRAMES), (17,))
+    scan.seconds(17)
+    noise = np.diff(laws.open_beam, axis=0) / np.sqrt(2)
+    assert laws.open_beam.shape == (5, *SCAN.shape)
+    assert noise.std() == pytest.approx(1 / np.sqrt(BEAM), rel=0.15)
+
+
+def test_the_law_of_a_scan_of_64_views(follow: Callable[..., Followed]) -> None:
+    angles = np.pi * np.arange(64) / 64
+    scan = replace(SCAN, angles=np.concatenate([angles[::2], angles[1::2]]))
+    followed = follow(_noisy(frames_of(scan)), (39, 71))
+    followed.seconds(39)
+    (none,) = followed.of("error_law")  # too few
+    assert (none["n_views"], np.isnan(none["exponent"])) == (32, True) and "32 views" in none["reason"]
+    (warning,) = followed.of("warning")
+    assert "32 views" in warning["message"]
+    followed.seconds(32)
+    _, law = followed.of("error_law")
+    assert law["n_views"] == 64 and 0 < law["exponent"] < 1 and 0 <= law["noise"] <= 1 and law["offset"] == 0
+
+
 def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", FRAMES, pause=1.0)
@@ -166,7 +202,10 @@ def test_what_prevents_a_law_is_one_sentence_and_the_fit_goes_on(
         scan.seconds(n)
     (warning,) = scan.of("warning")
     assert len(laws.asked) == 3 and (str(error) or "memory") in warning["message"]
-    assert scan.follower.n_views_taken == 30 and not scan.of("error_law")
+    assert scan.follower.n_views_taken == 30
+    assert [(law["n_views"], str(error) in law["reason"]) for law in scan.of("error_law")] == [
+        (n, True) for n in (10, 20, 30)
+    ]
 
 
 def test_a_mistake_is_not_taken_for_a_scan_without_a_law(laws: Laws, follow: Callable[..., Followed]) -> None:

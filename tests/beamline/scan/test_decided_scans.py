@@ -101,8 +101,8 @@ def gone(scan: Path, output: Path) -> Sequence[str]:
 @pytest.mark.parametrize(
     ("command", "cone", "why"),
     [
-        (gone, False, "the live reconstruction has ended"),
-        (None, False, "there is no live reconstruction"),
+        (gone, False, "no live reconstruction is running"),
+        (None, False, "no live reconstruction is running"),
         (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
     ],
 )

@@ -136,8 +136,8 @@ def test_the_dose_of_a_wish_counts_retakes_that_were_chosen(retaken: int, choice
 def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
     scan = Scan(wait=0.5)
     assert scan.after(1) is Choice.NEXT and scan.waited == round(0.5 / PAUSE_POLL)
-    assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no law of the error within 0.5 s")
-    assert scan.of("pass_ended")[0]["remark"] == "No gain is predicted: no law of the error within 0.5 s."
+    assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no prediction within 0.5 s")
+    assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: no prediction within 0.5 s."
     assert {one["gain"] for one in scan.chosen["options"]} == {None, 0.0}
     assert scan.after(3, law(12), law(33, exponent=0.2)) is Choice.ENOUGH  # the first is of an earlier pass, and late
     assert scan.waited == 2
@@ -163,7 +163,7 @@ def test_a_dead_live_process_means_the_plan_and_is_said_once(asks: bool) -> None
     assert [scan.after(n) for n in (2, 3)] == [Choice.NEXT] * 2
     assert scan.waited == 0 and scan.states.state is State.ACQUIRING
     assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.reason)]
-    assert [each["remark"] for each in scan.of("pass_ended")] == [f"No gain is predicted: {scan.reason}."]
+    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.reason}."]
 
 
 def test_a_law_of_before_does_not_serve_when_the_process_is_dead() -> None:
@@ -210,7 +210,7 @@ def test_without_an_answer_the_plan_goes_on_though_no_law_came() -> None:
     scan = Scan(asks=True, wait=0.5)
     assert scan.after(3) is Choice.NEXT
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no answer within 0.5 s")
-    assert scan.of("pass_ended")[0]["remark"].startswith("No gain is predicted: ")
+    assert scan.of("pass_ended")[0]["remark"].startswith("Gains are not known: ")
 
 
 def test_after_a_pause_it_asks_again() -> None:
@@ -224,6 +224,21 @@ def test_after_a_pause_it_asks_again() -> None:
     scan.moments += [lambda: scan.decide.answer(Choice.NEXT)]
     scan.after(1)
     assert scan.log == ["close shutter", "asking", "paused", "acquiring", "close shutter", "asking"]
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
+    scan = Scan(asks=asks, wait=0.5)
+    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")  # type: ignore[arg-type]
+    assert scan.after(1, none) is Choice.NEXT
+    assert scan.waited == 1 or asks
+    assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: 30 views are few."
+    assert (scan.chosen["by"], scan.chosen["reason"]) == (
+        "plan",
+        "no answer within 0.5 s" if asks else "30 views are few",
+    )
+    scan.decide.asks = False
+    assert scan.after(2, law(24)) is Choice.NEXT and scan.chosen["by"] == "program" and scan.waited == 1
 
 
 def test_a_law_without_its_numbers_is_none() -> None:

@@ -5,7 +5,7 @@ import { Passes } from "./passes.js";
 
 const $ = (id) => document.getElementById(id);
 const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "invalid" };
-const COLOURS = { done: "good", complete: "good", paused: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
+const COLOURS = { done: "good", complete: "good", paused: "warn", asking: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
 const columns = { kind: [], angle: [], time: [], mean: [] };
 const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] }, error: { x: [], y: [] } };
 let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
@@ -227,7 +227,7 @@ function onRun(event) {
   const data = JSON.parse(event.data), live = data.source === "recon";
   switch (data.event) {
     case "run_started": planned = data.n_frames; log(data, `Scan of ${data.sample}: ${data.n_frames} frames planned`); break;
-    case "state": if (!live) { state = data.state; $("message").textContent = data.message; $("said").textContent = ""; } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
+    case "state": if (!live) { state = data.state; $("message").textContent = data.message; $("said").textContent = ""; if (state === "finishing") passes.finish(); } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
     case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
     case "flag": advice.push(data); logFlag(data); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;

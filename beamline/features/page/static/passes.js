@@ -12,6 +12,9 @@ export class Passes {
   /** A pass is over. */
   end(data) { this.ended = data; this.asks = (data.wait ?? 0) > 0; this.draw(); }
 
+  /** A state that ends the question without a choice. */
+  finish() { this.asks = false; this.draw(); }
+
   /** What was chosen; what an earlier choice has brought stands in this event. */
   choose(data) {
     const before = this.decisions.find((each) => each.number === data.judged) ?? this.decisions[this.decisions.length - 1], own = data.options.find((each) => each.choice === data.choice);

@@ -15,11 +15,8 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.epics import ioc
 from beamline.features.epics.ioc import RunServer
-from beamline.page import followed_run
-from beamline.plan.passes import Choice
-from tests.beamline.features.run_folder import FAILED, STARTED, write_run
+from tests.beamline.features.run_folder import FAILED, STARTED, asking, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
 
 thread = pytest.importorskip("p4p.client.thread")
@@ -138,34 +135,25 @@ ASKED = {
 }  # fmt: skip
 
 
-def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path) -> None:
     run = write_run(tmp_path / "2026-01-01T000000_a", STARTED, ASKED)
-    asked: list[tuple[Path, str]] = []
-
-    class Obeyed:
-        def state(self) -> str:
-            return "acquiring"
-
-    def ask(run: Path, verb: str) -> Obeyed:
-        asked.append((run, verb))
-        return Obeyed()
-
-    monkeypatch.setattr(ioc, "ask", ask)
-    monkeypatch.setattr(followed_run, "Verb", Choice)
     with _served(tmp_path, control=True) as (server, client):
-        with pytest.raises(thread.RemoteError, match="asks nothing now"):
+        with pytest.raises(thread.RemoteError, match="no pass has ended yet"):
             client.put("T:Decide", "next", timeout=WITHIN)
         server.look()
         assert list(client.get("T:Options")) == ["next", "enough"] and client.get("T:Recommended") == "next"
         assert client.get("T:OptionDoses")[0] == 12.5 and client.get("T:OptionGainsLow")[0] == 0.6
         assert client.get("T:OptionGains")[1] != client.get("T:OptionGains")[1]
-        with pytest.raises(thread.RemoteError, match="'wide' is none of next, enough"):
-            client.put("T:Decide", "wide", timeout=WITHIN)
-        assert asked == []
-        _put(server, client, "T:Decide", "enough")
-        assert asked == [(run, "enough")] and client.get("T:Decide") == ""
-        with pytest.raises(TimeoutError):  # a choice is no verb of its own
-            client.put("T:EnoughScan", True, timeout=1.0)
+        with pytest.raises(thread.RemoteError, match="no scan is running"):
+            client.put("T:Decide", "next", timeout=WITHIN)
+        with asking(run) as answers:
+            with pytest.raises(thread.RemoteError, match="'wide' is none of what can be measured next: next, enough"):
+                client.put("T:Decide", "wide", timeout=WITHIN)
+            _put(server, client, "T:Decide", "enough")
+            assert answers == ["enough"] and client.get("T:Decide") == ""
+            with pytest.raises(thread.RemoteError, match="does not ask"):
+                client.put("T:Decide", "next", timeout=WITHIN)
+        assert "does not ask" in client.get("T:Decide").raw.alarm.message
 
 
 def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from beamline.storage.run_record import RunRecord, write_record
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.features.page.served import Served, served
-from tests.beamline.features.run_folder import write_run
+from tests.beamline.features.run_folder import asking, write_run
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
@@ -104,6 +104,17 @@ def test_acting_takes_its_own_token_and_our_own_origin(run: Path) -> None:
         assert page.ask("/api/verb/stop", headers={"X-Act-Token": token, "Origin": ours})[0] == 405
     assert page.log.pop(4).startswith("refused: do what is no verb from 127.0.0.1")
     assert [line.split(",")[0] for line in page.log] == ["refused: stop from 127.0.0.1"] * 4 + ["stop"]
+
+
+def test_a_choice_reaches_a_scan_that_asks_and_no_other(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    with served(tmp_path, control=True) as page:
+        assert page.addresses.act is not None
+        headers = {"x_act_token": page.addresses.act.partition("act=")[2], "origin": f"http://{page.host}"}
+        with asking(tmp_path) as answers:
+            assert act(page, "again") == 403 and answers == []
+            assert act(page, "again", **headers) == 200 and answers == ["again"]
+            assert act(page, "enough", **headers) == 404 and answers == ["again"]  # it asks no more
 
 
 def test_a_page_without_control_has_no_token_for_acting(page: Served) -> None:

@@ -8,13 +8,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from beamline.features.page import app
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
-from beamline.plan.passes import Choice
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import write_reconstruction
@@ -31,6 +28,7 @@ from tests.beamline.features.page.chromium import (
 )
 from tests.beamline.features.page.served import listed, served, viewed
 from tests.beamline.features.page.test_run_browser import made
+from tests.beamline.features.run_folder import asking
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 __all__ = ["browser"]
@@ -70,18 +68,8 @@ ENDED = {"event": "pass_ended", "recommended": "next", "wait": 30.0, **PASS}
 CHOSEN = {"event": "next_chosen", "choice": "next", "by": "program", "reason": "<b>most a second", **PASS}
 
 
-def test_what_can_be_measured_next_is_shown_and_chosen(
-    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_can_be_measured_next_is_shown_and_chosen(browser: Browser, tmp_path: Path) -> None:
     """Also by a page that is opened late, which learns all from the log."""
-    asked: list[tuple[Path, str]] = []
-
-    def ask(run: Path, verb: str) -> Obeyed:
-        asked.append((run, verb))
-        return Obeyed()
-
-    monkeypatch.setattr(app, "Verb", Choice)
-    monkeypatch.setattr(app, "ask", ask)
     events = [{**ENDED, "number": 1}, {**CHOSEN, "number": 1}, {**ENDED, "number": 2}]
     log = tmp_path / "events.jsonl"
     log.write_text("".join(f"{json.dumps(event)}\n" for event in events), encoding="utf-8")
@@ -90,7 +78,7 @@ def test_what_can_be_measured_next_is_shown_and_chosen(
     with NXtomoWriter(tmp_path / "scan.h5", ScanInfo("s"), frames[0].counts.shape, clock=SystemClock()) as writer:
         for frame in frames:
             writer.append(frame, digest(frame.counts), [])
-        with served(tmp_path, control=True) as page:
+        with asking(tmp_path) as answers, served(tmp_path, control=True) as page:
             browser.open(page.addresses.look)
             browser.until(lambda: "beamline decide CHOICE; after 30 s" in browser.text("passes"), "the scan asks")
             assert find("#passes button") == []
@@ -104,7 +92,7 @@ def test_what_can_be_measured_next_is_shown_and_chosen(
                 "1 next program +0.80 - <b>most a second",
             ]
             find("#passes button")[1].click()
-            browser.until(lambda: asked == [(tmp_path, "enough")], "the answer reaches the scan")
+            browser.until(lambda: answers == ["enough"], "the answer reaches the scan")
             chosen = {**CHOSEN, "number": 2, "choice": "enough", "by": "operator", "predicted": 0.8, "gained": 0.7}
             with log.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(chosen) + "\n")
@@ -112,13 +100,6 @@ def test_what_can_be_measured_next_is_shown_and_chosen(
             rows = [row.text for row in find("#passes .decisions tbody tr")]
             assert rows == ["2 enough operator +0.00 - <b>most a second", "1 next program +0.80 +0.70 <b>most a second"]
             assert browser.complaints() == []
-
-
-class Obeyed:
-    """A verb that the scan has obeyed."""
-
-    def state(self) -> str:
-        return "acquiring"
 
 
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:

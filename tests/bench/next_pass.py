@@ -1,0 +1,278 @@
+"""The next pass: what a scan's volume gains by each pass, and how few frames the best choice in hindsight takes.
+
+python -m tests.bench.next_pass SCORES.json --scenes 0,1,2
+adds the volumes that SCORES.json lacks, and prints a table. Several calls may add to one file at once.
+
+Scenes: see tests.bench.next_pass_scenes. A state of a scan is the passes that it has, with those taken twice, wide
+views and views taken again where it has them. Its quality is that of the volume that the default method makes of these
+views, with the diameter of a sample wider than the field as the configuration states it: PSNR in dB within 0.95 of the
+field's circle, over the largest density, values clipped at 0. Middle: mean density within 0.3 of the field over the
+true one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import hashlib
+import inspect
+import json
+import math
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import recon
+from recon.assess.error_law import ErrorLaw
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse
+from recon.methods import DEFAULT
+from recon.voxels.measured_law import measured_law
+from tests.bench.next_pass_scenes import COLS, CRUMBED, DEV, PASS, PASSES, RECIPES, VIEWS, noisy, open_beam, scene_of
+
+F32 = NDArray[np.float32]
+VERSION = 1
+"""Of scenes and figures: scores of another one do not belong into the same table."""
+SEEN, MIDDLE, WISH = 0.95, 0.3, 1.0
+"""Of the field's radius: what is judged, and the middle; dB that may lack."""
+
+
+class State(NamedTuple):
+    """What a scan has of the plan: `passes` in its order, those of `again` once more, and what it took beside them."""
+
+    passes: int
+    again: tuple[int, ...] = ()
+    wide: bool = False
+    retaken: bool = False
+
+    def __str__(self) -> str:
+        again = "".join(f"+{one}" for one in self.again)
+        return f"{self.passes}{again}{'w' if self.wide else ''}{'r' if self.retaken else ''}"
+
+    def frames(self, number: int) -> int:
+        """Exposures of the sample."""
+        wide = scene_of(number).geometry.n_views - VIEWS if self.wide else 0
+        return (self.passes + len(self.again)) * PASS + wide + (len(CRUMBED) if self.retaken else 0)
+
+
+class Score(NamedTuple):
+    """Of a volume: dB, density of the middle over the true one, and CPU seconds."""
+
+    quality: float
+    middle: float
+    seconds: float
+
+
+def whole_plan(number: int) -> State:
+    """All that the plan of a scene has."""
+    recipe = RECIPES[number]
+    return State(PASSES, wide=recipe.over > 1, retaken=recipe.crumb)
+
+
+def views_of(number: int, seed: int, state: State) -> tuple[F32, Geometry]:
+    """Line integrals and geometry of the views of a state, in the order taken, without those that a crumb spoils."""
+    scene, taken = _scene(number), state.passes * PASS
+    first = _noisy(number, seed, 0)
+    spoilt = np.zeros(first.shape[0], np.bool_)
+    if RECIPES[number].crumb:
+        spoilt[CRUMBED.start : CRUMBED.stop] = True
+    own = np.flatnonzero(~spoilt[:taken])
+    parts = [(0, own)]
+    for k, one in enumerate(state.again):
+        take = 1 + state.again[:k].count(one)
+        parts.append((take, np.arange(one * PASS, (one + 1) * PASS)))
+    if state.retaken:
+        parts.append((1, np.flatnonzero(spoilt[:taken])))
+    if state.wide:
+        parts.append((0, np.arange(VIEWS, first.shape[0])))
+    views = np.concatenate([_noisy(number, seed, take)[at] for take, at in parts])
+    return views, scene.geometry.select(np.concatenate([at for _, at in parts]))
+
+
+_scene = lru_cache(maxsize=2)(scene_of)
+
+
+@lru_cache(maxsize=4)
+def _noisy(number: int, seed: int, take: int) -> F32:
+    return noisy(number, _scene(number), seed, take)
+
+
+def use_of(number: int) -> DataUse:
+    """The radius of the sample, as its stated diameter gives it."""
+    over = RECIPES[number].over
+    return DataUse(sample_radius=COLS / 2 * over if over > 1 else 0.0)
+
+
+def judged(volume: F32, truth: F32) -> tuple[float, float]:
+    """dB, and the density of the middle over the true one."""
+    x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
+    away = np.hypot(x[:, None], x) / (truth.shape[2] / 2)
+    error = np.mean(np.square(np.maximum(volume, 0) - truth, dtype=np.float64)[:, away < SEEN])
+    middle = away < MIDDLE
+    return 10 * math.log10(float(truth.max()) ** 2 / error), float(volume[:, middle].mean() / truth[:, middle].mean())
+
+
+def measured(number: int, seed: int, state: State, method: str) -> Score:
+    """The score of a state's volume."""
+    views, geometry = views_of(number, seed, state)
+    begin = time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        volume = recon.reconstruct(views, geometry, method, use=use_of(number)).volume.data
+    return Score(*judged(volume, _scene(number).truth), time.process_time() - begin)
+
+
+class Law(NamedTuple):
+    """The values of an `ErrorLaw`, dB by the last pass as it measures them, and CPU seconds."""
+
+    n_views: int
+    exponent: float
+    exponent_error: float
+    noise: float
+    offset: float
+    gained: float | None
+    seconds: float
+
+
+def law_of(number: int, seed: int, state: State) -> Law:
+    """The law at the end of a pass, of the views that a live reconstruction has then."""
+    views, geometry = views_of(number, seed, state)
+    earlier = (views_of(number, seed, State(passes))[0] for passes in range(1, state.passes))
+    sizes = [*map(len, earlier), len(views)]
+    begin = time.process_time()
+    made = measured_law(views, geometry, sizes, np.random.default_rng(seed), open_beam(number, seed))
+    seconds, law = time.process_time() - begin, made.law
+    return Law(law.n_views, law.exponent, law.exponent_error, law.noise, law.offset, made.gained, seconds)
+
+
+@lru_cache(maxsize=1)
+def _law_code() -> str:
+    return hashlib.sha256(inspect.getsource(inspect.getmodule(measured_law) or measured_law).encode()).hexdigest()[:8]
+
+
+class Kept:
+    """Scores and laws in a file, which several processes may add to."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.scores, self.laws = self._read()
+
+    def _read(self) -> tuple[dict[str, Score], dict[str, Law]]:
+        """Raises ValueError: the file was not written by this version of the bench, or is damaged."""
+        if not self.path.exists():
+            return {}, {}
+        try:
+            document = json.loads(self.path.read_text(encoding="utf-8"))
+            version, scores = document["version"], {key: Score(*row) for key, row in document["next_pass"].items()}
+            laws = {key: Law(*row) for key, row in document.get("laws", {}).items()}
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{self.path} does not hold scores of next_pass ({error!r}); give another file") from error
+        if version != VERSION:
+            raise ValueError(f"{self.path} has scores of version {version}, and these are {VERSION}; give another file")
+        return scores, laws
+
+    def _add(self, scores: dict[str, Score], laws: dict[str, Law]) -> None:
+        """Add to what is in the file by now."""
+        with self.path.with_suffix(".lock").open("w", encoding="ascii") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            before = self._read()
+            self.scores, self.laws = before[0] | scores, before[1] | laws
+            document = {"version": VERSION, "next_pass": self.scores, "laws": self.laws}
+            part = self.path.with_suffix(".part")
+            part.write_text(json.dumps(document, indent=0), encoding="utf-8")
+            part.replace(self.path)
+
+    def score(self, number: int, state: State, seed: int = 0, method: str = DEFAULT) -> Score:
+        """Of the file, or made now."""
+        key = f"{number}|{seed}|{method}|{state}"
+        if key not in self.scores:
+            score = measured(number, seed, state, method)
+            print(key, *(round(value, 3) for value in score), file=sys.stderr, flush=True)
+            self._add({key: score}, {})
+        return self.scores[key]
+
+    def has(self, number: int, state: State) -> bool:
+        """Whether the file has the score of a state."""
+        return f"{number}|0|{DEFAULT}|{state}" in self.scores
+
+    def law(self, number: int, seed: int, state: State) -> ErrorLaw:
+        """Of the file, or measured now; its key has a sum of the code that measures."""
+        key = f"{number}|{seed}|{_law_code()}|{state}"
+        if key not in self.laws:
+            law = law_of(number, seed, state)
+            print(key, *law, file=sys.stderr, flush=True)
+            self._add({}, {key: law})
+        return ErrorLaw(*self.laws[key][:5])
+
+
+def hindsight(number: int, kept: Kept, below: float = WISH) -> State:
+    """The state of the fewest frames that is at most `below` dB under the whole plan's.
+
+    Each of the plan's passes is taken to improve the volume, so that few states are looked at. States with passes taken
+    twice count where the file has them.
+    """
+    whole = whole_plan(number)
+    least = kept.score(number, whole).quality - below
+
+    def fewest(of: State) -> State:
+        first, last = 0, PASSES  # the first is too few, the last suffices
+        while last - first > 1:
+            middle = (first + last + 1) // 2
+            enough = kept.score(number, _with(of, middle)).quality >= least
+            first, last = (first, middle) if enough else (middle, last)
+        return _with(of, last)
+
+    best = fewest(whole)
+    plain = State(best.passes) if whole.wide else fewest(State(PASSES))
+    twice = [state for state in (State(1, (0,)), State(2, (1,))) if kept.has(number, state)]
+    reached = [state for state in (plain, *twice) if kept.score(number, state).quality >= least]
+    return min((best, *reached), key=lambda state: state.frames(number))
+
+
+def _with(state: State, passes: int) -> State:
+    """A state of so many passes; before the crumb there is nothing to take again."""
+    return state._replace(passes=passes, retaken=state.retaken and passes * PASS > CRUMBED.start)
+
+
+def fixed(number: int, kept: Kept, frames: int) -> float:
+    """dB of the fixed plan of so many frames, between those of whole passes; wide views and retakes come last."""
+    whole = whole_plan(number)
+    if frames >= VIEWS:
+        return kept.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality
+    low = max(1, frames // PASS)
+    share = frames / PASS - low
+    below = kept.score(number, State(low)).quality
+    return below + share * (kept.score(number, State(low + 1)).quality - below) if share else below
+
+
+def table(kept: Kept, numbers: Sequence[int]) -> str:
+    """Markdown: dB by passes, the fewest frames in hindsight, and the density of the middle with the whole plan."""
+    heads = [f"{PASS * passes}" for passes in range(1, PASSES + 1)]
+    lines = ["| scene | " + " | ".join(heads) + " | whole plan | hindsight | middle |", "|---" * (len(heads) + 4) + "|"]
+    for number in numbers:
+        whole, best = whole_plan(number), hindsight(number, kept)
+        states = [State(passes) for passes in range(1, PASSES + 1)]
+        shown = [f"{kept.score(number, state).quality:.2f}" if kept.has(number, state) else "" for state in states]
+        score = kept.score(number, whole)
+        shown += [f"{score.quality:.2f} ({whole.frames(number)})", f"{best.frames(number)} ({best})"]
+        lines.append(f"| {number} {RECIPES[number]} | " + " | ".join([*shown, f"{score.middle:.3f}"]) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("scores", type=Path)
+    parser.add_argument("--scenes", default=",".join(map(str, DEV)))
+    asked = parser.parse_args()
+    print(table(Kept(asked.scores), [int(number) for number in asked.scenes.split(",")]))
+
+
+if __name__ == "__main__":
+    main()

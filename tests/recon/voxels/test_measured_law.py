@@ -1,0 +1,101 @@
+"""The law of the error, measured: against the error beside a known truth, and its refusals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import recon
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.measured_law import MeasuredLaw, measured_law
+from simulators.frame.shot import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+
+F32 = NDArray[np.float32]
+SIDE, ROWS = 48, 8
+PITCH = 1 / SIDE
+
+
+def sample(balls: int) -> Phantom:
+    rng, bodies = np.random.default_rng(4), []
+    for _ in range(balls):
+        r, turn, z = 0.3 * rng.random() ** 0.5, rng.uniform(0, 2 * np.pi), rng.uniform(-0.1, 0.1)
+        at = float(r * np.cos(turn)), float(r * np.sin(turn)), float(z)
+        bodies.append(Ellipsoid(tuple(rng.uniform(0.03, 0.08, 3).tolist()), 2.0, centre=at))
+    return Phantom.of((Cylinder(0.42, 1.0, 2.0), *bodies))
+
+
+def scan(n: int, photons: float, seed: int = 0) -> tuple[F32, Geometry, F32, F32]:
+    """Views over half a turn in bit-reversed order, their geometry, frames of the open beam, and the truth."""
+    rng, phantom = np.random.default_rng(seed), sample(25)
+    order = np.argsort([int(f"{k:012b}"[::-1], 2) for k in range(n)], kind="stable")
+    geometry = Geometry.parallel(order * np.pi / n, (ROWS, SIDE), pixel_pitch=PITCH)
+    detector = Detector.centred((3 * ROWS, 3 * SIDE), PITCH / 3)
+    fine = np.stack([phantom.line_integrals(float(angle), detector) for angle in geometry.angles])
+    clean = fine.reshape(n, ROWS, 3, SIDE, 3).mean((2, 4))
+    views = -np.log(np.maximum(rng.poisson(photons * np.exp(-clean)), 1) / photons).astype(np.float32)
+    open_beam = -np.log(rng.poisson(photons, (8, 32, SIDE)) / photons).astype(np.float32)
+    return views, geometry, open_beam, phantom.attenuation(Grid.matching(geometry))
+
+
+def law_of(n: int, photons: float, known: bool = True) -> MeasuredLaw:
+    views, geometry, open_beam, _ = scan(n, photons)
+    return measured_law(views, geometry, [n // 2, n], np.random.default_rng(1), open_beam if known else None)
+
+
+def true_gain(n: int, photons: float) -> float:
+    """dB from half of the views to all, by FISTA-TV."""
+    views, geometry, _, truth = scan(n, photons)
+    volumes = [recon.reconstruct(views[:k], geometry.select(np.arange(k)), "fista-tv").volume for k in (n // 2, n)]
+    half, whole = (float(np.mean((volume.data - truth) ** 2)) for volume in volumes)
+    return 10 * math.log10(half / whole)
+
+
+def test_where_noise_makes_the_error_views_bring_what_is_predicted() -> None:
+    law = law_of(96, 300).law
+    assert law.n_views == 96 and law.exponent > 0.5
+    assert law.gain(views=96).mean == pytest.approx(true_gain(192, 300), abs=0.6)
+
+
+def test_where_edges_make_the_error_views_bring_less() -> None:
+    law = law_of(192, 1e6).law
+    assert law.exponent < 0.4
+    assert law.gain(views=192).mean < law_of(192, 300).law.gain(views=192).mean - 0.5
+
+
+def test_views_at_the_same_angles_bring_less_than_others() -> None:
+    law = law_of(96, 300).law
+    assert 0 < law.gain(again=32).mean < law.gain(views=32).mean
+
+
+def test_the_gain_of_the_last_pass_is_that_of_its_views() -> None:
+    measured = law_of(96, 300)
+    assert measured.gained == pytest.approx(10 * measured.law.exponent * math.log10(2))
+    views, geometry, open_beam, _ = scan(96, 300)
+    assert measured_law(views, geometry, [96], np.random.default_rng(1), open_beam).gained is None
+
+
+def test_it_does_without_an_open_beam() -> None:
+    assert 0.25 <= law_of(96, 300, known=False).law.exponent <= 0.65
+
+
+def test_the_same_seed_gives_the_same_law() -> None:
+    assert law_of(64, 300) == law_of(64, 300)
+
+
+def test_what_cannot_be_measured_is_refused() -> None:
+    views, geometry, open_beam, _ = scan(96, 300)
+    rng = np.random.default_rng(0)
+    few = np.arange(40)
+    with pytest.raises(ValueError, match="40 views are fewer than 48"):
+        measured_law(views[few], geometry.select(few), [40], rng, open_beam)
+    cone = Geometry.cone(geometry.angles, (ROWS, SIDE), pixel_pitch=PITCH, sod=5.0, sdd=7.0)
+    with pytest.raises(ValueError, match="cone"):
+        measured_law(views, cone, [96], rng, open_beam)
+    with pytest.raises(ValueError, match="nothing to reconstruct"):
+        measured_law(np.zeros_like(views), geometry, [96], rng, open_beam)
