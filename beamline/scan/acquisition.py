@@ -204,7 +204,7 @@ class Acquisition:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
         beyond = middle_of_exposure(views)[triggers]
-        earlier = sum(done.block.n for done in self._done if done.again and done not in self._done_views)
+        earlier = sum(done.block.left for done in self._done if done.again)
         done = RecordedBlock(retake_block(views, triggers), BlockTally(), again=True)
         for frame in self._block(done):
             i = frame.trigger
@@ -224,20 +224,19 @@ class Acquisition:
     @property
     def _missing_views(self) -> tuple[int, ...]:
         """Triggers of the views that gave no frame, in ascending order."""
-        return tuple(sorted(i for done in self._done_views if not done.again for i in done.taken.missing))
+        return tuple(sorted(i for taken in self._first_taken for i in taken.missing))
 
     @property
-    def _done_views(self) -> list[RecordedBlock]:
-        """What was taken of the views; views that were taken again for single ones have other triggers."""
-        blocks = [block.first_trigger for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
-        views = (done for done in self._done if done.block.kind is FrameKind.PROJECTION)
-        return [done for done in views if done.block.first_trigger in blocks]
+    def _first_taken(self) -> list[BlockTally]:
+        """Tallies of the views, without those that repeat views."""
+        kind = FrameKind.PROJECTION
+        return [done.taken for done in self._done if done.block.kind is kind and not done.again]
 
     def _recover(self, triggers: Collection[int]) -> None:
         """These views have a frame: they are not missing, if they were."""
-        for done in self._done_views:
-            for trigger in set(done.taken.missing) & {*triggers} if not done.again else ():
-                done.taken.missing.remove(trigger)
+        for taken in self._first_taken:
+            for trigger in {*taken.missing}.intersection(triggers):
+                taken.missing.remove(trigger)
                 self.recovered += 1
 
     def _wide(self, block: Block) -> Iterator[Frame]:
@@ -365,7 +364,7 @@ class Acquisition:
     def _raise_outcome(self) -> None:
         blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
         planned = sum(block.n for block in blocks)
-        views = sum(len(done.taken.rows) for done in self._done_views) + sum(len(block.stored) for block in blocks)
+        views = sum(len(taken.rows) for taken in self._first_taken) + sum(len(block.stored) for block in blocks)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
         if self._refused:

@@ -215,6 +215,10 @@ VIOLATIONS = {
     "one view": ({"angles": np.zeros(1)}, "at least 2 views"),
     "no flats": ({"flats": FieldPlan(0, Place.START, 0.05)}, "no flats: scan.flats.count is 0"),
     "no darks": ({"darks": FieldPlan(0, Place.BOTH, 0.05)}, "no darks: scan.darks.count is 0"),
+    "passes": (
+        {"mode": Mode.STEP, "pass_views": 3},
+        "scan.pass_views 3 makes more than 100 passes of 360 views; set it to at least 4, or to 0",
+    ),
 }
 
 

@@ -91,7 +91,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         assert (ran.error is None) is not enough
         status = "stopped" if enough else "complete"
         if enough:
-            n = sum(len(one) for one in sets if max(one) < VIEWS)
+            n = len({trigger for one in sets for trigger in one if trigger < VIEWS})
             assert f"Stopped after {n} of 12 projections: the views suffice." in str(ran.error)
         else:
             assert (ran.result.missing, ran.result.n_frames, ran.result.retaken) == ((), len(frames), 0)
