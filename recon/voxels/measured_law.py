@@ -70,7 +70,7 @@ def measured_law(
         geometry: of these views: parallel beam, straight.
         sizes: numbers of views at the ends of passes so far, the last of all.
         open_beam: line integrals [frame, row, col] of frames of the open beam, noise alone, three or more, binned as
-            the views; None: the share of the error that stays is not measured, and taken as none.
+            the views; None: how far the error falls is not measured, and taken as usual.
 
     Raises:
         ValueError: a cone, fewer than 48 views, or views without matter.
@@ -95,7 +95,7 @@ def measured_law(
     if scan.noise is not None:
         real = [scan.unseen_power(volume, scan.views, held_out) for volume in measured]
         fall = _fall(real, [scan.unseen_power(volume, copy, held_out) for volume in copied])
-    exponent = float(np.interp(noise * (fall or _FALL), _NOISY, (_BY_ELSE, _BY_NOISE)))
+    exponent = float(np.interp(noise * (_FALL if fall is None else fall), _NOISY, (_BY_ELSE, _BY_NOISE)))
     if n < geometry.detector_shape[1]:  # gaps between the views make the error
         exponent = _BY_NOISE
     beside = _DENSITY * offset_error(Volume(measured[1], scan.box), scan.geometry, sample)
@@ -199,8 +199,8 @@ class _Scan:
 
     @property
     def in_angle(self) -> NDArray[np.intp]:
-        """Views in the order of their angles over half a turn."""
-        return np.argsort(np.mod(self.geometry.angles, np.pi), kind="stable")
+        """Views in the order of their angles, as `split_views` takes every eighth of them."""
+        return np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
 
     def copies(self, sample: F32, fitted: NDArray[np.intp], rng: np.random.Generator) -> tuple[F32, F32]:
         """Two scans [view, row, col] of a sample, with different noise like that of the open beam; without one, like
