@@ -35,7 +35,7 @@ class Decider:
         frames: with light on the sample beside the views, of earlier parts of the run.
         unable: why no law can come; "" while one may.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
-        close_shutter: called before the operator is asked.
+        close_shutter: called before the scan waits.
         record: takes the values of a decision, for the file.
     """
 
@@ -132,9 +132,15 @@ class Decider:
         known = law and not (self.asks or self._unable)
         if law and known and next_is_sure(passes, offered, self.wish, self._spent(passes), law):
             return law, offered
-        self._wait(lambda: self._law_of == len(self._ended) or self._take_law() or bool(self.unable()))
+        if not self._law_has_come():
+            self.close_shutter()  # a law takes seconds
+            self._wait(self._law_has_come)
         law = self._law and replace(self._law, n_views=passes.n_views) if self._law_of == len(self._ended) else None
         return law, options(passes, law, self.timeline, self.seconds_of)
+
+    def _law_has_come(self) -> bool:
+        """Whether the law of all views so far is there, or none can come."""
+        return self._law_of == len(self._ended) or self._take_law() or bool(self.unable())
 
     def _take_law(self) -> bool:
         """Take up a law that has come; whether it is of all views so far, or late, and of an earlier pass."""
