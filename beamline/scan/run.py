@@ -49,7 +49,6 @@ from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.frame import FrameKind
 from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
@@ -204,7 +203,6 @@ class _Run:
     @cached_property
     def decider(self) -> Decider:
         scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
-        wide = (block for block in timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
 
         def seconds_of(block: Block, at: float | None = None) -> float:
             at = devices.stage.position() if at is None else at
@@ -223,7 +221,7 @@ class _Run:
             sink=self.sink,
             seconds=sum(seconds_of(block, 0.0) for block in after if block.kind in REFERENCES)
             + (self.series.seconds if self.series else 0.0),
-            frames=sum(len(block.stored) for block in wide),
+            number=len(timeline.plan.choices),
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
         )
 

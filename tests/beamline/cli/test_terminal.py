@@ -143,7 +143,11 @@ EVENTS = [
         SCAN,
         "Scan complete: 3",
     ),
-    ("error_law", {"n_views": 9, "exponent": 1.0, "exponent_error": 0.1, "noise": 1.0, "offset": 0.1}, None),
+    (
+        "error_law",
+        {"number": 1, "n_views": 9, "exponent": 1.0, "exponent_error": 0.1, "noise": 1.0, "offset": 0.1},
+        None,
+    ),
     (
         "next_chosen",
         {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71},

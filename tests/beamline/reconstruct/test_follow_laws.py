@@ -249,7 +249,7 @@ def test_a_selection_of_views_stands_for_all(laws: Laws, follow: Callable[..., F
     for n in (14, 10):
         scan.seconds(n)
     assert laws.sizes == [[5], [5, 10]]
-    assert [law["n_views"] for law in scan.of("error_law")] == [10, 20]
+    assert [(law["number"], law["n_views"]) for law in scan.of("error_law")] == [(1, 5), (2, 10)]
 
 
 def test_a_pass_without_a_view_that_can_be_used_has_no_law(laws: Laws, follow: Callable[..., Followed]) -> None:
