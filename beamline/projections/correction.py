@@ -180,15 +180,17 @@ class ScanCorrection:
         part = None if self._stream is None else self._stream.provisional()
         return None if part is None else self._filters.apply(part, None)
 
-    def open_beam(self, most: int) -> NDArray[np.float32] | None:
+    def open_beam(self, most: int) -> NDArray[np.float32]:
         """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
 
-        None: the scan has line integrals already.
+        None where the scan has line integrals already.
 
         Raises:
             DataError: as `at_once`.
         """
-        return None if self._beam is None else self.quiet().at_once(self._beam.used.flats[-1][:most]).data
+        if self._beam is None:
+            return np.zeros((0, 0, 0), np.float32)
+        return self.quiet().at_once(self._beam.used.flats[-1][:most]).data
 
     @property
     def done(self) -> dict[str, StepDone]:

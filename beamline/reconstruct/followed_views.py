@@ -214,15 +214,14 @@ class PassLaws:
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
             open_beam = correction.open_beam(_OPEN_BEAM)
-            measured = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
+            law, gained = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
             self._warn(f"No gain by further views is predicted: {why}.")
             unknown = ends.size, rows.size, math.nan, math.nan, math.nan, math.nan
             self._sink(LawMeasured(*unknown, reason=why, time=self._clock.now()))
             return
-        law = measured.law
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
         now = self._clock.now()
-        self._sink(LawMeasured(ends.size, **vars(law), gained=measured.gained, seconds=now - begin, time=now))
+        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, seconds=now - begin, time=now))

@@ -21,7 +21,6 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
-from recon.voxels.measured_law import MeasuredLaw
 from tests.beamline.reconstruct.growing_scan import BRIEF, INTERLACED, SCAN, ScanClock, alarms, close, options, schedule
 from tests.beamline.scans import BEAM, frames_of
 
@@ -46,12 +45,12 @@ class Laws:
         sizes: Sequence[int],
         rng: np.random.Generator,
         open_beam: np.ndarray,
-    ) -> MeasuredLaw:
+    ) -> tuple[ErrorLaw, float]:
         self.asked.append((data, geometry, list(sizes)))
         self.open_beam = open_beam
         if self.error is not None:
             raise self.error
-        return MeasuredLaw(ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), 0.5 * len(sizes))
+        return ErrorLaw(sizes[-1], 1.5, 0.1, 0.25, self.offset), 0.5 * len(sizes)
 
     @property
     def sizes(self) -> list[list[int]]:
