@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from beamline.config.beam import NoMonochromator
 from beamline.config.load import NO_LIVE, Config, changed, load, override_of
-from beamline.core.errors import ConfigError, ScanStopped, refuse_wrong_arguments
+from beamline.core.errors import ConfigError, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
@@ -147,9 +147,6 @@ class Instrument:
                     [remember, say, *([on_event] if on_event else [])], stop,
                     live=how.live, afterwards=how.afterwards, instrument=self._devices,
                 )  # fmt: skip
-        except ScanStopped:
-            if not stop.enough:
-                raise
         finally:
             self.last = _result(ends)
         assert self.last is not None

@@ -231,7 +231,7 @@ class StopRequest:
     @property
     def enough(self) -> bool:
         """Whether only `stop_as_enough` asked for the stop."""
-        return self._enough and not self.aborting
+        return self._enough and not (self.aborting or self.by_person)
 
     @property
     def seconds(self) -> float:

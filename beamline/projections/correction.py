@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
@@ -22,7 +23,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ViewLight
+from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
@@ -181,7 +182,8 @@ class ScanCorrection:
         return None if part is None else self._filters.apply(part, None)
 
     def open_beam(self, most: int) -> NDArray[np.float32]:
-        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
+        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are,
+        with noise as of the exposure of a view.
 
         None where the scan has line integrals already.
 
@@ -190,7 +192,9 @@ class ScanCorrection:
         """
         if self._beam is None:
             return np.zeros((0, 0, 0), np.float32)
-        return self.quiet().at_once(self._beam.used.flats[-1][:most]).data
+        flats = self._beam.used.flats[-1][:most]
+        light = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
+        return self.quiet().at_once(flats).data * np.float32(math.sqrt(light) if light > 0 else 1.0)
 
     @property
     def done(self) -> dict[str, StepDone]:

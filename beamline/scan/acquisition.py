@@ -255,8 +255,8 @@ class Acquisition:
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {done.block.kind for done in self._done if done.taken.frames}
-        unhurried = self._stop.enough and not self._stop.by_person
-        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and (unhurried or block.kind not in kinds)
+        needed = self._stop.enough or block.kind not in kinds
+        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and needed
 
     def _set_shutter_and_sample(self, block: Block) -> None:
         """Bring shutter and sample where the block needs them; a shutter that does not move ends the scan."""
@@ -369,7 +369,7 @@ class Acquisition:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")
         if self._refused:
             raise ReferencesError(self._refused)
-        if self._stop.stopping:
+        if self._stop.stopping and not self._stop.enough:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before the first frame: {self._stop.reason}.")
             raise ScanStopped(

@@ -27,7 +27,7 @@ class ErrorLaw:
     Attributes:
         n_views: of the volume.
         exponent: of the fall of the mean square error with the number of views.
-        exponent_error: its standard error.
+        exponent_error: its standard error; those of the shares are as large a part of them.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
@@ -40,10 +40,12 @@ class ErrorLaw:
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
         """dB by so many views at new angles, at the same angles again, and by wide views."""
 
-        def of(exponent: float) -> float:
-            noise = self.noise * self.n_views / (self.n_views + again)
-            left = (1 - self.noise - self.offset + noise) * (1 + views / self.n_views) ** -exponent
-            return -10 * math.log10(left + (0.0 if wide else self.offset)) or 0.0  # never -0.0
+        def of(scale: float) -> float:
+            noise = min(scale * self.noise, 1 - self.offset)
+            beside = self.offset * (max(1 - scale, 0) if wide else 1)
+            light = noise * self.n_views / (self.n_views + again)
+            left = (1 - noise - self.offset + light) * (1 + views / self.n_views) ** (-scale * self.exponent)
+            return -10 * math.log10(left + beside) or 0.0  # never -0.0
 
-        low, high = (max(0.0, self.exponent + sign * 2 * self.exponent_error) for sign in (-1, 1))
-        return Gain(of(self.exponent), of(low), of(high))
+        error = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
+        return Gain(of(1.0), of(1 - error), of(1 + error))

@@ -89,7 +89,7 @@ def measured_law(
         [slab.unseen_power(volume, slab.views, held_out) for volume in measured],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    exponent = float(np.interp(noise * (fall or _FALL), _NOISY, (_BY_ELSE, _BY_NOISE)))
+    exponent = float(np.interp(noise * (_FALL if fall is None else fall), _NOISY, (_BY_ELSE, _BY_NOISE)))
     if n < geometry.detector_shape[1]:  # gaps between the views make the error
         exponent = _BY_NOISE
     beside = _DENSITY * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
@@ -167,7 +167,7 @@ class _Slab:
 
     def chosen_weight(self) -> float:
         """The weight that predicts views held out best, for one view."""
-        in_angle = np.argsort(np.mod(self.geometry.angles, np.pi), kind="stable")
+        in_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
         some = np.sort(in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         self.volume(self.views, some, None)
         by_noise = float(self.made["weight"][0] / len(some) ** _BY_VIEWS)

@@ -22,6 +22,10 @@ def test_gains_are_those_of_the_error() -> None:
     ends = law.gain(views=100)
     assert ends.low == pytest.approx(-10 * math.log10(0.8 * 2**-0.3 + 0.2))
     assert ends.high == pytest.approx(-10 * math.log10(0.8 * 2**-0.7 + 0.2))
+    again = law.gain(again=100)
+    assert again.low == pytest.approx(-10 * math.log10(1 - 0.24 / 2))  # the share of the noise is as uncertain
+    assert again.high == pytest.approx(-10 * math.log10(1 - 0.56 / 2))
+    assert law.gain(wide=True).low == pytest.approx(-10 * math.log10(1 - 0.6 * 0.2))
 
 
 @given(LAWS, st.integers(0, 500), st.integers(0, 500), st.booleans())
