@@ -246,7 +246,6 @@ class LawMeasured(Event, event="error_law"):
         n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`, of the views that the
             live reconstruction uses.
         gained: dB by the last pass, as views held out measure it; None: not known.
-        seconds: that it took.
         reason: why these views have no law; then the other numbers are NaN.
     """
 
@@ -257,7 +256,6 @@ class LawMeasured(Event, event="error_law"):
     noise: float
     offset: float
     gained: float | None = None
-    seconds: float = math.nan
     reason: str = ""
 
 

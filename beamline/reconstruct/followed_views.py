@@ -119,9 +119,6 @@ _UNKNOWN = (
 )
 
 
-_NO_AXIS_NO_LAW = "No gain by further views is predicted before the rotation axis is known."
-
-
 class AxisSearch:
     """Repeats the search for the rotation axis each time the views have grown by half, at a quarter of a turn, at half
     a turn, and at the end.
@@ -195,10 +192,10 @@ class PassLaws:
         if not ends.size or (end := int(ends[-1])) == self._end:
             return
         if axis_col is None:
-            self._warn(_NO_AXIS_NO_LAW)
+            self._warn("No gain by further views is predicted before the rotation axis is known.")
         if axis_col is None or cursor.taken < end:
             return
-        self._end, begin = end, self._clock.now()
+        self._end = end
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
         images = {
@@ -223,5 +220,4 @@ class PassLaws:
             return
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
-        now = self._clock.now()
-        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, seconds=now - begin, time=now))
+        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))

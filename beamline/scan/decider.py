@@ -37,7 +37,7 @@ class Decider:
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
         unable: why no law can come; "" while one may. Once it has said so, the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
-        close_shutter: called before the operator is asked.
+        close_shutter: called before the scan waits.
         record: takes the values of a decision, for the file.
     """
 
@@ -119,6 +119,7 @@ class Decider:
         offered = options(passes, law, self.timeline, self.seconds_of)
         known = law and not (self.asks or self.unable())
         if not (law and known and next_is_sure(passes, offered, self.wish, law, *self._spent(passes))):
+            self.close_shutter()  # a law takes seconds
             self._wait(lambda: self._law.number == self.number or bool(self.unable()))
             law = self._newest(passes) if self._law.number == self.number else None
             offered = options(passes, law, self.timeline, self.seconds_of)

@@ -118,7 +118,7 @@ def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[
     assert [(law["n_views"], law["exponent"], law["noise"], law.get("gained")) for law in told] == [
         (n, 1.5, 0.25, gained) for n, gained in ((10, 0.5), (20, 1.0), (30, 1.5))
     ]
-    assert all(law["seconds"] >= 0 for law in told) and isinstance(scan.events[-1], LawMeasured)
+    assert isinstance(scan.events[-1], LawMeasured)
     close(scan.clock)
     with open_scan(tmp_path / "scan.h5") as source:
         whole = prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda sentence: None)

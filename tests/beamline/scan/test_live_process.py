@@ -270,7 +270,7 @@ def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path
     said = """
 import json
 law = {"event": "error_law", "number": 1, "n_views": 90, "noise": 0.2, "offset": 0.0}
-print(json.dumps({**law, "exponent": 1.1, "exponent_error": 0.1, "gained": None, "seconds": 2.0}))
+print(json.dumps({**law, "exponent": 1.1, "exponent_error": 0.1, "gained": None}))
 print(json.dumps({"event": "error_law", "n_views": 90}))
 """
     laws: list[LawMeasured] = []
