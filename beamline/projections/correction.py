@@ -182,8 +182,9 @@ class ScanCorrection:
         return None if part is None else self._filters.apply(part, None)
 
     def open_beam(self, most: int) -> NDArray[np.float32]:
-        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are,
-        with noise as of the exposure of a view.
+        """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
+
+        Their noise is that of the exposure of a view.
 
         None where the scan has line integrals already.
 

@@ -119,11 +119,16 @@ class Decider:
         offered = options(passes, law, self.timeline, self.seconds_of)
         known = law and not (self.asks or self.unable())
         if not (law and known and next_is_sure(passes, offered, self.wish, law, *self._spent(passes))):
-            self.close_shutter()  # a law takes seconds
-            self._wait(lambda: self._law.number == self.number or bool(self.unable()))
+            if not self._law_has_come():
+                self.close_shutter()  # a law takes seconds
+                self._wait(self._law_has_come)
             law = self._newest(passes) if self._law.number == self.number else None
             offered = options(passes, law, self.timeline, self.seconds_of)
         return law, offered
+
+    def _law_has_come(self) -> bool:
+        """Whether the law of all views so far is there, or none can come."""
+        return self._law.number == self.number or bool(self.unable())
 
     def _newest(self, passes: Passes) -> ErrorLaw | None:
         """The newest law. Gains depend on ratios of numbers of views alone: a law of some views serves for all."""

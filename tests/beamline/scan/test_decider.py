@@ -187,7 +187,7 @@ def test_the_operator_is_asked_with_a_closed_shutter() -> None:
     scan.moments = [lambda: scan.decide.add_law(law(12)), lambda: None, lambda: None]
     scan.moments += [lambda: scan.decide.answer(Choice.WIDE), lambda: scan.decide.answer(Choice.AGAIN)]
     assert scan.after(1) is Choice.AGAIN
-    assert scan.log == ["close shutter", "close shutter", "asking"]  # for the law, and for the operator
+    assert scan.log == ["close shutter", "close shutter", "asking"]  # while it waits for the law, too
     (ended,) = scan.of("pass_ended")
     assert ended["wait"] == 60 and ended["recommended"] == "next"
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("operator", "the operator chose it")
@@ -223,6 +223,13 @@ def test_after_a_pause_it_asks_again() -> None:
     scan.moments += [lambda: scan.decide.answer(Choice.NEXT)]
     scan.after(1)
     assert scan.log[1:] == ["close shutter", "asking", "paused", "acquiring", "close shutter", "asking"]
+
+
+def test_the_shutter_stays_open_where_the_law_is_there() -> None:
+    scan = Scan()
+    scan.decide.add_law(law(12))
+    assert scan.after(1) is Choice.NEXT
+    assert not scan.log
 
 
 @pytest.mark.parametrize("asks", [False, True])

@@ -13,6 +13,8 @@ from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.measured_law import measured_law
+from recon.voxels.priors import NoiseBalance
+from recon.voxels.voxel_problem import VoxelProblem
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
@@ -31,16 +33,16 @@ def sample(balls: int) -> Phantom:
     return Phantom.of((Cylinder(0.42, 1.0, 2.0), *bodies))
 
 
-def scan(n: int, photons: float, seed: int = 0) -> tuple[F32, Geometry, F32, F32]:
+def scan(n: int, photons: float, seed: int = 0, cols: int = SIDE) -> tuple[F32, Geometry, F32, F32]:
     """Views over half a turn in bit-reversed order, their geometry, frames of the open beam, and the truth."""
     rng, phantom = np.random.default_rng(seed), sample(25)
     order = np.argsort([int(f"{k:012b}"[::-1], 2) for k in range(n)], kind="stable")
-    geometry = Geometry.parallel(order * np.pi / n, (ROWS, SIDE), pixel_pitch=PITCH)
-    detector = Detector.centred((3 * ROWS, 3 * SIDE), PITCH / 3)
+    geometry = Geometry.parallel(order * np.pi / n, (ROWS, cols), pixel_pitch=PITCH)
+    detector = Detector.centred((3 * ROWS, 3 * cols), PITCH / 3)
     fine = np.stack([phantom.line_integrals(float(angle), detector) for angle in geometry.angles])
-    clean = fine.reshape(n, ROWS, 3, SIDE, 3).mean((2, 4))
+    clean = fine.reshape(n, ROWS, 3, cols, 3).mean((2, 4))
     views = -np.log(np.maximum(rng.poisson(photons * np.exp(-clean)), 1) / photons).astype(np.float32)
-    open_beam = -np.log(rng.poisson(photons, (8, 32, SIDE)) / photons).astype(np.float32)
+    open_beam = -np.log(rng.poisson(photons, (8, 32, cols)) / photons).astype(np.float32)
     return views, geometry, open_beam, phantom.attenuation(Grid.matching(geometry))
 
 
@@ -58,19 +60,19 @@ def true_gain(n: int, photons: float) -> float:
 
 
 def test_where_noise_makes_the_error_views_bring_what_is_predicted() -> None:
-    law, _ = law_of(96, 300)
+    law = law_of(96, 300)[0]
     assert law.n_views == 96 and law.exponent > 0.5
     assert law.gain(views=96).mean == pytest.approx(true_gain(192, 300), abs=0.6)
 
 
 def test_where_edges_make_the_error_views_bring_less() -> None:
-    law, _ = law_of(192, 1e6)
+    law = law_of(192, 1e6)[0]
     assert law.exponent < 0.4
     assert law.gain(views=192).mean < law_of(192, 300)[0].gain(views=192).mean - 0.5
 
 
 def test_views_at_the_same_angles_bring_less_than_others() -> None:
-    law, _ = law_of(96, 300)
+    law = law_of(96, 300)[0]
     assert 0 < law.gain(again=32).mean < law.gain(views=32).mean
 
 
@@ -80,6 +82,44 @@ def test_the_gain_of_the_last_pass_is_measured_apart_from_the_law(n: int, photon
     assert gained == pytest.approx(true_gain(n, photons), abs=0.8)
     views, geometry, open_beam, _ = scan(n, photons)
     assert measured_law(views, geometry, [n], np.random.default_rng(1), open_beam)[1] is None
+
+
+def test_the_noise_of_the_open_beam_is_taken_off_the_residual() -> None:
+    views, geometry, open_beam, _ = scan(192, 300)
+    known, unknown = (
+        measured_law(views, geometry, [96, 192], np.random.default_rng(1), frames)[1]
+        for frames in (open_beam, open_beam * np.float32(0.3))
+    )
+    assert known is not None and unknown is not None
+    assert unknown < known / 2  # the noise, which more views do not change, hides the fall of the error
+
+
+def test_wide_views_help_where_the_sample_is_wider_than_the_field() -> None:
+    views, geometry, open_beam, _ = scan(96, 3000, cols=28)
+    law = measured_law(views, geometry, [96], np.random.default_rng(1), open_beam)[0]
+    assert 0 < law.offset <= 0.4 and law.gain(wide=True).mean > 0
+    assert law.noise + law.offset < 1
+    assert law_of(96, 3000)[0].offset == 0
+
+
+def test_fewer_views_than_columns_leave_gaps_that_others_fill() -> None:
+    views, geometry, open_beam, _ = scan(56, 1e6, cols=64)
+    assert measured_law(views, geometry, [56], np.random.default_rng(1), open_beam)[0].exponent == 0.6
+
+
+def test_views_of_many_columns_are_binned(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, seen = law_of(192, 300)[0], list[int]()
+    monkeypatch.setattr("recon.voxels.measured_law._WORK", 192 * SIDE**2 - 1)
+    made = NoiseBalance.of
+
+    def of(problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
+        seen.append(problem.data.shape[1])
+        return made(problem, start, sweeps)
+
+    monkeypatch.setattr(NoiseBalance, "of", of)
+    binned = law_of(192, 300)[0]
+    assert seen == [SIDE // 2]
+    assert binned.n_views == 192 and binned.exponent == pytest.approx(whole.exponent, abs=0.15)
 
 
 def test_the_same_seed_gives_the_same_law() -> None:
