@@ -89,9 +89,9 @@ def measured_law(
         [slab.unseen_power(volume, slab.views, held_out) for volume in measured],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    exponent = float(np.interp(noise * (_FALL if fall is None else fall), _NOISY, (_BY_ELSE, _BY_NOISE)))
-    if n < geometry.detector_shape[1]:  # gaps between the views make the error
-        exponent = _BY_NOISE
+    gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
+    by_noise = 1.0 if gaps else noise * (_FALL if fall is None else fall)
+    exponent = float(np.interp(by_noise, _NOISY, (_BY_ELSE, _BY_NOISE)))
     beside = _DENSITY * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
     offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
@@ -143,9 +143,8 @@ class _Slab:
     @classmethod
     def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32) -> _Slab:
         """Rows with most matter of a scan whose sample is `width` times as wide as the field."""
-        factor = 1
-        while len(data) * (width * data.shape[2] / factor) ** 2 > _WORK:
-            factor *= 2
+        halvings = math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))
+        factor = 2 ** max(0, math.ceil(halvings))
         rows = busiest_rows(data, min(_ROWS * factor, data.shape[1]))
         views, geometry = np.ascontiguousarray(data[:, rows]), geometry.rows(rows.start, rows.stop)
         change = np.diff(open_beam, axis=0)
