@@ -205,8 +205,9 @@ class _Run:
         scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
 
         def seconds_of(block: Block) -> float:
-            stage, ready = devices.stage, self.ready
-            return block_seconds(block, stage.limits, ready.timing, ready.plan.settle, stage.position())
+            return block_seconds(
+                block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, devices.stage.position()
+            )
 
         after = timeline.blocks[timeline.blocks.index(timeline.views) :]
         return Decider(
