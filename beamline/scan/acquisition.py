@@ -172,7 +172,6 @@ class Acquisition:
             if not (passes.to_come or passes.wide or passes.retakes):
                 return
             choice = next_pass(passes)
-            self._stop.refuse_abort()
             if choice is Choice.ENOUGH and not self._stop.stopping:
                 self._stop.stop_as_enough("the views suffice")
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
