@@ -93,8 +93,10 @@ def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float
         seconds, dose: that the scan has taken; the seconds include what must follow the views.
     """
     if wish.quality_db is not None and rest.mean <= wish.quality_db:
-        left = f"{rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f})"
-        return Choice.ENOUGH, f"all that is left would add {left}; {wish.quality_db:g} dB may lack"
+        return Choice.ENOUGH, (
+            f"all that is left would add {rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f}); "
+            f"{wish.quality_db:g} dB may lack"
+        )
     useful = {one: _beyond(one, wish, seconds, dose) for one in offered if one.gain > 0}
     within = [one for one, why in useful.items() if not why]
     if not within:
@@ -103,8 +105,10 @@ def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float
     following = next((one for one in within if one.choice is Choice.NEXT), best)
     if best.low / best.seconds <= following.high / following.seconds:
         best = following
-    gain = f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f})"
-    return best.choice, f"{gain} in {best.seconds:.0f} s; nothing else is surely better for its time"
+    return best.choice, (
+        f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f}) in {best.seconds:.0f} s; "
+        "nothing else is surely better for its time"
+    )
 
 
 def rest_gain(passes: Passes, law: ErrorLaw) -> Gain:

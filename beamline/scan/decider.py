@@ -117,8 +117,8 @@ class Decider:
         """
         law = self._newest(passes)
         offered = options(passes, law, self.timeline, self.seconds_of)
-        known = law and not (self.asks or self.unable())
-        if not (law and known and next_is_sure(passes, offered, self.wish, law, *self._spent(passes))):
+        spent = self._spent(passes)
+        if law is None or self.asks or self.unable() or not next_is_sure(passes, offered, self.wish, law, *spent):
             if not self._law_has_come():
                 self.close_shutter()  # a law takes seconds
                 self._wait(self._law_has_come)

@@ -111,10 +111,10 @@ class RunServer:
         client when the verb is done: a verb never waits for another one."""
 
         def put(pv: Any, op: Any) -> None:
-            if not bool(op.value()):
+            if bool(op.value()):
+                self._send(pv, op, lambda: verb)
+            else:
                 op.done()
-                return
-            self._send(pv, op, lambda: verb)
 
         return put
 
