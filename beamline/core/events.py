@@ -242,19 +242,20 @@ class LawMeasured(Event, event="error_law"):
     """How the error of the volume falls with further views, by the live reconstruction at the end of a pass.
 
     Attributes:
-        n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`.
+        number: of the pass, from 1.
+        n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`, of the views that the
+            live reconstruction uses.
         gained: dB by the last pass, as views held out measure it; None: not known.
-        seconds: that it took.
         reason: why these views have no law; then the other numbers are NaN.
     """
 
+    number: int
     n_views: int
     exponent: float
     exponent_error: float
     noise: float
     offset: float
     gained: float | None = None
-    seconds: float = math.nan
     reason: str = ""
 
 

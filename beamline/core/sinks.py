@@ -155,7 +155,7 @@ def _options(ended: PassEnded) -> Iterator[str]:
     for each in ended.options:
         mark, choice = "> " if each["choice"] == ended.recommended else "  ", one_line(str(each["choice"]))
         cost = f"{each['seconds']:>9.0f}{100 * each['dose']:>7.1f} %{size(each['bytes']):>10}"
-        yield f"{mark}{choice:<7}{_gain(each):<22}{_gain_per_minute(each):>8}{cost}"
+        yield "{}{:<7}{:<22}{:>8}{}".format(mark, choice, *_gain(each), cost)
     if ended.remark:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
@@ -163,16 +163,13 @@ def _options(ended: PassEnded) -> Iterator[str]:
         yield f"Within {ended.wait:.0f} s: {answer}; else the plan goes on."
 
 
-def _gain(option: Mapping[str, Any]) -> str:
-    gain, low, high = option["gain"], option["low"], option["high"]
+def _gain(option: Mapping[str, Any]) -> tuple[str, str]:
+    """The gain of an option, and by the minute."""
+    gain, low, high, seconds = (option[name] for name in ("gain", "low", "high", "seconds"))
     if gain is None:
-        return "not known"
-    return f"{gain:+.2f}" if low is None or high is None or low == high else f"{gain:+.2f} ({low:.2f} to {high:.2f})"
-
-
-def _gain_per_minute(option: Mapping[str, Any]) -> str:
-    gain, seconds = option["gain"], option["seconds"]
-    return "-" if gain is None or not seconds else f"{60 * gain / seconds:+.2f}"
+        return "not known", "-"
+    likely = "" if low == high else f" ({low:.2f} to {high:.2f})"
+    return f"{gain:+.2f}{likely}", f"{60 * gain / seconds:+.2f}" if seconds else "-"
 
 
 _DECIDED = {
@@ -187,8 +184,7 @@ def _decision(chosen: NextChosen) -> str:
     if chosen.gained is None:
         return said
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
-    which = "before" if chosen.judged is None else f"after pass {chosen.judged}"
-    return f"{said.rstrip('.')}. The choice {which}: {predicted}measured {chosen.gained:+.2f} dB"
+    return f"{said.rstrip('.')}. The choice after pass {chosen.judged}: {predicted}measured {chosen.gained:+.2f} dB"
 
 
 def _missing(block: BlockDone) -> str | None:

@@ -48,14 +48,6 @@ class Wish:
     dose: float | None = None
 
 
-@dataclass(frozen=True)
-class Spent:
-    """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
-
-    seconds: float
-    dose: float
-
-
 def frame_dose(timeline: Timeline) -> float:
     """The share of one frame in the exposures of the whole plan with light on the sample."""
     return 1 / sum(block.n for block in timeline.blocks if block.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW))
@@ -73,9 +65,8 @@ def options(
 
     def option(choice: Choice, frames: int, seconds: float, **measured: Any) -> PassOption:
         gain = Gain(math.nan, math.nan, math.nan) if law is None else law.gain(**measured)
-        gains = gain.mean + 0.0, gain.low + 0.0, gain.high + 0.0  # never -0.0
-        n_bytes = frames * timeline.total_bytes // timeline.n_frames
-        return PassOption(choice, frames, seconds, frames * frame_dose(timeline), n_bytes, *gains)
+        cost = frames, seconds, frames * frame_dose(timeline), frames * timeline.total_bytes // timeline.n_frames
+        return PassOption(choice, *cost, gain.mean, gain.low, gain.high)
 
     offered, n = [], passes.retakes
     if passes.to_come:
@@ -91,7 +82,7 @@ def options(
     return (*offered, PassOption(Choice.ENOUGH, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0))
 
 
-def choose(offered: Sequence[PassOption], wish: Wish, spent: Spent, rest: Gain) -> tuple[Choice, str]:
+def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float, dose: float) -> tuple[Choice, str]:
     """The choice with the best gain a second until the wish is met, and why.
 
     The next pass of the plan keeps its place unless another choice is better beyond the uncertainty of both.
@@ -99,42 +90,47 @@ def choose(offered: Sequence[PassOption], wish: Wish, spent: Spent, rest: Gain) 
     Args:
         offered: with known gains.
         rest: by all that the plan still has.
+        seconds, dose: that the scan has taken; the seconds include what must follow the views.
     """
     if wish.quality_db is not None and rest.mean <= wish.quality_db:
-        left = f"{rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f})"
-        return Choice.ENOUGH, f"all that is left would add {left}; {wish.quality_db:g} dB may lack"
-    useful = [one for one in offered if one.gain > 0]
-    within = [one for one in useful if not _beyond(one, wish, spent)]
+        return Choice.ENOUGH, (
+            f"all that is left would add {rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f}); "
+            f"{wish.quality_db:g} dB may lack"
+        )
+    useful = {one: _beyond(one, wish, seconds, dose) for one in offered if one.gain > 0}
+    within = [one for one, why in useful.items() if not why]
     if not within:
-        reasons = [_beyond(one, wish, spent) for one in useful]
-        return Choice.ENOUGH, next(iter(reasons), "nothing that is left would improve the volume")
+        return Choice.ENOUGH, next(iter(useful.values()), "nothing that is left would improve the volume")
     best = max(within, key=lambda one: one.gain / one.seconds)
     following = next((one for one in within if one.choice is Choice.NEXT), best)
     if best.low / best.seconds <= following.high / following.seconds:
         best = following
-    gain = f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f})"
-    return best.choice, f"{gain} in {best.seconds:.0f} s; nothing else is surely better for its time"
+    return best.choice, (
+        f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f}) in {best.seconds:.0f} s; "
+        "nothing else is surely better for its time"
+    )
 
 
-def rest_gain(passes: Passes, law: ErrorLaw, first: int = 0) -> Gain:
-    """The gain by all that the plan still has, once the first so many passes to come are taken."""
-    taken, left = (sum(block.left for block in part) for part in (passes.to_come[:first], passes.to_come[first:]))
-    law = replace(law, n_views=law.n_views + taken)
-    return law.gain(views=left + passes.retakes, wide=bool(passes.wide))
+def rest_gain(passes: Passes, law: ErrorLaw) -> Gain:
+    """The gain by all that the plan still has."""
+    views = sum(block.left for block in passes.to_come) + passes.retakes
+    return replace(law, n_views=passes.n_views).gain(views=views, wide=bool(passes.wide))
 
 
-def next_is_sure(passes: Passes, offered: Sequence[PassOption], wish: Wish, spent: Spent, law: ErrorLaw) -> bool:
+def next_is_sure(
+    passes: Passes, offered: Sequence[PassOption], wish: Wish, law: ErrorLaw, seconds: float, dose: float
+) -> bool:
     """Whether a law of fewer views suffices: by it the next pass is chosen, and surely does not meet the wish."""
-    choice, _ = choose(offered, wish, spent, rest_gain(passes, law))
-    later = rest_gain(passes, law, first=1)
+    choice, _ = choose(offered, wish, rest_gain(passes, law), seconds, dose)
+    later = rest_gain(passes.after(Choice.NEXT), law)
     return choice is Choice.NEXT and (wish.quality_db is None or later.low > wish.quality_db)
 
 
-def _beyond(one: PassOption, wish: Wish, spent: Spent) -> str:
+def _beyond(one: PassOption, wish: Wish, seconds: float, dose: float) -> str:
     """What of the wish an option would exceed, in words; "" if nothing."""
-    seconds, dose = spent.seconds + one.seconds, 100 * (spent.dose + one.dose)
+    seconds, percent = seconds + one.seconds, 100 * (dose + one.dose)
     if wish.seconds is not None and seconds > wish.seconds:
         return f"{one.choice} would end the scan after {seconds:.0f} s; {wish.seconds:g} s are wished"
-    if wish.dose is not None and dose > 100.0000001 * wish.dose:
-        return f"{one.choice} would make it {dose:.3g} % of the plan's dose; {100 * wish.dose:g} % are wished"
+    if wish.dose is not None and percent > 100.0000001 * wish.dose:
+        return f"{one.choice} would make it {percent:.3g} % of the plan's dose; {100 * wish.dose:g} % are wished"
     return ""

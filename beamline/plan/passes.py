@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import accumulate, pairwise
 
 from beamline.plan.plan import Block, ScanPlan
 
@@ -77,15 +78,8 @@ def pass_blocks(views: Block, step_views: int) -> tuple[Block, ...]:
 
     Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
     """
-    every = range(views.n)
-    others = (frozenset(every) - frozenset(one) for one in _spans(views, step_views))
-    passes = (replace(views, stored=views.stored | other) for other in others)
-    return tuple(block for block in passes if block.left)
-
-
-def _spans(views: Block, step_views: int) -> Iterator[range]:
-    first = 0
-    sizes = [train.n for train in views.trains] or [step_views or views.n] * -(-views.n // (step_views or views.n))
-    for n in sizes:
-        yield range(first, min(first + n, views.n))
-        first += n
+    most = step_views or views.n
+    sizes = [train.n for train in views.trains] or [most] * -(-views.n // most)
+    spans = pairwise(accumulate(sizes, initial=0))
+    others = (views.stored.union(range(first), range(end, views.n)) for first, end in spans)
+    return tuple(block for other in others if (block := replace(views, stored=other)).left)

@@ -181,18 +181,18 @@ class ScanCorrection:
         part = None if self._stream is None else self._stream.provisional()
         return None if part is None else self._filters.apply(part, None)
 
-    def open_beam(self, most: int) -> NDArray[np.float32] | None:
+    def open_beam(self, most: int) -> NDArray[np.float32]:
         """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
 
         Their noise is that of the exposure of a view.
 
-        None: the scan has line integrals already.
+        None where the scan has line integrals already.
 
         Raises:
             DataError: as `at_once`.
         """
         if self._beam is None:
-            return None
+            return np.zeros((0, 0, 0), np.float32)
         flats = self._beam.used.flats[-1][:most]
         light = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(light) if light > 0 else 1.0)

@@ -119,9 +119,6 @@ _UNKNOWN = (
 )
 
 
-_NO_AXIS_NO_LAW = "No gain by further views is predicted before the rotation axis is known."
-
-
 class AxisSearch:
     """Repeats the search for the rotation axis each time the views have grown by half, at a quarter of a turn, at half
     a turn, and at the end.
@@ -188,18 +185,17 @@ class PassLaws:
     def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
         """Measure and report the law of the newest pass, if it is over and was not looked at yet.
 
-        The number of views of the law is that of all usable ones, also where the selection leaves some out: gains
-        depend on the ratio alone. Wide views are no data of it; where there are some, the density beside the field is
-        known. What prevents a law becomes a warning, and the reason of an event without one.
+        Wide views are no data of it; where there are some, the density beside the field is known. What prevents a law
+        becomes a warning, and the reason of an event without one.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
             return
         if axis_col is None:
-            self._warn(_NO_AXIS_NO_LAW)
+            self._warn("No gain by further views is predicted before the rotation axis is known.")
         if axis_col is None or cursor.taken < end:
             return
-        self._end, begin = end, self._clock.now()
+        self._end = end
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
         images = {
@@ -215,15 +211,13 @@ class PassLaws:
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
             open_beam = correction.open_beam(_OPEN_BEAM)
-            measured = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
+            law, gained = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
             self._warn(f"No gain by further views is predicted: {why}.")
-            none = LawMeasured(len(usable), math.nan, math.nan, math.nan, math.nan, reason=why)
-            self._sink(replace(none, time=self._clock.now()))
+            unknown = ends.size, rows.size, math.nan, math.nan, math.nan, math.nan
+            self._sink(LawMeasured(*unknown, reason=why, time=self._clock.now()))
             return
-        law = replace(measured.law, n_views=round(measured.law.n_views * len(usable) / rows.size))
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
-        now = self._clock.now()
-        self._sink(LawMeasured(**vars(law), gained=measured.gained, seconds=now - begin, time=now))
+        self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))

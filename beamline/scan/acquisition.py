@@ -135,13 +135,12 @@ class Acquisition:
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            if self._stop.stopping and not self._still_needed(block):
+            taken = any(done.block is block for done in self._done)  # wide views that were chosen
+            if taken or (self._stop.stopping and not self._still_needed(block)):
                 continue
             if block.kind is FrameKind.WIDE_VIEW:
-                if all(done.block is not block for done in self._done):
-                    yield from self._wide(block)
-                continue
-            if block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
+                yield from self._wide(block)
+            elif block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
                 yield from self._pass_by_pass(block, self._supervision.next_pass)
             else:
                 yield from self._block(RecordedBlock(block, BlockTally()))
@@ -172,7 +171,6 @@ class Acquisition:
             if not (passes.to_come or passes.wide or passes.retakes):
                 return
             choice = next_pass(passes)
-            self._stop.refuse_abort()
             if choice is Choice.ENOUGH and not self._stop.stopping:
                 self._stop.stop_as_enough("the views suffice")
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):

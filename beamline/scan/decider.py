@@ -6,19 +6,21 @@ It costs no frame, and the scan does not depend on it: without a law in time the
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from beamline.core.events import LawMeasured, NextChosen, PassEnded, Sink, Warned
 from beamline.core.stop import StopRequest
-from beamline.plan.choose import PassOption, Spent, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, rest_gain
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL
+from drivers.base.frame import FrameKind
 from recon.base.error_law import ErrorLaw
+
+_NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="none came yet")
 
 
 @dataclass(eq=False, kw_only=True)
@@ -32,8 +34,8 @@ class Decider:
         now: the instrument's clock, s.
         began: time of the first frame.
         seconds: that count beside those since then: of earlier parts of the run, and of what must follow the views.
-        frames: with light on the sample beside the views, of earlier parts of the run.
-        unable: why no law can come; "" while one may.
+        number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
+        unable: why no law can come; "" while one may. Once it has said so, the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
         close_shutter: called before the scan waits.
         record: takes the values of a decision, for the file.
@@ -50,25 +52,25 @@ class Decider:
     sink: Sink
     began: float = math.inf
     seconds: float = 0.0
-    frames: int = 0
+    number: int = 0
     unable: Callable[[], str] = lambda: ""
     wait_a_moment: Callable[[], bool] = lambda: False
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
-    _laws: deque[LawMeasured] = field(default_factory=lambda: deque(maxlen=1))  # that came: the newest
-    _law: ErrorLaw | None = None  # the newest that was taken up; None: for a reason there is none
-    _reason: str = ""
-    _law_of: int = 0  # the number of its pass,
-    _lost: int = 0  # and the frames that it lacks, as flagged ones are not in a law
-    _ended: list[tuple[int, float | None]] = field(default_factory=list)  # passes: frames of views, dB of what followed
+    _law: LawMeasured = _NO_LAW  # the newest
+    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options by the number of the pass before
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # what came of a choice, as `NextChosen` has it
-    _unable: str = ""  # the reason that was given last
+    _unable: str = ""
     _answers: frozenset[Choice] = frozenset()  # that the operator can give now
     _answer: Choice | None = None
 
     def add_law(self, law: LawMeasured) -> None:
         """Take a law from the live reconstruction; any thread."""
-        self._laws.append(law)
+        self._law = law
+        if law.gained is not None:
+            before = law.number - 1
+            predicted = self._chosen.get(before, {}).get("gain")
+            self._outcome = {"predicted": predicted, "gained": law.gained, "judged": before}
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not asked for becomes a warning."""
@@ -80,35 +82,26 @@ class Decider:
 
     def __call__(self, passes: Passes) -> Choice:
         """What is measured next, after a wait for the law and, where it asks, for the operator."""
-        plan, known = self.timeline.plan, self._unable
-        earlier = [(passes.n_views - passes.done[-1].left, None)] * len(plan.choices)  # parts of the run
-        self._ended = [*(self._ended or earlier), (passes.n_views, None)]
-        self._take_law()
-        self._unable = self.unable()
-        if self._unable and self._unable == known:
+        self.number += 1
+        if self._unable:
             return Choice.NEXT
         law, offered = self._predict(passes)
         if self.stop.stopping:
             return Choice.NEXT
         if law is not None:
-            by, (choice, reason) = "program", choose(offered, self.wish, self._spent(passes), rest_gain(passes, law))
+            by, (choice, reason) = "program", choose(offered, self.wish, rest_gain(passes, law), *self._spent(passes))
         else:
-            self._unable = self.unable()
-            why = self._reason if self._law_of == len(self._ended) else ""
-            by, choice = "plan", Choice.NEXT
-            reason = self._unable or why or f"no prediction within {self.wait:g} s"
+            self._unable, why = self.unable(), self._law.reason if self._law.number == self.number else ""
+            by, choice, reason = "plan", Choice.NEXT, self._unable or why or f"no prediction within {self.wait:g} s"
         asks, remark = self.asks and not self._unable, "" if law else f"Gains are not known: {reason}."
-        facts = len(self._ended), passes.n_views // plan.frames_per_view
+        facts = self.number, passes.n_views // self.timeline.plan.frames_per_view
         values = [{name: None if value != value else value for name, value in vars(one).items()} for one in offered]
         self.sink(PassEnded(*facts, values, choice, self.wait if asks else 0.0, remark))
         if asks:
             by, choice, reason = self._ask(choice, offered)
             if self.stop.stopping:
                 return Choice.NEXT
-        for one in offered:
-            if one.choice is choice:
-                self._ended[-1] = passes.n_views, one.gain if law else None
-                self.frames += one.frames * (choice in (Choice.WIDE, Choice.RETAKE))
+        self._chosen[self.number] = {one["choice"]: one for one in values}.get(choice, {})
         event = NextChosen(*facts, choice, by, reason, values, **self._outcome)
         self._outcome = {}
         self.sink(event)
@@ -117,44 +110,37 @@ class Decider:
             self.stop.stop_as_enough(f"the views are enough: {reason}")
         return choice
 
-    def _spent(self, passes: Passes) -> Spent:
-        dose = (passes.n_views + self.frames) * frame_dose(self.timeline)
-        return Spent(self.now() - self.began + self.seconds, dose)
-
     def _predict(self, passes: Passes) -> tuple[ErrorLaw | None, tuple[PassOption, ...]]:
         """The law of the views so far and the options by it; None if no law comes in time.
 
-        An earlier law serves where by it the next pass is sure, so that the stage does not wait. Gains depend on ratios
-        of numbers of views alone, so that a law of some of the views serves for all.
+        An earlier law serves where by it the next pass is sure, so that the stage does not wait.
         """
-        law = self._law and replace(self._law, n_views=passes.n_views)
+        law = self._newest(passes)
         offered = options(passes, law, self.timeline, self.seconds_of)
-        known = law and not (self.asks or self._unable)
-        if law and known and next_is_sure(passes, offered, self.wish, self._spent(passes), law):
-            return law, offered
-        if not self._law_has_come():
-            self.close_shutter()  # a law takes seconds
-            self._wait(self._law_has_come)
-        law = self._law and replace(self._law, n_views=passes.n_views) if self._law_of == len(self._ended) else None
-        return law, options(passes, law, self.timeline, self.seconds_of)
+        spent = self._spent(passes)
+        if law is None or self.asks or self.unable() or not next_is_sure(passes, offered, self.wish, law, *spent):
+            if not self._law_has_come():
+                self.close_shutter()  # a law takes seconds
+                self._wait(self._law_has_come)
+            law = self._newest(passes) if self._law.number == self.number else None
+            offered = options(passes, law, self.timeline, self.seconds_of)
+        return law, offered
 
     def _law_has_come(self) -> bool:
         """Whether the law of all views so far is there, or none can come."""
-        return self._law_of == len(self._ended) or self._take_law() or bool(self.unable())
+        return self._law.number == self.number or bool(self.unable())
 
-    def _take_law(self) -> bool:
-        """Take up a law that has come; whether it is of all views so far, or late, and of an earlier pass."""
-        if not self._laws:
-            return False
-        law = self._laws.pop()
-        frames = law.n_views * self.timeline.plan.frames_per_view
-        number = min(range(len(self._ended)), key=lambda i: (abs(self._ended[i][0] - frames - self._lost), -i)) + 1
-        self._law_of, self._lost = number, self._ended[number - 1][0] - frames
-        self._reason, of_law = law.reason, (law.exponent, law.exponent_error, law.noise, law.offset)
-        self._law = None if law.reason or None in of_law else ErrorLaw(frames, *of_law)
-        if law.gained is not None and number > 1:
-            self._outcome = {"predicted": self._ended[number - 2][1], "gained": law.gained, "judged": number - 1}
-        return number == len(self._ended)
+    def _newest(self, passes: Passes) -> ErrorLaw | None:
+        """The newest law. Gains depend on ratios of numbers of views alone: a law of some views serves for all."""
+        values = self._law.exponent, self._law.exponent_error, self._law.noise, self._law.offset
+        return None if self._law.reason or None in values else ErrorLaw(passes.n_views, *values)
+
+    def _spent(self, passes: Passes) -> tuple[float, float]:
+        """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
+        again = sum(one["frames"] for one in self._chosen.values() if one.get("choice") is Choice.RETAKE)
+        wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
+        frames = passes.n_views + again + wide - sum(block.left for block in passes.wide)
+        return self.now() - self.began + self.seconds, frames * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait at most as long as it may, or until a stop."""

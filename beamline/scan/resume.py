@@ -226,9 +226,9 @@ def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], 
     missing = triggers_of(*passes.done) - views | triggers_of(*passes.to_come)
     if choices[-1:] == (Choice.AGAIN,):
         missing |= triggers_of(passes.done[-1]) - since
-    n = plan.angles.size
-    rejected = range(n, n + plan.wide_views * len(plan.wide_places)) if Choice.ENOUGH in choices else ()
-    return {*range(n)} - missing, wide.union(rejected), choices
+    if Choice.ENOUGH in choices:
+        wide |= {plan.angles.size + i for i in range(plan.wide_views * len(plan.wide_places))}
+    return {*range(plan.angles.size)} - missing, wide, choices
 
 
 def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:

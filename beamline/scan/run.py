@@ -49,7 +49,6 @@ from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.frame import FrameKind
 from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
@@ -204,11 +203,11 @@ class _Run:
     @cached_property
     def decider(self) -> Decider:
         scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
-        wide = (block for block in timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
 
-        def seconds_of(block: Block, at: float | None = None) -> float:
-            at = devices.stage.position() if at is None else at
-            return block_seconds(block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, at)
+        def seconds_of(block: Block) -> float:
+            return block_seconds(
+                block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, devices.stage.position()
+            )
 
         after = timeline.blocks[timeline.blocks.index(timeline.views) :]
         return Decider(
@@ -221,9 +220,9 @@ class _Run:
             states=self.states,
             stop=self.stop,
             sink=self.sink,
-            seconds=sum(seconds_of(block, 0.0) for block in after if block.kind in REFERENCES)
+            seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
             + (self.series.seconds if self.series else 0.0),
-            frames=sum(len(block.stored) for block in wide),
+            number=len(timeline.plan.choices),
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
         )
 
@@ -428,15 +427,11 @@ class _Run:
             acquisition.wait_while_paused()
             return wait_in_pause(recorder)
 
-        decider.unable, decider.record = lambda: self._unable_to_predict(follower), recorder.decided
-        decider.wait_a_moment = wait_a_moment
+        cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
+        ended = "no live reconstruction is running"
+        decider.unable = lambda: cone or (ended if follower is None or follower.ended else "")
+        decider.record, decider.wait_a_moment = recorder.decided, wait_a_moment
         return acquisition
-
-    def _unable_to_predict(self, follower: LiveReconstruction | None) -> str:
-        """Why the live reconstruction measures no law of the error; "" where it may."""
-        if self.ready.info.source_distance_mm is not None:
-            return "the beam is a cone, in which no gain is predicted"
-        return "no live reconstruction is running" if follower is None or follower.ended else ""
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""

@@ -13,8 +13,8 @@ falls less in the scan than in the copy, it has parts that further views do not 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.held_out import preferred_strength, split_views, unseen_residuals
-from recon.voxels.iterative import UNITS, solve
+from recon.voxels.iterative import solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.resolution import at_voxel_resolution
@@ -52,59 +52,53 @@ _BY_VIEWS = 0.6  # the weight of total variation grows with the views to this po
 _CIRCLE = 0.95  # of the field's radius, where errors count
 
 
-@dataclass(frozen=True)
-class MeasuredLaw:
-    """A law of the error; `gained`: dB by the views of the last pass, by the views held out (None: not known)."""
-
-    law: ErrorLaw
-    gained: float | None
-
-
 def measured_law(
-    data: F32, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator, open_beam: F32 | None = None
-) -> MeasuredLaw:
-    """The law of the error of the volume of these views.
+    data: F32, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator, open_beam: F32
+) -> tuple[ErrorLaw, float | None]:
+    """The law of the error of the volume of these views, and dB by those of the last pass (None: not known).
 
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
         geometry: of these views: parallel beam, straight.
         sizes: numbers of views at the ends of passes so far, the last of all.
-        open_beam: line integrals [frame, row, col] of frames of the open beam, noise alone, three or more, binned as
-            the views; None: how far the error falls is not measured, and taken as usual.
+        open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
+            binned as the views.
 
     Raises:
-        ValueError: a cone, fewer than 48 views, or views without matter.
+        ValueError: a cone, fewer than 48 views or 3 frames of the open beam, or views without matter.
     """
     n = len(data)
-    if geometry.is_cone or n < LEAST_VIEWS:
-        why = "the beam is a cone" if geometry.is_cone else f"{n} views are fewer than {LEAST_VIEWS}"
-        raise ValueError(f"the error of a volume is not measured: {why}")
+    if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _FRAMES:
+        there = f"{n} views and {len(open_beam)} frames of the open beam are there, {LEAST_VIEWS} and {_FRAMES} needed"
+        raise ValueError(
+            f"the error of a volume is not measured: {'the beam is a cone' if geometry.is_cone else there}"
+        )
     sample = sample_radius(data, geometry)
-    scan = _Scan.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
-    most, held_out = split_views(scan.geometry)
-    parts = np.sort(scan.in_angle[1::2]), most
-    weight = scan.chosen_weight()
-    measured = [scan.volume(scan.views, some, weight) for some in parts]
+    slab = _Slab.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
+    most, held_out = split_views(slab.geometry)
+    parts = split_views(slab.geometry, 2)[1], most
+    weight = slab.chosen_weight()
+    measured = [slab.volume(slab.views, some, weight) for some in parts]
     if not measured[1].any():
         raise ValueError("the error of a volume is not measured: these views show no matter")
-    copy, other = scan.copies(measured[1], most, rng)
-    copied = [scan.volume(copy, some, weight) for some in parts]
-    errors = [scan.square_error(volume, measured[1]) for volume in copied]
-    noise = scan.square_error(copied[0], scan.volume(other, parts[0], weight)) / 2 / max(errors[0], _TINY)
-    fall = None
-    if scan.noise is not None:
-        real = [scan.unseen_power(volume, scan.views, held_out) for volume in measured]
-        fall = _fall(real, [scan.unseen_power(volume, copy, held_out) for volume in copied])
-    exponent = float(np.interp(noise * (_FALL if fall is None else fall), _NOISY, (_BY_ELSE, _BY_NOISE)))
-    if n < geometry.detector_shape[1]:  # gaps between the views make the error
-        exponent = _BY_NOISE
-    beside = _DENSITY * offset_error(Volume(measured[1], scan.box), scan.geometry, sample)
+    copy, other = slab.copies(measured[1], rng)
+    copied = [slab.volume(copy, some, weight) for some in parts]
+    errors = [slab.square_error(volume, measured[1]) for volume in copied]
+    noise = slab.square_error(copied[0], slab.volume(other, parts[0], weight)) / 2 / max(errors[0], _TINY)
+    fall = _fall(
+        [slab.unseen_power(volume, slab.views, held_out) for volume in measured],
+        [slab.unseen_power(volume, copy, held_out) for volume in copied],
+    )
+    gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
+    by_noise = 1.0 if gaps else noise * (_FALL if fall is None else fall)
+    exponent = float(np.interp(by_noise, _NOISY, (_BY_ELSE, _BY_NOISE)))
+    beside = _DENSITY * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
     offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
     if fall is None or len(sizes) < 2 or min(errors) <= 0:
-        return MeasuredLaw(law, None)
+        return law, None
     measured_exponent = _SHOWN * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
-    return MeasuredLaw(law, measured_exponent * 10 * math.log10(n / sizes[-2]))
+    return law, measured_exponent * 10 * math.log10(n / sizes[-2])
 
 
 def _fall(real: Sequence[float], ideal: Sequence[float]) -> float | None:
@@ -131,120 +125,82 @@ class _TotalVariation:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scan:
+class _Slab:
     """Some rows of a scan, binned where they are many.
 
     Attributes:
-        views: [view, row, col]; noise: of the open beam, [frame, row, col].
-        box: as wide as the sample; field: that of the detector.
-        weight: of total variation by the noise, for one view.
-        units: that all volumes are made in, as `recon.voxels.iterative.solve` decides them.
+        views: [view, row, col]; noise: of one frame of the open beam [frame, row, col].
+        box: as wide as the sample.
+        made: decisions of the first volume, which the others follow.
     """
 
     views: F32
     geometry: Geometry
     box: Grid
-    field: Grid
-    noise: F32 | None
-    weight: float
-    units: Mapping[str, Sequence[Any]]
+    noise: F32
+    made: dict[str, list[Any]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32 | None) -> _Scan:
+    def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32) -> _Slab:
         """Rows with most matter of a scan whose sample is `width` times as wide as the field."""
-        factor = 1
-        while len(data) * (width * data.shape[2] / factor) ** 2 > _WORK:
-            factor *= 2
+        halvings = math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))
+        factor = 2 ** max(0, math.ceil(halvings))
         rows = busiest_rows(data, min(_ROWS * factor, data.shape[1]))
-        views = np.ascontiguousarray(data[:, rows])
-        geometry = geometry.rows(rows.start, rows.stop)
-        noise = None if open_beam is None or len(open_beam) < _FRAMES else _noise_of(open_beam)
+        views, geometry = np.ascontiguousarray(data[:, rows]), geometry.rows(rows.start, rows.stop)
+        change = np.diff(open_beam, axis=0)
+        change -= np.median(change, axis=(1, 2), keepdims=True)
+        noise = (change / math.sqrt(2)).astype(np.float32)
         if factor > 1:
-            views, geometry = bin_views(views, factor), geometry.binned(factor)
-            noise = None if noise is None else bin_views(noise, factor)
-        geometry, field = slab_of(geometry, Grid.matching(geometry), 0, geometry.detector_shape[0])
-        box = field.reaching(width * geometry.reach, geometry) if width > 1 else field
-        some = np.sort(np.argsort(np.mod(geometry.angles, np.pi))[:: -(-geometry.n_views // _TRIAL_VIEWS)])
-        decide, part = Decisions(), geometry.select(some)
-        solve(
-            _TotalVariation(None),
-            Projector(part, box),
-            views[some],
-            start=_first(views[some], part, box),
-            decide=decide,
-        )
-        weight = decide.made["weight"][0] / len(some) ** _BY_VIEWS
-        return cls(views, geometry, box, field, noise, weight, {UNITS: decide.made[UNITS]})
+            views, noise, geometry = bin_views(views, factor), bin_views(noise, factor), geometry.binned(factor)
+        geometry, box = slab_of(geometry, Grid.matching(geometry), 0, geometry.detector_shape[0])
+        return cls(views, geometry, box.reaching(width * geometry.reach, geometry) if width > 1 else box, noise)
 
-    def volume(self, views: F32, some: NDArray[np.intp], weight: float) -> F32:
-        """[z, y, x] of some of the views; `weight` of total variation: for one view."""
+    def volume(self, views: F32, some: NDArray[np.intp], weight: float | None) -> F32:
+        """[z, y, x] of some of the views; `weight` of total variation: for one view, as of `_TotalVariation`."""
         geometry, images = self.geometry.select(some), np.ascontiguousarray(views[some])
-        method, start = _TotalVariation(weight * len(some) ** _BY_VIEWS), _first(images, geometry, self.box)
-        made = solve(method, Projector(geometry, self.box), images, start=start, decide=Decisions(0, self.units))
-        return np.maximum(made.data, 0)
+        start = Volume(np.maximum(fbp(images, geometry, self.box, filter="hann"), 0), self.box)
+        method, decide = _TotalVariation(weight and weight * len(some) ** _BY_VIEWS), Decisions(0, self.made)
+        volume = solve(method, Projector(geometry, self.box), images, start=start, decide=decide)
+        self.made.update(decide.made)
+        return np.maximum(volume.data, 0)
 
     def chosen_weight(self) -> float:
         """The weight that predicts views held out best, for one view."""
-        some = np.sort(self.in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
+        in_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
+        some = np.sort(in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
+        self.volume(self.views, some, None)
+        by_noise = float(self.made["weight"][0] / len(some) ** _BY_VIEWS)
         seen, unseen = (some[part] for part in split_views(self.geometry.select(some)))
-        projector = Projector(self.geometry.select(unseen), self.box)
-        judges = projection_lines(self.views[unseen])
+        projector, judges = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
 
         def residuals(weight: float) -> NDArray[np.float64]:
             model = projector.forward(self.volume(self.views, seen, weight))
             return unseen_residuals(projection_lines(model), judges, None, projector.resolution)
 
-        best = preferred_strength(residuals, self.weight) if self.weight > 0 else None
-        return self.weight if best is None else best.strength
+        best = preferred_strength(residuals, by_noise) if by_noise > 0 else None
+        return by_noise if best is None else best.strength
 
-    @property
-    def in_angle(self) -> NDArray[np.intp]:
-        """Views in the order of their angles, as `split_views` takes every eighth of them."""
-        return np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
-
-    def copies(self, sample: F32, fitted: NDArray[np.intp], rng: np.random.Generator) -> tuple[F32, F32]:
-        """Two scans [view, row, col] of a sample, with different noise like that of the open beam; without one, like
-        that of the residual in the views that the sample was fitted to."""
+    def copies(self, sample: F32, rng: np.random.Generator) -> list[F32]:
+        """Two scans [view, row, col] of a sample, with different noise like that of the open beam."""
         clean = Projector(self.geometry, self.box).forward(sample)
-        variance = np.exp(clean, dtype=np.float64)  # photons: it rises as the light falls
-        if self.noise is not None:
-            variance *= float(np.mean(np.square(self.noise, dtype=np.float64)))
-        else:
-            left = np.square(self.views[fitted] - clean[fitted], dtype=np.float64)
-            variance *= float(left.mean()) / float(variance[fitted].mean())
-        deviation = np.sqrt(variance)
-        one, other = ((clean + rng.normal(size=clean.shape) * deviation).astype(np.float32) for _ in range(2))
-        return one, other
+        photons = np.exp(clean, dtype=np.float64)  # the variance rises as the light falls
+        deviation = np.sqrt(photons * float(np.mean(np.square(self.noise, dtype=np.float64))))
+        return [(clean + rng.normal(size=clean.shape) * deviation).astype(np.float32) for _ in range(2)]
 
     def square_error(self, volume: F32, other: F32) -> float:
         """Mean square difference of two volumes within the field's circle."""
-        ny, nx = self.field.shape[1:]
-        y, x = (np.rint(np.subtract(self.field.first, self.box.first) / self.field.spacing).astype(int))[1:]
-        inside = np.hypot(*np.meshgrid(*self.field.coordinates()[1:], indexing="ij")) < _CIRCLE * self.geometry.reach
-        part = np.subtract(volume, other)[:, y : y + ny, x : x + nx][:, inside]
+        y, x = np.meshgrid(*self.box.coordinates()[1:], indexing="ij")
+        part = np.subtract(volume, other)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
         return float(np.mean(np.square(part, dtype=np.float64)))
 
     def unseen_power(self, volume: F32, views: F32, unseen: NDArray[np.intp]) -> float:
         """Power of the error of a volume in views that it was not made of, without that of their noise."""
-        assert self.noise is not None
-        projector = Projector(self.geometry.select(unseen), self.box)
+        projector, n = Projector(self.geometry.select(unseen), self.box), len(self.noise)
         seen = projection_lines(np.ascontiguousarray(views[unseen]))
         left = at_voxel_resolution(seen, projector.resolution) - projection_lines(projector.forward(volume))
-        some = unseen[np.arange(len(self.noise)) * len(unseen) // len(self.noise)]
-        resolution = Projector(self.geometry.select(some), self.box).resolution
-        noise = _ramp_power(at_voxel_resolution(projection_lines(self.noise), resolution))
-        return _ramp_power(left) - noise * float(np.exp(seen, dtype=np.float64).mean())
-
-
-def _first(views: F32, geometry: Geometry, box: Grid) -> Volume:
-    return Volume(np.maximum(fbp(views, geometry, box, filter="hann"), 0), box)
-
-
-def _noise_of(open_beam: F32) -> F32:
-    """Noise [frame, row, col] as of one frame, from differences of frames that follow each other."""
-    change = np.diff(open_beam, axis=0)
-    change -= np.median(change, axis=(1, 2), keepdims=True)
-    return (change / math.sqrt(2)).astype(np.float32)
+        some = self.geometry.select(unseen[np.arange(n) * len(unseen) // n])
+        noise = at_voxel_resolution(projection_lines(self.noise), Projector(some, self.box).resolution)
+        return _ramp_power(left) - _ramp_power(noise) * float(np.exp(seen, dtype=np.float64).mean())
 
 
 def _ramp_power(lines: F32) -> float:

@@ -147,9 +147,9 @@ def law_of(number: int, seed: int, state: State) -> Law:
     earlier = (views_of(number, seed, State(passes))[0] for passes in range(1, state.passes))
     sizes = [*map(len, earlier), len(views)]
     begin = time.process_time()
-    made = measured_law(views, geometry, sizes, np.random.default_rng(seed), open_beam(number, seed))
-    seconds, law = time.process_time() - begin, made.law
-    return Law(law.n_views, law.exponent, law.exponent_error, law.noise, law.offset, made.gained, seconds)
+    law, gained = measured_law(views, geometry, sizes, np.random.default_rng(seed), open_beam(number, seed))
+    seconds = time.process_time() - begin
+    return Law(law.n_views, law.exponent, law.exponent_error, law.noise, law.offset, gained, seconds)
 
 
 @lru_cache(maxsize=1)

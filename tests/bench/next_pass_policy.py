@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from beamline.plan.choose import Spent, Wish, choose, options, rest_gain
+from beamline.plan.choose import Wish, choose, options, rest_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
@@ -65,7 +65,7 @@ def way(number: int, seed: int, kept: Kept, wish: Wish) -> tuple[list[Step], Sta
             return steps, state
         law = kept.law(number, seed, state)
         offered, rest = options(passes, law, timeline, seconds_of), rest_gain(passes, law)
-        choice, _ = choose(offered, wish, Spent(0.0, 0.0), rest)
+        choice, _ = choose(offered, wish, rest, 0.0, 0.0)
         steps.append(Step(state, law, choice, rest.mean))
         match choice:
             case Choice.NEXT:

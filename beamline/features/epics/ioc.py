@@ -111,10 +111,10 @@ class RunServer:
         client when the verb is done: a verb never waits for another one."""
 
         def put(pv: Any, op: Any) -> None:
-            if not bool(op.value()):
+            if bool(op.value()):
+                self._send(pv, op, lambda: verb)
+            else:
                 op.done()
-                return
-            self._send(pv, op, lambda: verb)
 
         return put
 
@@ -139,20 +139,15 @@ class RunServer:
             self._refuse(pv, op, error)
             return
         if done:
-            pv.post(_posted(_unset(pv), Stamp(self._now())))
+            pv.post(_posted("" if pv is self._decide else False, Stamp(self._now())))
             op.done()
         else:
             self._asked.append((pv, op, asked))
 
     def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
         stamp = Stamp(self._now(), Severity.MAJOR, user_message(error))
-        pv.post(_posted(_unset(pv), stamp))
+        pv.post(_posted("" if pv is self._decide else False, stamp))
         op.done(error=stamp.message)
-
-
-def _unset(pv: Any) -> str | bool:
-    """The value of the PV of a verb or an answer before a client writes it."""
-    return "" if isinstance(pv.current(), str) else False
 
 
 def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:

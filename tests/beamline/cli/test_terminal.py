@@ -143,16 +143,20 @@ EVENTS = [
         SCAN,
         "Scan complete: 3",
     ),
-    ("error_law", {"n_views": 9, "exponent": 1.0, "exponent_error": 0.1, "noise": 1.0, "offset": 0.1}, None),
     (
-        "next_chosen",
-        {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71},
-        "After pass 3: again, chosen by the program: it brings most a second. The choice before: predicted +0.80 dB, "
-        "measured +0.71 dB",
+        "error_law",
+        {"number": 1, "n_views": 9, "exponent": 1.0, "exponent_error": 0.1, "noise": 1.0, "offset": 0.1},
+        None,
     ),
     (
         "next_chosen",
-        {**CHOSEN, "by": "operator", "reason": "the operator chose it", "gained": -0.1},
+        {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71, "judged": 2},
+        "After pass 3: again, chosen by the program: it brings most a second. The choice after pass 2: predicted "
+        "+0.80 dB, measured +0.71 dB",
+    ),
+    (
+        "next_chosen",
+        {**CHOSEN, "by": "operator", "reason": "the operator chose it", "gained": -0.1, "judged": 2},
         "again, the operator chose it. The c",
     ),
     ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),

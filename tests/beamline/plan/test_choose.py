@@ -7,14 +7,14 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan.choose import PassOption, Spent, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, rest_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.plan.timeline import block_seconds
 from recon.base.error_law import ErrorLaw, Gain
 from tests.beamline.fakes import FakeInstrument
 
-NOTHING = Spent(0.0, 0.0)
+NOTHING = 0.0, 0.0
 QUALITY = Wish(quality_db=1.0)
 LAW = ErrorLaw(12, 1.0, 0.1, 0.3, 0.2)
 
@@ -78,10 +78,10 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
         ([NEXT], QUALITY, NOTHING, 1.01, Choice.NEXT, "1.00 dB (0.80 to 1.20) in 10 s"),
         ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would add 1.00 dB"),
         ([NEXT], Wish(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(seconds=100), Spent(90.0, 0), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(seconds=100), Spent(91.0, 0), 9, Choice.ENOUGH, "after 101 s; 100 s are wished"),
-        ([NEXT], Wish(dose=0.5), Spent(0, 0.4), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(dose=0.5), Spent(0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; 50 % are wished"),
+        ([NEXT], Wish(seconds=100), (90.0, 0), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], Wish(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; 100 s are wished"),
+        ([NEXT], Wish(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], Wish(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; 50 % are wished"),
         ([NEXT], Wish(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "may lack"),  # whichever is met first
         ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else is surely better"),
         ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else"),
@@ -97,16 +97,17 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
     ],
 )
 def test_the_choice_and_its_reason(
-    offered: list[PassOption], wish: Wish, spent: Spent, rest: float, chosen: Choice, why: str
+    offered: list[PassOption], wish: Wish, spent: tuple[float, float], rest: float, chosen: Choice, why: str
 ) -> None:
-    choice, reason = choose([*offered, ENOUGH], wish, spent, Gain(rest, 0.0, 9.0))
+    choice, reason = choose([*offered, ENOUGH], wish, Gain(rest, 0.0, 9.0), *spent)
     assert choice is chosen and why in reason
 
 
 def test_the_rest_is_all_that_the_plan_still_has() -> None:
     timeline = scan(wide=5)
     assert rest_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
-    assert rest_gain(after(timeline, 1, retakes=3), LAW, first=1) == replace(LAW, n_views=24).gain(views=27, wide=True)
+    later = after(timeline, 1, retakes=3).after(Choice.NEXT)
+    assert rest_gain(later, LAW) == replace(LAW, n_views=24).gain(views=27, wide=True)
     assert rest_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
 
 
@@ -129,7 +130,7 @@ def test_a_next_pass_is_sure_only_if_the_wish_is_not_met_after_it_even_at_the_lo
     timeline = scan()
     law, passes = ErrorLaw(12 * done, 1.0, error, 0.0), after(timeline, done)
     offered = options(passes, law, timeline, seconds_of)
-    assert next_is_sure(passes, offered, wish, Spent(4.0, 0.0), law) is sure
+    assert next_is_sure(passes, offered, wish, law, 4.0, 0.0) is sure
 
 
 LAWS = st.builds(
@@ -141,14 +142,14 @@ WISHES = st.builds(
 TIMELINE = scan(wide=5)
 
 
-def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, Spent]:
+def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
     """What is chosen to the end, by a law that stays: the choices, views and what was spent."""
     passes, choices = after(TIMELINE, 1, retakes=3), list[Choice]()
     seconds, dose = seconds_of(passes.done[0]), 12 * frame_dose(TIMELINE)
     while passes.to_come or passes.wide or passes.retakes:
         so_far = replace(law, n_views=passes.n_views)
         offered = options(passes, so_far, TIMELINE, seconds_of)
-        choice, _ = choose(offered, wish, Spent(seconds, dose), rest_gain(passes, so_far))
+        choice, _ = choose(offered, wish, rest_gain(passes, so_far), seconds, dose)
         choices.append(choice)
         if choice is Choice.ENOUGH:
             break
@@ -156,16 +157,16 @@ def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, Spent]:
         assert one.gain > 0  # nothing that brings nothing is taken before ENOUGH
         seconds, dose = seconds + one.seconds, dose + one.dose
         passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
-    return choices, passes.n_views, Spent(seconds, dose)
+    return choices, passes.n_views, seconds, dose
 
 
 @given(LAWS, WISHES)
 def test_a_scan_that_does_stays_within_its_wishes_and_the_plan(law: ErrorLaw, wish: Wish) -> None:
-    choices, views, spent = taken(law, wish)
+    choices, views, seconds, dose = taken(law, wish)
     first = seconds_of(after(TIMELINE, 1).done[0])
     assert views <= 48 and choices.count(Choice.WIDE) <= 1
-    assert spent.seconds <= max(first, wish.seconds or math.inf) * (1 + 1e-9)
-    assert spent.dose <= max(12 * frame_dose(TIMELINE), wish.dose or math.inf) * (1 + 1e-6)
+    assert seconds <= max(first, wish.seconds or math.inf) * (1 + 1e-9)
+    assert dose <= max(12 * frame_dose(TIMELINE), wish.dose or math.inf) * (1 + 1e-6)
 
 
 @given(LAWS, st.floats(0.01, 10), st.floats(1, 3))
@@ -176,12 +177,12 @@ def test_with_less_quality_to_reach_no_more_views_are_taken(law: ErrorLaw, wishe
 @given(LAWS, st.floats(0.05, 1), st.floats(1, 3))
 def test_with_more_dose_to_spend_no_less_is_reached(law: ErrorLaw, dose: float, more: float) -> None:
     assume(law.exponent > 0.05)
-    few, many = (taken(law, Wish(dose=share))[2].dose for share in (dose, min(1.0, more * dose)))
+    few, many = (taken(law, Wish(dose=share))[3] for share in (dose, min(1.0, more * dose)))
     assert few <= many * (1 + 1e-6)
 
 
 @given(LAWS)
 def test_noise_alone_is_worth_the_same_angles_only_where_it_is_better_than_new_ones(law: ErrorLaw) -> None:
     """New angles lower the noise, too: with an exponent of 1 or more they are never worse."""
-    choices, _, _ = taken(replace(law, exponent=max(1.0, law.exponent)), Wish())
+    choices, *_ = taken(replace(law, exponent=max(1.0, law.exponent)), Wish())
     assert Choice.AGAIN not in choices

@@ -45,7 +45,8 @@ for n, law in enumerate(laws, start=1):
         if '"scan_done"' in events.read_text():
             sys.exit(1)
         time.sleep(0.02)
-    print(json.dumps({"event": "error_law", "n_views": 3 * n, "noise": 0.1, "offset": 0.0, **law}), flush=True)
+    known = {"event": "error_law", "number": n, "n_views": 3 * n, "noise": 0.1, "offset": 0.0}
+    print(json.dumps({**known, **law}), flush=True)
 while '"scan_done"' not in events.read_text():
     time.sleep(0.02)
 print(json.dumps({"event": "done", "output": sys.argv[2]}), flush=True)
@@ -196,7 +197,7 @@ def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_t
         with h5py.File(ran.folder / "scan.h5") as file:
             assert series.seconds == pytest.approx(np.ptp(file[layout.TIME][()]))
         last = live((1.0, 0.1, None))
-        words_of = lambda scan, output: [word.replace("3 * n", "9") for word in last(scan, output)]  # noqa: E731
+        words_of = lambda scan, output: [word.replace('"number": n', '"number": 3') for word in last(scan, output)]  # noqa: E731
         run_scan(series.config, series, [events.append], instrument=instrument.connected(), live=words_of)
     (chosen,) = [event.data for event in events if event.event == "next_chosen"]
     assert (chosen["number"], chosen["n_views"], chosen["choice"]) == (3, 9, "enough")

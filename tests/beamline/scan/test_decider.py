@@ -22,13 +22,13 @@ QUALITY = Wish(quality_db=1.0)
 
 
 def law(n: int, exponent: float = 1.0, error: float = 0.1, noise: float = 0.3, **more: Any) -> LawMeasured:
-    return LawMeasured(n, exponent, error, noise, 0.0, **more)
+    return LawMeasured(-(-n // EACH), n, exponent, error, noise, 0.0, **more)
 
 
 class Scan:
     """A decider in a scan that is stood still; `moments` happen one after the other while it waits."""
 
-    def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, seconds: float = 0.0) -> None:
+    def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, **more: Any) -> None:
         instrument = FakeInstrument()
         plan = replace(instrument.plan(4 * EACH, passes=4), retake_share=0.25)
         self.timeline = instrument.worked_out(plan)
@@ -46,7 +46,7 @@ class Scan:
         self.now = 100.0
         self.decide = Decider(
             asks=asks, wish=wish, wait=wait, timeline=self.timeline, seconds_of=seconds_of, now=lambda: self.now,
-            states=self.states, stop=self.stop, sink=self.events.append, began=90.0, seconds=seconds,
+            states=self.states, stop=self.stop, sink=self.events.append, began=90.0, **more,
             unable=lambda: self.reason, wait_a_moment=self.moment, record=self.recorded.append,
             close_shutter=lambda: self.log.append("close shutter"),
         )  # fmt: skip
@@ -58,7 +58,7 @@ class Scan:
     def after(self, n: int, *measured: LawMeasured, retakes: int = 0, again: int = 0) -> Choice:
         """What follows n passes and some that were taken again; the laws come one by one while it waits."""
         self.moments += [lambda each=each: self.decide.add_law(each) for each in measured]  # type: ignore[misc]
-        self.waited = 0
+        self.waited, self.decide.number = 0, n - 1
         each = pass_blocks(self.timeline.views, 0)
         done, to_come = each[: n - again], each[n - again : len(each) - again]
         return self.decide(Passes(done + done[-1:] * again, to_come, (), retakes))
@@ -143,12 +143,11 @@ def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
     assert scan.waited == 2
 
 
-def test_views_that_were_flagged_are_missed_by_no_law() -> None:
+def test_the_law_after_what_an_earlier_part_chose_has_no_prediction_beside_it() -> None:
     scan = Scan(Wish(0.01), wait=0.2)
-    scan.after(1, law(7, error=0.5))
-    scan.after(2, law(14, error=0.5))
-    scan.after(3, law(21, error=0.5))
-    assert [each["by"] for each in scan.of("next_chosen")] == ["program"] * 3
+    scan.after(2, law(21, error=0.5, gained=1.0))  # of fewer views, as some were flagged
+    assert (scan.chosen["number"], scan.chosen["by"], scan.chosen["judged"]) == (2, "program", 1)
+    assert "predicted" not in scan.chosen
 
 
 @pytest.mark.parametrize("asks", [False, True])

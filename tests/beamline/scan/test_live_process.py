@@ -269,8 +269,8 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=T
 def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path) -> None:
     said = """
 import json
-law = {"event": "error_law", "n_views": 90, "exponent": 1.1, "exponent_error": 0.1, "noise": 0.2, "offset": 0.0}
-print(json.dumps({**law, "gained": None, "seconds": 2.0}))
+law = {"event": "error_law", "number": 1, "n_views": 90, "noise": 0.2, "offset": 0.0}
+print(json.dumps({**law, "exponent": 1.1, "exponent_error": 0.1, "gained": None}))
 print(json.dumps({"event": "error_law", "n_views": 90}))
 """
     laws: list[LawMeasured] = []
