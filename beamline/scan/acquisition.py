@@ -301,10 +301,13 @@ class Acquisition:
         while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
             self._clock.sleep(min(SLICE, left))
 
-    def wait_while_paused(self) -> None:
+    def wait_while_paused(self, reopen: bool = True) -> None:
         """Wait with a closed shutter while a pause is requested; a stop ends it.
 
         A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.
+
+        Args:
+            reopen: frames follow at once.
         """
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
         reason = pause.reason
@@ -321,7 +324,8 @@ class Acquisition:
             if self._supervision.wait_in_pause():
                 pause.resume()
         if not self._stop.stopping:
-            self._set_shutter_and_sample(block)
+            if reopen:
+                self._set_shutter_and_sample(block)
             states.enter(_state_of(block), "The scan goes on")
 
     def _make_safe(self, home: float | None) -> list[BaseException]:

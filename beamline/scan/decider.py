@@ -133,7 +133,9 @@ class Decider:
     def _newest(self, passes: Passes) -> ErrorLaw | None:
         """The newest law. Gains depend on ratios of numbers of views alone: a law of some views serves for all."""
         values = self._law.exponent, self._law.exponent_error, self._law.noise, self._law.offset
-        return None if self._law.reason or None in values else ErrorLaw(passes.n_views, *values)
+        if self._law.reason or None in values or not 0 <= values[2] + values[3] <= 1:  # of a process that is not ours
+            return None
+        return ErrorLaw(passes.n_views, *values)
 
     def _spent(self, passes: Passes) -> tuple[float, float]:
         """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""

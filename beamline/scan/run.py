@@ -424,7 +424,7 @@ class _Run:
         )  # fmt: skip
 
         def wait_a_moment() -> bool:
-            acquisition.wait_while_paused()
+            acquisition.wait_while_paused(reopen=False)
             return wait_in_pause(recorder)
 
         cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"

@@ -95,7 +95,7 @@ def measured_law(
     beside = _DENSITY * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
     offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    if fall is None or len(sizes) < 2 or min(errors) <= 0:
+    if not fall or len(sizes) < 2 or min(errors) <= 0:
         return law, None
     measured_exponent = _SHOWN * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
     return law, measured_exponent * 10 * math.log10(n / sizes[-2])

@@ -154,6 +154,8 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
 
     def react(event: Event) -> None:
         state = event.data.get("state")
+        if event.data.get("message") == "The scan goes on":
+            seen.append(("goes on", instrument.is_open))
         if event.event != "state" or state not in (State.ASKING, State.PAUSED):
             return
         (run,) = tmp_path.iterdir()
@@ -164,7 +166,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     asks = ("scan.decide=ask", "scan.wait_s=300", "scan.mode=step", "scan.pass_views=5")
     ran = Ran(tmp_path, instrument, *PASSES[1:], *asks, live=live((1.0, 0.1, None)), heard=react)
     assert ran.error is None
-    assert seen == [("asking", False), ("paused", False), ("asking", False)]
+    assert seen == [("asking", False), ("paused", False), ("goes on", False), ("asking", False)]
     assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
     ran.assert_good_file(12, "complete")
 
