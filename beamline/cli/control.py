@@ -46,7 +46,25 @@ def _send(run: Path | None, word: str) -> None:
     if run is not None and not run.is_dir():
         raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
     run = run or _only(runs)
-    click.echo(f"{run}: {tell(run, Choice(word) if word in CHOICES else Verb(word))}")
+    state = tell(run, Choice(word) if word in CHOICES else Verb(word))
+    if word in CHOICES:
+        _require_chosen(run, word)
+    click.echo(f"{run}: {state}")
+
+
+def _require_chosen(run: Path, choice: str) -> None:
+    """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
+    from beamline.core.events import event_in
+    from beamline.core.files import EVENTS, parts_of
+
+    with (parts_of(run)[-1] / EVENTS).open("rb") as log:
+        decisions = [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
+    last = decisions[-1] if decisions else {}
+    if last.get("choice") != choice:
+        taken = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing"
+        raise ConfigError(
+            f"the scan in {run} does not take {choice}, which was not on offer or came too late; {taken}."
+        )
 
 
 @click.command()
@@ -57,7 +75,7 @@ def decide(words: tuple[str, ...]) -> None:
     With `scan.decide: ask` a scan asks after each pass of views: the next pass of the plan, the angles of the last one
     again, the wide views, views that were flagged, or no further view.
 
-    Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not ask, 5 disk error.
+    Exit code: 0 the scan has obeyed, 2 no scan runs there, it does not ask, or it takes another choice, 5 disk error.
     """
     *run, choice = words
     if len(run) > 1 or choice not in CHOICES:

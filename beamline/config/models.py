@@ -323,7 +323,7 @@ class Config(Section):
             "a live volume; set recon.live to true": recon.live,
             "a volume that grows with the views; set recon.method to r2": streams(recon.method),
             "passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or scan.pass_views of a step scan, such "
-            "as 60": scan.pass_views if scan.mode is Mode.STEP else interlaced,
+            "as 60": 0 < scan.pass_views < getattr(angles, "views", math.inf) if scan.mode is Mode.STEP else interlaced,
         }
         if scan.decide != "off" and not all(needs.values()):
             lacking = next(what for what, there in needs.items() if not there)

@@ -26,6 +26,10 @@ FAULTS = {
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step"),
         "my.yaml:5: scan.decide do needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or",
     ),
+    "decision of a single pass": (
+        ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step\n  pass_views: 12"),
+        "my.yaml:5: scan.decide do needs passes; set scan.angles to {scheme: interlaced, passes: 8, ...}, or",
+    ),
     "unknown key": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  setle_s: 1"),
         "my.yaml:5: scan.setle_s is not a known key (did you mean settle_s?); legal keys there: mode, angles",

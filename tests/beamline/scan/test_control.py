@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from beamline.cli.control import CHOICES
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event
+from beamline.core.events import Event, NextChosen
 from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.plan.passes import Choice
@@ -92,11 +92,15 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     run = tmp_path / "runs" / "a"
     run.mkdir(parents=True)
     (run / "config.resolved.yaml").touch()
+    (run / "events.jsonl").touch()
     chosen: list[Choice] = []
     file = RecordFile(run, RunRecord(State.ACQUIRING))
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
+        taken = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
+        with (run / "events.jsonl").open("a") as log:
+            log.write(f"{taken.to_json()}\n")
         file.put(RunRecord(State.TAXI))
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
@@ -106,6 +110,9 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         file.put(RunRecord(State.ASKING))
         told = CliRunner().invoke(main, ["decide", str(run), "again"])
         assert (told.exit_code, told.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        file.put(RunRecord(State.ASKING))
+        other = CliRunner().invoke(main, ["decide", str(run), "wide"])
+        assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr
         (run / "control" / "enough").touch()
     file.close()
     assert not (run / "control").exists()

@@ -35,6 +35,7 @@ from recon.base.method import Reconstruction
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from tests.beamline.ball_scan import COMMON, shipped, with_scene
+from tests.beamline.scans import seal
 
 # A can of 2.8 fields with a ball near its wall, which no ordinary view at 0 degrees shows.
 PIXEL, COLS, VIEWS = 4.6e-3, 40, 12
@@ -153,6 +154,11 @@ def test_triggers_frames_and_rows_are_one(words: tuple[str, ...], tmp_path: Path
         assert {len(file[path]) for path in (layout.DATA, *layout.growing(file))} == {scan.n_frames}
     assert describe(scan.path)["kinds"] == {"projection": VIEWS, "wide_view": 8, "flat": 4, "dark": 2}
     assert [finding for finding in validate(scan.path) if finding.severity == "error"] == []
+    with h5py.File(scan.path, "r+") as file:  # a view that was taken again before them has the trigger of the first
+        file[layout.TRIGGER][FIRST - 1], file[layout.FRAMESTAMP][FIRST - 1] = file[layout.TRIGGER][FIRST], 0
+        file[layout.REPLACES][FIRST - 1] = FIRST - 2
+        seal(file)
+    assert [finding for finding in validate(scan.path) if finding.rule == "framestamps"] == []
 
 
 @pytest.mark.parametrize("words", [(), (motor(-1.0),)], ids=["simulated", "motor"])
