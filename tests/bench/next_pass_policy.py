@@ -154,7 +154,9 @@ def table(kept: Kept, numbers: Sequence[int], seeds: Sequence[int], wish: Wish) 
     right = [one for outcome in each for one in outcome.right]
     ratio = statistics.median(one.ratio for one in each)
     worst = min(one.over_fixed for one in each)
-    lines.append(f"| all | | | {ratio:.2f} | | {worst:+.2f} at least | {sum(right)} of {len(right)} | |")
+    wished = wish.quality_db or 0.0
+    near = f"{sum(one.below <= wished for one in each)} of {len(each)} reach {wished:g}"
+    lines.append(f"| all | | | {ratio:.2f} | {near} | {worst:+.2f} at least | {sum(right)} of {len(right)} | |")
     return "\n".join(lines)
 
 
