@@ -426,9 +426,9 @@ class Rig:
             self.pause.release(cause)
 
     @contextmanager
-    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest, *choose: Any) -> Iterator[None]:
         self.pause = pause
-        with verbs_taken(folder, stop, pause):
+        with verbs_taken(folder, stop, pause, *choose):
             yield
 
     def _wait_in_pause(self, recorder: Recorder) -> bool:
