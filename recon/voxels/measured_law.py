@@ -35,7 +35,7 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 
-LEAST_VIEWS = 48
+LEAST_VIEWS = 40
 _BY_NOISE, _BY_ELSE = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
 _NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
 _SPREAD = 0.25  # relative standard error of an exponent, on the same scans
@@ -65,7 +65,7 @@ def measured_law(
             binned as the views.
 
     Raises:
-        ValueError: a cone, fewer than 48 views or 3 frames of the open beam, or views without matter.
+        ValueError: a cone, fewer than 40 views or 3 frames of the open beam, or views without matter.
     """
     n = len(data)
     if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _FRAMES:
