@@ -225,7 +225,7 @@ class ReconSection(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _wishes_are_of_the_scan(cls, data: Any) -> Any:
+    def _refuse_stop_when(cls, data: Any) -> Any:
         if isinstance(data, dict) and "stop_when" in data:
             raise ValueError(
                 "stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db: 0.5} ends a "

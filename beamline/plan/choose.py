@@ -94,8 +94,8 @@ def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float
     """
     if wish.quality_db is not None and rest.mean <= wish.quality_db:
         return Choice.ENOUGH, (
-            f"all that is left would add {rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f}); "
-            f"{wish.quality_db:g} dB may lack"
+            f"all that the plan still has would add {rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f}); "
+            f"{wish.quality_db:g} dB less is accepted"
         )
     useful = {one: _beyond(one, wish, seconds, dose) for one in offered if one.gain > 0}
     within = [one for one, why in useful.items() if not why]
@@ -107,7 +107,7 @@ def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float
         best = following
     return best.choice, (
         f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f}) in {best.seconds:.0f} s; "
-        "nothing else is surely better for its time"
+        "no other choice is clearly better per second"
     )
 
 
@@ -130,7 +130,7 @@ def _beyond(one: PassOption, wish: Wish, seconds: float, dose: float) -> str:
     """What of the wish an option would exceed, in words; "" if nothing."""
     seconds, percent = seconds + one.seconds, 100 * (dose + one.dose)
     if wish.seconds is not None and seconds > wish.seconds:
-        return f"{one.choice} would end the scan after {seconds:.0f} s; {wish.seconds:g} s are wished"
+        return f"{one.choice} would end the scan after {seconds:.0f} s; the wish allows {wish.seconds:g} s"
     if wish.dose is not None and percent > 100.0000001 * wish.dose:
-        return f"{one.choice} would make it {percent:.3g} % of the plan's dose; {100 * wish.dose:g} % are wished"
+        return f"{one.choice} would make it {percent:.3g} % of the plan's dose; the wish allows {100 * wish.dose:g} %"
     return ""

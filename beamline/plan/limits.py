@@ -120,7 +120,7 @@ def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
     return runs
 
 
-PASSES = 100
+MOST_PASSES = 100
 """Most passes of a step scan: a pass holds which of all views it takes."""
 ROOM = 1.1
 """Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
@@ -167,10 +167,10 @@ def violations(facts: PlanFacts) -> Iterator[str]:
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
             yield f"no {name}: scan.{name}.count is 0; take at least one, or say at: none where that is meant"
-    if plan.pass_views and plan.n_views > PASSES * plan.pass_views:
+    if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
         yield (
-            f"scan.pass_views {plan.pass_views} makes more than {PASSES} passes of {plan.n_views} views; set it to at "
-            f"least {math.ceil(plan.n_views / PASSES)}, or to 0"
+            f"scan.pass_views {plan.pass_views} divides {plan.n_views} views into more than {MOST_PASSES} passes; "
+            f"set it to at least {math.ceil(plan.n_views / MOST_PASSES)}, or to 0"
         )
     needed = facts.total_bytes + facts.retake_bytes
     if facts.free_bytes is not None and needed * ROOM > facts.free_bytes:

@@ -56,12 +56,12 @@ class Passes:
         return self if choice is Choice.RETAKE else replace(self, to_come=to_come, wide=())
 
 
-def triggers_of(*blocks: Block) -> frozenset[int]:
+def triggers_to_take(*blocks: Block) -> frozenset[int]:
     """Frames, counted within their block, that are taken in one of these parts of a block."""
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def begun(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
+def passes_at_start(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
     """A scan at the end of the pass that it begins with; one that goes on is in that pass.
 
     Passes are those of the whole plan, whatever is stored.

@@ -12,7 +12,7 @@ from beamline.core.errors import BeamlineError, DataError, InstrumentError, Refe
 from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
-from beamline.plan.passes import Choice, Passes, begun, triggers_of
+from beamline.plan.passes import Choice, Passes, passes_at_start, triggers_to_take
 from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block
 from beamline.scan.control import State
 from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
@@ -145,7 +145,7 @@ class Acquisition:
             else:
                 yield from self._block(RecordedBlock(block, BlockTally()))
             if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
-                yield from self._again(block)
+                yield from self._retake(block)
 
     def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Iterator[Frame]:
         """The views in passes, and what is chosen after each. What nobody chose is left to the plan.
@@ -153,8 +153,8 @@ class Acquisition:
         A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
         """
         plan, wide = self._timeline.plan, [b for b in self._timeline.blocks if b.kind is FrameKind.WIDE_VIEW and b.left]
-        passes, choice = begun(views, plan, wide), Choice((Choice.NEXT, *plan.choices)[-1])
-        rest = replace(views, stored=frozenset(range(views.n)) - triggers_of(*passes.done) | views.stored)
+        passes, choice = passes_at_start(views, plan, wide), Choice((Choice.NEXT, *plan.choices)[-1])
+        rest = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         due = [*([rest] if rest.left else []), *(wide if choice is Choice.WIDE else [])]
         while True:
             again = passes.done[-1] in passes.done[:-1]
@@ -163,11 +163,11 @@ class Acquisition:
                 yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(done)
                 self._recover(done.taken.rows)
             if choice is Choice.RETAKE:
-                yield from self._again(views)
+                yield from self._retake(views)
             if self._stop.stopping:
                 return
             self._supervision.pass_ended()
-            passes = replace(passes, retakes=self._supervision.may_retake(self._missing_views))
+            passes = replace(passes, retakes=self._supervision.n_retakable(self._missing_views))
             if not (passes.to_come or passes.wide or passes.retakes):
                 return
             choice = next_pass(passes)
@@ -194,7 +194,7 @@ class Acquisition:
             self._devices.sample.back()
         self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
-    def _again(self, views: Block) -> Iterator[Frame]:
+    def _retake(self, views: Block) -> Iterator[Frame]:
         """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
         which is then not missing. A repeated view without a frame is not a further failure."""
         retakes = self._supervision.retakes(self._missing_views)

@@ -179,9 +179,9 @@ class Recorder:
             self.wait()
             self._retaking = False
 
-    def decided(self, values: Mapping[str, object]) -> None:
+    def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass: the values of its event, if the scan decides."""
-        self._enqueue(lambda: self._writer.decided(values))
+        self._enqueue(lambda: self._writer.add_decision(values))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; no frame may be put afterwards."""

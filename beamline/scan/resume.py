@@ -21,7 +21,7 @@ from beamline.config.load import NO_LIVE, Config, changed, load, plan_of, resolv
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
 from beamline.instrument import connect
-from beamline.plan.passes import Choice, begun, triggers_of
+from beamline.plan.passes import Choice, passes_at_start, triggers_to_take
 from beamline.plan.plan import ScanPlan
 from beamline.plan.timeline import work_out
 from beamline.scan.preflight import ReadyScan
@@ -222,10 +222,10 @@ def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], 
     choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, ended + 1))
     plan = replace(plan_of(config), choices=choices)
     stage, camera, to_counts = connect.describe(config)
-    passes = begun(work_out(plan, stage, to_counts, camera).views, plan)
-    missing = triggers_of(*passes.done) - views | triggers_of(*passes.to_come)
+    passes = passes_at_start(work_out(plan, stage, to_counts, camera).views, plan)
+    missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
     if choices[-1:] == (Choice.AGAIN,):
-        missing |= triggers_of(passes.done[-1]) - since
+        missing |= triggers_to_take(passes.done[-1]) - since
     if Choice.ENOUGH in choices:
         wide |= {plan.angles.size + i for i in range(plan.wide_views * len(plan.wide_places))}
     return {*range(plan.angles.size)} - missing, wide, choices

@@ -419,7 +419,7 @@ class _Run:
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
                 next_pass=None if self.config.scan.decide == "off" else decider,
                 pass_ended=recorder.end_pass,
-                may_retake=lambda missing: len(self._to_retake(recorder, missing)[0]),
+                n_retakable=lambda missing: len(self._to_retake(recorder, missing)[0]),
             ),
         )  # fmt: skip
 
@@ -430,7 +430,7 @@ class _Run:
         cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
         ended = "no live reconstruction is running"
         decider.unable = lambda: cone or (ended if follower is None or follower.ended else "")
-        decider.record, decider.wait_a_moment = recorder.decided, wait_a_moment
+        decider.record, decider.wait_a_moment = recorder.add_decision, wait_a_moment
         return acquisition
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:

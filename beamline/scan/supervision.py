@@ -56,8 +56,8 @@ class Supervision:
     next_pass: Callable[[Passes], Choice] | None = None
     # pass_ended: called before, and after the last pass, too; all frames were delivered
     pass_ended: Callable[[], None] = lambda: None
-    # may_retake: called then with the triggers without a frame; returns how many views `retakes` would return
-    may_retake: Callable[[Sequence[int]], int] = lambda missing: 0
+    # n_retakable: called then with the triggers without a frame; returns how many views `retakes` would return
+    n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 
 @dataclass(frozen=True)

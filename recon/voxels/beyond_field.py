@@ -124,7 +124,7 @@ def sample_radius(
 
 
 def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None) -> float:
-    """The mean square error, 1/mm², of the constant that unknown matter beside the field adds in its middle.
+    """The square error, 1/mm², in the middle of the field, from not knowing the density beside it.
 
     It is of a volume in a box as wide as the sample, by the uncertainty of its density. Of cans of packed balls, 1.5, 2
     and 3 times as wide as the field, 90 views give 5, 1 and 2 times the true one; 30 views a tenth of it.

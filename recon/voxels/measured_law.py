@@ -36,17 +36,17 @@ from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 
 LEAST_VIEWS = 40
-_BY_NOISE, _BY_ELSE = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
+_BY_NOISE, _BY_OTHERS = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
 _NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
 _SPREAD = 0.25  # relative standard error of an exponent, on the same scans
 _SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles
-_SHOWN = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
-_FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
-_DENSITY = 3.0  # times the square error by the uncertainty of the density beside the field
+_VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
+_USUAL_FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
+_OFFSET_FACTOR = 3.0  # times the square error by the uncertainty of the density beside the field
 _MOST_OFFSET = 0.4  # share of the error
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
-_FRAMES = 3  # of the open beam, at least
+_LEAST_FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
 _BY_VIEWS = 0.6  # the weight of total variation grows with the views to this power
 _CIRCLE = 0.95  # of the field's radius, where errors count
@@ -68,8 +68,9 @@ def measured_law(
         ValueError: a cone, fewer than 40 views or 3 frames of the open beam, or views without matter.
     """
     n = len(data)
-    if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _FRAMES:
-        there = f"{n} views and {len(open_beam)} frames of the open beam are there, {LEAST_VIEWS} and {_FRAMES} needed"
+    if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
+        needed = f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
+        there = f"{n} views and {len(open_beam)} frames of the open beam are there, {needed}"
         raise ValueError(
             f"the error of a volume is not measured: {'the beam is a cone' if geometry.is_cone else there}"
         )
@@ -90,14 +91,16 @@ def measured_law(
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
     gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
-    by_noise = 1.0 if gaps else noise * (_FALL if fall is None else fall)
-    exponent = float(np.interp(by_noise, _NOISY, (_BY_ELSE, _BY_NOISE)))
-    beside = _DENSITY * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
+    by_noise = 1.0 if gaps else noise * (_USUAL_FALL if fall is None else fall)
+    exponent = float(np.interp(by_noise, _NOISY, (_BY_OTHERS, _BY_NOISE)))
+    beside = _OFFSET_FACTOR * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
     offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
     if not fall or len(sizes) < 2 or min(errors) <= 0:
         return law, None
-    measured_exponent = _SHOWN * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
+    measured_exponent = (
+        _VOLUME_OVER_VIEWS * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
+    )
     return law, measured_exponent * 10 * math.log10(n / sizes[-2])
 
 

@@ -30,7 +30,7 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         choice = choose(passes)
         numbers[-1] += 1
         values = {"number": numbers[-1], "n_views": passes.n_views, "choice": choice, "predicted": float("nan")}
-        recorders[-1].decided(values)
+        recorders[-1].add_decision(values)
         return choice
 
     def ready(*given: Any, **more: Any) -> Any:

@@ -34,7 +34,7 @@ CLOSE_DB, CLOSE_SHARE = 0.3, 0.3
 
 @dataclass(frozen=True)
 class Step:
-    """A pass end: the passes so far, the law of their error, what is chosen, and dB that all that is left would add."""
+    """A pass end: the passes so far, the law of their error, what is chosen, and dB that the rest of the plan adds."""
 
     state: State
     law: ErrorLaw

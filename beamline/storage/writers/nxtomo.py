@@ -202,7 +202,7 @@ class NXtomoWriter:
         """
         self._add(layout.PASS_ENDS, self._rows)
 
-    def decided(self, values: Mapping[str, object]) -> None:
+    def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass, likewise."""
         self._add(layout.DECISIONS, json.dumps(values, default=str).encode())
 

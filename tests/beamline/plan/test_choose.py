@@ -79,14 +79,14 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
         ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would add 1.00 dB"),
         ([NEXT], Wish(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
         ([NEXT], Wish(seconds=100), (90.0, 0), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; 100 s are wished"),
+        ([NEXT], Wish(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; the wish allows 100 s"),
         ([NEXT], Wish(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; 50 % are wished"),
-        ([NEXT], Wish(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "may lack"),  # whichever is met first
-        ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else is surely better"),
-        ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else"),
+        ([NEXT], Wish(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; the wish allows 50 %"),
+        ([NEXT], Wish(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "less is accepted"),  # whichever is met first
+        ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice is clearly better"),
+        ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
         ([NEXT, option(Choice.AGAIN, 1.3)], QUALITY, NOTHING, 9, Choice.AGAIN, "1.30 dB"),
-        ([NEXT, option(Choice.AGAIN, 1.3, off=0.2)], QUALITY, NOTHING, 9, Choice.NEXT, "nothing else"),
+        ([NEXT, option(Choice.AGAIN, 1.3, off=0.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
         ([NEXT, option(Choice.WIDE, 1.0, 5.0)], QUALITY, NOTHING, 9, Choice.WIDE, "1.00 dB (1.00 to 1.00) in 5 s"),
         ([NEXT, option(Choice.RETAKE, 0.1, 0.5)], QUALITY, NOTHING, 9, Choice.RETAKE, "0.10 dB"),
         # The next pass takes too long, a few retakes do not.

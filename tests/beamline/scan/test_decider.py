@@ -111,7 +111,9 @@ def test_where_the_next_pass_is_sure_the_stage_does_not_wait_and_the_outcome_com
 def test_enough_ends_the_views_without_hurry() -> None:
     scan = Scan()
     assert scan.after(3, law(36, exponent=0.5)) is Choice.ENOUGH
-    assert scan.stop.enough and scan.stop.reason.startswith("the views are enough: all that is left would add 0.62 dB")
+    assert scan.stop.enough and scan.stop.reason.startswith(
+        "the views are enough: all that the plan still has would add 0.62 dB"
+    )
     assert scan.chosen["choice"] == "enough" and scan.recorded[0]["reason"] == scan.chosen["reason"]
 
 

@@ -99,7 +99,7 @@ def test_ends_of_passes_and_decisions_are_there_while_the_file_grows(
             assert (source.pass_ends.tolist(), source.decisions) == ([], ())
             writer.end_pass()
             assert (source.refresh(), source.pass_ends.tolist()) == (8, [8])
-            writer.decided(decided)
+            writer.add_decision(decided)
             append(writer, *frames[8:])
             writer.end_pass()
             assert (source.refresh(), source.pass_ends.tolist()) == (len(frames), [8, len(frames)])

@@ -55,7 +55,7 @@ def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
         patch.setattr(h5py.Dataset, "resize", Mock(side_effect=OSError(28, "No space left on device")))
         with pytest.raises(DataError, match=r"s\.h5 could not take the end of a pass.*No space left.*first 3 frames"):
             writer.end_pass()
-    writer.decided({"choice": "next"})  # nothing more is written
+    writer.add_decision({"choice": "next"})  # nothing more is written
     writer.close()
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.refresh(), source.attributes["status"], source.pass_ends.size) == (3, "failed", 0)
