@@ -197,7 +197,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
-            _refuse_whole(run, planned, parts, closed)
+            _refuse_whole(run, parts, closed)
     last, seconds = max(float(each.max()) for each in times), sum(float(np.ptp(each)) for each in times)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(views), planned, last, tuple(left_out), end_references,
@@ -231,9 +231,9 @@ def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], 
     return {*range(plan.angles.size)} - missing, wide, choices
 
 
-def _refuse_whole(run: Path, planned: int, parts: list[Path], closed: bool) -> None:
+def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
-    whole = f"{run} has all {planned} views and its references"
+    whole = f"{run} has all views that it was to take, and its references"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
     what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
