@@ -107,7 +107,7 @@ class Fields(Section):
 
 
 class WishSection(Section):
-    """What a scan that decides is to reach; several wishes hold together, null is none."""
+    """Limits of a scan that decides: it keeps all that are given; null is no limit."""
 
     quality_db: Annotated[float, Field(gt=0, le=100)] | None = Field(
         default=None, description="dB of PSNR that the volume may stay below that of the whole plan."

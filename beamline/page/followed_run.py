@@ -82,12 +82,12 @@ class RunValues:
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
-    """What an operator's word chooses. Raises ConfigError if it is none of what can be measured next."""
+    """The choice that an operator's word names. Raises ConfigError if it is not on offer."""
     for choice in Choice:
         if choice == word and word in values.options:
             return choice
     options = ", ".join(values.options) or "no pass has ended yet"
-    raise ConfigError(f"{one_line(word)!r} is none of what can be measured next: {options}. Nothing was changed.")
+    raise ConfigError(f"{one_line(word)!r} cannot be chosen now; on offer: {options}. Nothing was changed.")
 
 
 class Severity(IntEnum):

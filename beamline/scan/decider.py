@@ -106,8 +106,6 @@ class Decider:
         self._outcome = {}
         self.sink(event)
         self.record({"predicted": None, "gained": None} | event.data)
-        if choice is Choice.ENOUGH:
-            self.stop.stop_as_enough(f"the views are enough: {reason}")
         return choice
 
     def _predict(self, passes: Passes) -> tuple[ErrorLaw | None, tuple[PassOption, ...]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
+from beamline.plan.passes import Choice
 from beamline.storage import hdf5
 from beamline.storage.parts import decisions_in, files_with_frames, joined_file_of, to_join, views_in, views_planned
 from beamline.storage.run_record import DIED, alive, read_record
@@ -124,7 +125,7 @@ def _lacks_views(run: Path) -> bool:
             with hdf5.open_hdf5(part) as file, hdf5.readable(part):
                 planned = views_planned(file) or 0
                 views |= views_in(file)
-                enough = any(values.get("choice") == "enough" for values in decisions_in(file))
+                enough = any(values.get("choice") == Choice.ENOUGH for values in decisions_in(file))
                 rejected |= layout.PASS_ENDS in file and (enough or ending_in(file).status == "complete")
     except (DataError, *hdf5.ALTERED):
         return False

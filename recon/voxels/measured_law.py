@@ -38,12 +38,10 @@ from recon.voxels.voxel_problem import VoxelProblem
 LEAST_VIEWS = 40
 _BY_NOISE, _BY_OTHERS = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
 _NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
-_SPREAD = 0.25  # relative standard error of an exponent, on the same scans
-_SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles
+_SPREAD = 0.25  # half of the range of a gain, as a share of it: a convention, see docs/performance.md
+_SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles: median of 14
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
 _USUAL_FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
-_OFFSET_FACTOR = 3.0  # times the square error by the uncertainty of the density beside the field
-_MOST_OFFSET = 0.4  # share of the error
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
 _LEAST_FRAMES = 3  # of the open beam, at least
@@ -93,8 +91,8 @@ def measured_law(
     gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
     by_noise = 1.0 if gaps else noise * (_USUAL_FALL if fall is None else fall)
     exponent = float(np.interp(by_noise, _NOISY, (_BY_OTHERS, _BY_NOISE)))
-    beside = _OFFSET_FACTOR * offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
-    offset = min(beside / (errors[1] + beside), _MOST_OFFSET) if beside else 0.0
+    beside = offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
+    offset = beside / (errors[1] + beside) if beside else 0.0
     law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
     if not fall or len(sizes) < 2 or min(errors) <= 0:
         return law, None

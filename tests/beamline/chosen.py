@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from beamline.config.load import plan_of
+from beamline.config.load import Config, plan_of
 from beamline.plan.passes import Choice, Passes
+from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.supervision import Supervision
@@ -38,13 +39,17 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         numbers.append(len(made.plan.choices))
         return replace(made, info=replace(made.info, decides=True))
 
+    def in_passes(config: Config) -> ScanPlan:
+        return replace(plan_of(config), pass_views=pass_views)
+
+    def supervised(*given: Any, **more: Any) -> Supervision:
+        return Supervision(*given, **more | {"next_pass": next_pass})
+
     with patch.context() as within:
         for module in ("preflight", "resume"):
-            in_passes = lambda config: replace(plan_of(config), pass_views=pass_views)  # noqa: E731
             within.setattr(f"beamline.scan.{module}.plan_of", in_passes)
         within.setattr("beamline.scan.run.preflight", ready)
         within.setattr("beamline.scan.run.Recorder", recorder)
-        supervised = lambda *given, **more: Supervision(*given, **more | {"next_pass": next_pass})  # noqa: E731
         within.setattr("beamline.scan.run.Supervision", supervised)
         yield
 

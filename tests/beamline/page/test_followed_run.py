@@ -93,11 +93,11 @@ def test_what_can_be_measured_next_stands_in_lists_until_it_is_chosen() -> None:
 
 def test_a_choice_is_one_of_the_options() -> None:
     assert choice_of(_after(STARTED, ASKED), "enough") is Choice.ENOUGH
-    with pytest.raises(ConfigError, match="'wide' is none of what can be measured next: next, enough"):
+    with pytest.raises(ConfigError, match="'wide' cannot be chosen now; on offer: next, enough"):
         choice_of(_after(STARTED, ASKED), "wide")
     with pytest.raises(ConfigError, match="no pass has ended yet"):
         choice_of(_after(STARTED), "next")
-    with pytest.raises(ConfigError, match="none of"):  # of a log of another version
+    with pytest.raises(ConfigError, match="cannot be chosen now"):  # of a log of another version
         choice_of(_after(STARTED, replace(ASKED, options=[{**NEXT, "choice": "later"}])), "later")
 
 

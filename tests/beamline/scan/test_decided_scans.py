@@ -199,7 +199,10 @@ def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_t
         with h5py.File(ran.folder / "scan.h5") as file:
             assert series.seconds == pytest.approx(np.ptp(file[layout.TIME][()]))
         last = live((1.0, 0.1, None))
-        words_of = lambda scan, output: [word.replace('"number": n', '"number": 3') for word in last(scan, output)]  # noqa: E731
+
+        def words_of(scan: Path, output: Path) -> list[str]:
+            return [word.replace('"number": n', '"number": 3') for word in last(scan, output)]
+
         run_scan(series.config, series, [events.append], instrument=instrument.connected(), live=words_of)
     (chosen,) = [event.data for event in events if event.event == "next_chosen"]
     assert (chosen["number"], chosen["n_views"], chosen["choice"]) == (3, 9, "enough")

@@ -108,12 +108,11 @@ def test_where_the_next_pass_is_sure_the_stage_does_not_wait_and_the_outcome_com
     assert (scan.chosen["predicted"], scan.chosen["gained"], scan.chosen["judged"]) == (predicted, 5.0, 1)
 
 
-def test_enough_ends_the_views_without_hurry() -> None:
+def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
     scan = Scan()
     assert scan.after(3, law(36, exponent=0.5)) is Choice.ENOUGH
-    assert scan.stop.enough and scan.stop.reason.startswith(
-        "the views are enough: all that the plan still has would add 0.62 dB"
-    )
+    assert not scan.stop.stopping
+    assert scan.chosen["reason"].startswith("all that the plan still has would add 0.62 dB")
     assert scan.chosen["choice"] == "enough" and scan.recorded[0]["reason"] == scan.chosen["reason"]
 
 
@@ -204,7 +203,7 @@ def test_enter_takes_what_is_recommended_but_not_an_earlier_one() -> None:
     scan = Scan(asks=True, wait=60)
     scan.moments = [lambda: scan.decide.add_law(law(36, exponent=0.3)), lambda: True, lambda: None, lambda: True]
     assert scan.after(3) is Choice.ENOUGH and scan.waited == 4
-    assert scan.chosen["by"] == "operator" and scan.stop.enough
+    assert scan.chosen["by"] == "operator"
 
 
 def test_without_an_answer_the_plan_goes_on_though_no_law_came() -> None:
