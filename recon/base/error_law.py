@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Gain:
-    """A predicted gain in dB of PSNR, and the ends of what is likely (two standard errors)."""
+    """A predicted gain in dB of PSNR, and the ends of its range (docs/performance.md says how often they hold)."""
 
     mean: float
     low: float

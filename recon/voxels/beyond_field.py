@@ -127,7 +127,7 @@ def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None
     """The square error, 1/mm², in the middle of the field, from not knowing the density beside it.
 
     It is of a volume in a box as wide as the sample, by the uncertainty of its density. Of cans of packed balls, 1.5, 2
-    and 3 times as wide as the field, 90 views give 5, 1 and 2 times the true one; 30 views a tenth of it.
+    and 3 times as wide as the field, 90 views give 6 to 20, 1 and 2 times the true one; 30 views a tenth of it.
 
     Args:
         geometry: of the views.
