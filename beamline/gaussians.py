@@ -1,7 +1,5 @@
 """Reads the Gaussians behind a volume from its file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

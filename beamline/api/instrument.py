@@ -1,7 +1,5 @@
 """The instrument of a script: devices that stay open over many scans, and the results of scans."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Arguments and options that several commands share: how values are parsed and compared, and what --json prints."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os

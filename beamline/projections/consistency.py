@@ -1,7 +1,5 @@
 """Consistency: laws that hold for all views of a sample at rest, and the warning of one wider than the field."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The tilt of the rotation axis that corrected views show, and the warning where nobody stated it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

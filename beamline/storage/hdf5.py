@@ -1,7 +1,5 @@
 """Opening and writing HDF5 files that may be growing, locked or damaged, and why one cannot be read."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -3,8 +3,6 @@
 Every command that meets such a run says the same, by `next_step`.
 """
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Process variables of the newest run of a folder, by PVAccess (p4p); with --control also verbs and answers to it."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

@@ -3,8 +3,6 @@
 The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
 """
 
-from __future__ import annotations
-
 import asyncio
 import ipaddress
 import secrets

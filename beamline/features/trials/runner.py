@@ -1,7 +1,5 @@
 """Runner: reads the scan once, runs each trial in a separate process within the time limit, writes the table."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

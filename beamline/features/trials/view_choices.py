@@ -1,7 +1,5 @@
 """The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

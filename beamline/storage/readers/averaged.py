@@ -1,7 +1,5 @@
 """Scans whose views are means of several frames."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Conditions for trust in a scan of any format, one function a rule. Public validators accept NaN angles, not these."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

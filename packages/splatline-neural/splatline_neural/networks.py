@@ -3,8 +3,6 @@
 All take points [line, sample, 3] in 0..1 of the field's box and give density [line, sample] in the field's unit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Names of image files: the kind of each frame, its number, and the angle where the name says it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
