@@ -13,7 +13,7 @@ import click
 
 from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
 from beamline.core.errors import INTERRUPTED, ConfigError
-from beamline.core.events import Done, Sink
+from beamline.core.events import Done, Sink, event_in
 from beamline.core.stop import terminated_like_interrupted
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
@@ -54,7 +54,6 @@ def _send(run: Path | None, word: str) -> None:
 
 def _require_chosen(run: Path, choice: str) -> None:
     """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
-    from beamline.core.events import event_in
     from beamline.core.files import EVENTS, parts_of
 
     with (parts_of(run)[-1] / EVENTS).open("rb") as log:

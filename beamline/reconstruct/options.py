@@ -13,7 +13,7 @@ from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.region import AroundSample, Region, selection_around
+from beamline.reconstruct.region import AroundSample, Region, box_around_sample, selection_around
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
@@ -174,8 +174,6 @@ class ReconOptions:
         if region is None:
             return self
         if isinstance(region, AroundSample):
-            from beamline.reconstruct.region import box_around_sample
-
             region = box_around_sample(source, self.selection)
         selection = selection_around(source, self.selection, region, self.method.traits.halo)
         return replace(self, selection=selection, region=region)

@@ -6,7 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,11 +14,8 @@ from beamline.cli.options import json_events, set_option
 from beamline.core.events import Diagnosed, Done
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
-from beamline.features.doctor.check import Grade
+from beamline.features.doctor.check import Diagnosis, Grade
 from drivers.base.clock import SystemClock
-
-if TYPE_CHECKING:
-    from beamline.features.doctor.check import Diagnosis
 
 _STYLES = {
     Grade.OK: "green",
@@ -48,7 +45,6 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
     Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """
     from beamline.config.load import load
-    from beamline.features.doctor.check import Diagnosis
     from beamline.features.doctor.examine import examine
 
     if file is None and overrides:

@@ -24,7 +24,7 @@ from beamline.cli.options import (
 from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import refuse_existing
+from beamline.core.files import refuse_existing, whole_file
 from beamline.core.text import count, size
 from beamline.storage.volumes import suffixes_text
 from recon.base.views import spread
@@ -178,8 +178,6 @@ def _write_ply(path: Path, model: Model) -> None:
         DataError: `path` exists, or the disk refuses; nothing is left.
     """
     import numpy as np
-
-    from beamline.core.files import whole_file
 
     arrays, unit = model.gaussians.physical(), model.record.length_unit
     names = ("x", "y", "z", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "density")

@@ -14,7 +14,7 @@ from beamline.cli.selection_options import light_asked, light_options, scan_opti
 from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.events import RuleBroken
-from beamline.core.files import refuse_existing
+from beamline.core.files import refuse_existing, write_whole
 from beamline.core.text import SENTENCE, aligned, count, one_line, printable
 
 if TYPE_CHECKING:
@@ -98,7 +98,6 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:
-    from beamline.core.files import write_whole
     from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
 

@@ -52,7 +52,6 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
-    from beamline.core.errors import ConfigError
     from beamline.features.page.app import page  # these load HDF5 and the server, which `scan -h` does not need
     from beamline.features.page.serve import open_port, start
     from beamline.page.run_files import Reader, watched

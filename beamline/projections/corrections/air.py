@@ -12,7 +12,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.projections.step import StepDone, StepMemory, option
-from recon.base.arrays import bin_views, factor_within
+from recon.base.arrays import F32, F64, Mask, bin_views, factor_within
 from recon.base.views import spread
 from recon.base.volume import Grid
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
-    from recon.base.arrays import F32, F64, Mask
     from recon.base.geometry import Geometry
     from recon.prep.background import AirSums, Background
 

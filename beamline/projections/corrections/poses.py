@@ -11,17 +11,15 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.protocols import Unmoved
+from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import cone_of, pivot_of, pixel_size, rows_of, with_pivot
+from beamline.projections.selection import Selection, cone_of, pivot_of, pixel_size, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from beamline.projections.protocols import ScanPart, ViewMotion
-    from beamline.projections.selection import Selection
     from beamline.projections.usable_views import UsableViews
     from beamline.storage.pose_table import PoseTable
     from beamline.storage.readers.base import ScanSource

@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
-from beamline.projections.selection import cone_of
+from beamline.projections.selection import Selection, cone_of
 from beamline.projections.step import StepDone, StepMemory, option
 from drivers.base.frame import FrameKind
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.core.sinks import Warn
-    from beamline.projections.selection import Selection
     from beamline.projections.tilt import BandsDone
     from beamline.storage.readers.base import ScanSource
     from recon.prep import resample

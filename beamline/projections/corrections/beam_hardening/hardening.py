@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.projections.step import StepDone, StepMemory, option
-from recon.base.arrays import bin_views
+from recon.base.arrays import F32, F64, bin_views
 from recon.base.volume import Grid, Volume
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
-    from recon.base.arrays import F32, F64
     from recon.base.geometry import Geometry
     from recon.features.beam_hardening import Curve
 

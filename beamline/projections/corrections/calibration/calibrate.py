@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.projections.selection import geometry_of, pivot_of, rows_of, with_pivot
+from beamline.projections.selection import Selection, geometry_of, pivot_of, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 from recon.base.registry import unknown
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
-    from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry

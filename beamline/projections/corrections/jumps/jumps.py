@@ -12,10 +12,10 @@ import numpy as np
 from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.protocols import Unmoved
-from beamline.projections.selection import cone_of, geometry_of, rows_of
+from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
+from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.projections.step import StepDone, StepMemory, option
-from beamline.projections.usable_views import part_numbers
+from beamline.projections.usable_views import UsableViews, part_numbers, usable_views
 from drivers.base.frame import FrameKind
 from recon.base.volume import Grid
 from recon.features.jumps import jump_clusters, part_groups, thinned
@@ -23,9 +23,6 @@ from recon.features.jumps import jump_clusters, part_groups, thinned
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from beamline.projections.protocols import ScanPart, ViewMotion
-    from beamline.projections.selection import Selection
-    from beamline.projections.usable_views import UsableViews
     from beamline.storage.readers.base import ScanSource
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
@@ -173,7 +170,6 @@ def find_jumps(
 def _search_memory(source: ScanSource, selection: Selection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
-    from beamline.projections.usable_views import usable_views
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv
 
