@@ -18,6 +18,7 @@ from beamline.core.installed import shipped_scenes
 from beamline.core.quantities import VoxelKind
 from beamline.simulate import volumes_beside
 from beamline.storage import hdf5
+from beamline.storage.writers.recon_file import new_plot
 from recon.base.geometry import Geometry
 from recon.base.registry import unknown
 from recon.base.volume import Grid
@@ -145,16 +146,9 @@ def write_truth(path: Path, truth: Truth) -> None:
         DataError: `path` exists or cannot be written.
     """
     with whole_file(path) as partial, hdf5.created(partial) as file:
-        file.attrs["default"] = "entry"
-        entry = file.create_group("entry")
-        entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
-        data = entry.create_group("data")
-        data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "data", ["z", "y", "x"]
+        data = new_plot(file, "data", truth.grid, "mm")
         chunks = (1, *truth.grid.shape[1:])
         data.create_dataset("data", data=truth.values, chunks=chunks)
         data["data"].attrs["units"] = truth.kind.unit("mm")
         data.create_dataset("labels", data=truth.labels, chunks=chunks, compression="gzip", compression_opts=1)
         data["labels"].attrs["names"] = ["air", *truth.names]
-        for name, centres in zip(("z", "y", "x"), truth.grid.coordinates(), strict=True):
-            data[name] = centres
-            data[name].attrs["units"] = "mm"

@@ -20,7 +20,7 @@ from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, plane
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import DEVIATION
+from beamline.storage.writers.recon_file import DEVIATION, new_plot
 from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.features.particles import (
@@ -245,22 +245,15 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
 
 def _write_labels(found: Segmented, options: SegmentOptions, output: Path) -> None:
     with whole_file(output) as new, hdf5.created(new) as file:
-        file.attrs["default"] = "entry"
-        entry = file.create_group("entry")
-        entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
-        process = entry.create_group("process")
+        data = new_plot(file, "labels", found.volume.grid, found.unit)
+        process = data.parent.create_group("process")
         process.attrs["NX_class"] = "NXprocess"
         process["program"], process["version"], process["command"] = "splatline", version(), options.command
         process["volume"] = str(options.volume.resolve())
         for name, value in settings_of(found, options).items():
             process[name] = value
-        data = entry.create_group("data")
-        data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "labels", ["z", "y", "x"]
         chunks = (1, *found.labels.shape[1:])
         data.create_dataset("labels", data=found.labels, chunks=chunks, compression="gzip", compression_opts=1)
-        for name, centres in zip(("z", "y", "x"), found.volume.grid.coordinates(), strict=True):
-            data[name] = centres
-            data[name].attrs["units"] = found.unit
 
 
 _SLICES, _COLOURS = 3, 12

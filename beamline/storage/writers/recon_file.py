@@ -130,6 +130,19 @@ def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
     return group
 
 
+def new_plot(file: hdf5.NewFile, signal: str, grid: Grid, unit: str) -> h5py.Group:
+    """The group entry/data of a new file as NXdata, its default plot: with axes z, y and x, without the signal."""
+    file.attrs["default"] = "entry"
+    entry = _group(file, "entry", "NXentry")
+    entry.attrs["default"] = "data"
+    data = _group(entry, "data", "NXdata")
+    data.attrs["signal"], data.attrs["axes"] = signal, ["z", "y", "x"]
+    for name, centres in zip(("z", "y", "x"), grid.coordinates(), strict=True):
+        data[name] = centres
+        data[name].attrs["units"] = unit
+    return data
+
+
 def read_reconstruction(path: Path) -> ReconRecord:
     """Read the record written by `write_reconstruction`.
 
