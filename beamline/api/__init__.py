@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, ReferencesError, ScanStopped
 from beamline.core.events import Event
-from beamline.core.stop import ScanAborted, StopRequest
+from beamline.core.stop import ScanAborted, StopRequest, to_stderr
 from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
-    from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
+    from beamline.api.instrument import Instrument, ScanResult, connect, scan
     from beamline.api.reconstruction import ReconResult, monitor, reconstruct, stream, volumes
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 _LAZY = {
-    **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
+    **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reconstruction"),
     **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
     "ScanVerdict": "beamline.projections.replay",

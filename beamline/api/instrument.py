@@ -1,9 +1,7 @@
 """The instrument of a script: devices that stay open over many scans, and the results of scans."""
 
-import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -14,8 +12,7 @@ from beamline.core.errors import ConfigError, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
-from beamline.core.stop import StopRequest, stop_signals
-from beamline.core.text import printable
+from beamline.core.stop import StopRequest, stop_signals, to_stderr
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
 from beamline.scan.run import run_scan
@@ -24,13 +21,6 @@ from drivers.in_beam import Ask
 Say = Callable[[str], None]
 
 _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets anew
-
-
-def to_stderr(text: str) -> None:
-    """Print a sentence to stderr, as the commands do."""
-    with suppress(OSError, ValueError, AttributeError):  # the terminal is closed or missing
-        sys.stderr.write(f"{printable(text)}\n")
-        sys.stderr.flush()
 
 
 ScanResult = RunResult  # what scripts get

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from beamline.api.instrument import Say, to_stderr
+from beamline.api.instrument import Say
 from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
 from beamline.core.files import JOINED, SCAN, parts_of
 from beamline.core.sinks import sentence
-from beamline.core.stop import StopOnSignal
+from beamline.core.stop import StopOnSignal, to_stderr
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest

@@ -18,13 +18,13 @@ from types import FrameType
 from typing import Any
 
 from beamline.core.errors import INTERRUPTED, ScanStopped
+from beamline.core.text import printable
 
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 """Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
 
 
-@contextmanager
-def stop_signals(stop: StopRequest) -> Iterator[None]:
+def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
     """A context in which the first Ctrl-C requests a stop, the second an abort.
 
     SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
@@ -35,20 +35,19 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
     def interrupt(number: int, frame: FrameType | None) -> None:
         if stop.stopping:
             stop.abort("Ctrl-C was pressed again")
-            _print("Aborting.")
+            to_stderr("Aborting.")
         else:
             stop.stop("Ctrl-C was pressed")
-            _print("Stopping cleanly. Press Ctrl-C again to abort.")
+            to_stderr("Stopping cleanly. Press Ctrl-C again to abort.")
 
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
 
     def keep_on(number: int, frame: FrameType | None) -> None:
-        _print("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
+        to_stderr("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
-    with _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_asking_to_end(), terminate)}):
-        yield
+    return _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_asking_to_end(), terminate)})
 
 
 class StopOnSignal:
@@ -73,16 +72,14 @@ class StopOnSignal:
         if self._requested or not self.ready:
             raise KeyboardInterrupt
         self._requested = True
-        _print(self._reply)
+        to_stderr(self._reply)
 
 
-@contextmanager
-def terminated_like_interrupted() -> Iterator[None]:
+def terminated_like_interrupted() -> AbstractContextManager[None]:
     """A context in which SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C, so that no partial file
     remains.
     """
-    with _caught(dict.fromkeys(_asking_to_end(), signal.default_int_handler)):
-        yield
+    return _caught(dict.fromkeys(_asking_to_end(), signal.default_int_handler))
 
 
 @contextmanager
@@ -102,9 +99,10 @@ def _asking_to_end() -> list[signal.Signals]:
     return [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
 
 
-def _print(text: str) -> None:
+def to_stderr(text: str) -> None:
+    """Print a sentence to stderr, as the commands do."""
     with suppress(OSError, ValueError, AttributeError):  # the terminal is closed or missing
-        sys.stderr.write(f"{text}\n")
+        sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
 
 

@@ -6,7 +6,7 @@ import re
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -190,22 +190,18 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
         """Raises OSError if the disk did not take something; call it now and then during long writes."""
 
 
-@contextmanager
-def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
+def created(path: Path, libver: str | tuple[str, str] | None = None) -> AbstractContextManager[NewFile]:
     """Create a file. At the end of the block it is flushed to the disk.
 
     Raises:
         OSError: the disk refused the bytes; the file is closed and stays.
     """
-    with _written(path, "x", libver) as file:
-        yield file
+    return _written(path, "x", libver)
 
 
-@contextmanager
-def changed(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
+def changed(path: Path, libver: str | tuple[str, str] | None = None) -> AbstractContextManager[NewFile]:
     """Open an existing file to change it, as `created` does; a disk error leaves the changes half done."""
-    with _written(path, "r+", libver) as file:
-        yield file
+    return _written(path, "r+", libver)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -57,10 +57,8 @@ class NXtomoproc:
             except (DataError, OSError, TypeError):
                 return False
 
-    @contextmanager
-    def open(self, path: Path) -> Iterator[ReconRecord]:
-        with opened_reconstruction(path) as record:
-            yield record
+    def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
+        return opened_reconstruction(path)
 
 
 @dataclass(frozen=True)

@@ -174,9 +174,7 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 def is_partial(path: Path) -> bool:
     """Whether a file is a partial volume, by its content."""
-    if not path.is_file():
-        return False
-    if not hdf5.is_hdf5(path):
+    if not path.is_file() or not hdf5.is_hdf5(path):
         return False
     try:
         with hdf5.open_hdf5(path) as file:
