@@ -132,6 +132,9 @@ def refuse_equal(places: Mapping[str, float | str]) -> None:
 class BeamMonitorSection(Section):
     """Keys that all beam monitors share. Each kind is listed in BEAM_MONITORS of a folder of `beamline.config`."""
 
+    counterpart: ClassVar[str | None] = None
+    """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
+
     unit: str
     scale: PositiveFloat = Field(default=1.0, description="What the number is multiplied by to be in `unit`.")
     timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
@@ -162,11 +165,6 @@ class BeamMonitorSection(Section):
         return self.resume_above or 1.1 * (self.pause_below or 0.0)
 
     @property
-    def counterpart(self) -> str | None:
-        """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
-        return None
-
-    @property
     def simulated(self) -> bool:
         return False
 
@@ -178,14 +176,8 @@ class BeamMonitorSection(Section):
 
 class NoBeamMonitor(Section):
     kind: Literal["none"] = "none"
-
-    @property
-    def counterpart(self) -> None:
-        """None: this monitor is not simulated."""
-
-    @property
-    def simulated(self) -> bool:
-        return False
+    counterpart: ClassVar[None] = None
+    simulated: ClassVar[bool] = False
 
 
 class StageOutputShutter(Section):

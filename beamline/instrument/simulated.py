@@ -101,9 +101,10 @@ def simulated_devices(
     shutter: Shutter = SimulatedShutter()
     beam_is_on = shutter.is_open
     if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
-        number, output = wanted.output, stage.digital_output(wanted.output)
-        shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
-        beam_is_on = partial(_is_at_level, controller, number, wanted.open_high)
+        shutter = OutputShutter(
+            stage.digital_output(wanted.output), clock, open_high=wanted.open_high, settle=wanted.settle_s
+        )
+        beam_is_on = partial(_is_at_level, controller, wanted)
     sample: SampleMover
     sample = simulated = SimulatedSampleMover()
     place: Callable[[], float | None] = simulated.place
@@ -128,12 +129,12 @@ def simulated_devices(
         monochromator = SimulatedMonochromator(
             scene.beam.energy_kev, lambda kev: scene_of(config, kev), camera.show, clock, section.settle_s
         )
-    known = SimulatedScene(_truth(camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
+    known = SimulatedScene(partial(_truth, camera), _cone(scene), camera.labels_at, partial(_rehearse, camera))
     return Devices(stage, camera, shutter, sample, changer, monochromator), known
 
 
-def _is_at_level(controller: Controller, output: int, high: bool) -> bool:
-    return controller.output_is_high(output) is high
+def _is_at_level(controller: Controller, shutter: StageOutputShutter) -> bool:
+    return controller.output_is_high(shutter.output) is shutter.open_high
 
 
 def _place_of(mover: StageMover, axis: TriggerLine, clock: Clock) -> float | None:
@@ -230,16 +231,12 @@ def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
     return VirtualClock(max(VIRTUAL_START, not_before)) if kind == "virtual" else SystemClock()
 
 
-def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
-
-    def truth(grid: Grid) -> Volume:
-        # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
-        detector = camera.detector
-        up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
-        z, y, x = grid.centre
-        return Volume(camera.scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
-
-    return truth
+def _truth(camera: SimulatedOrcaQuest, grid: Grid) -> Volume:
+    # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
+    detector = camera.detector
+    up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
+    z, y, x = grid.centre
+    return Volume(camera.scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
 
 
 def simulated_beam_monitor(name: str, config: BeamMonitorSection, clock: Clock) -> str:

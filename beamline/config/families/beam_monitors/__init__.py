@@ -1,7 +1,7 @@
 """The section of each kind of beam monitor, and how its driver is connected."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveInt
 
@@ -28,6 +28,8 @@ PvUrl = Annotated[str, without(pv_problem)]
 class ElectrometerConfig(BeamMonitorSection):
     """An electrometer or picoammeter on a serial port that answers a query with a line containing a number."""
 
+    counterpart: ClassVar[str | None] = "electrometer"
+
     kind: Literal["electrometer"]
     port: Annotated[str, Field(min_length=1)] = Field(
         description="A serial port, socket://host:port, or sim://electrometer."
@@ -39,10 +41,6 @@ class ElectrometerConfig(BeamMonitorSection):
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
     baudrate: PositiveInt = 9600
     transcript: str | None = Field(default=None, description="As the stage's.")
-
-    @property
-    def counterpart(self) -> str:
-        return self.kind
 
     @property
     def simulated(self) -> bool:
