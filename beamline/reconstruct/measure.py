@@ -119,11 +119,7 @@ def measure(
     the views used, and in the views held out where there are any. Of a detector with more than 2^17 pixels only bands
     of rows with so many pixels are used. `progress` hears how many of these views were compared.
     """
-    values: dict[str, float] = {}
-    if truth is not None:
-        values["psnr"] = metrics.psnr(truth.data, volume.data)
-        values["ssim3d"] = metrics.ssim3d(truth.data, volume.data)
-        values["nrmse"] = metrics.nrmse(truth.data, volume.data)
+    values = {} if truth is None else _against(truth.data, volume.data)
     if prepared is None:
         return {name: float(value) for name, value in values.items()}
     some, weights = spread(np.arange(prepared.geometry.n_views), _RESIDUAL_VIEWS), prepared.ray_factors()
@@ -138,6 +134,12 @@ def measure(
         )
         values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, progress)
     return {name: float(value) for name, value in values.items()}
+
+
+def _against(truth: NDArray[np.float32], volume: NDArray[np.float32]) -> dict[str, float]:
+    """The figures of a volume by the true one, [z, y, x] each."""
+    of = {"psnr": metrics.psnr, "ssim3d": metrics.ssim3d, "nrmse": metrics.nrmse}
+    return {name: figure(truth, volume) for name, figure in of.items()}
 
 
 def residuals_along_rows(volume: Volume, prepared: PreparedProjections) -> tuple[float, float]:
@@ -191,9 +193,7 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
     try:
         if truth is not None:
             true = read_truth(truth)
-            values["psnr"], values["nrmse"] = metrics.psnr(true, volume), metrics.nrmse(true, volume)
-            values["ssim3d"] = metrics.ssim3d(true, volume)
-            values["ssim_slices"] = metrics.ssim_of_whole_slices(true, volume)
+            values = {**_against(true, volume), "ssim_slices": metrics.ssim_of_whole_slices(true, volume)}
         if masks is not None:
             labels, _ = whole_volume(masks)
             if not np.isin(labels, (0, 1, 2)).all():

@@ -284,6 +284,6 @@ def reconstruct_file(
             filter=options.filter,
         )  # fmt: skip
         with job.stopping():  # the volume is there: the first signal no longer discards it
-            record = write_result(made, prepared, truth, options.target, context, sink, clock, bool(job.slabs))
+            record = write_result(made, prepared, truth, options.target, context, sink, clock)
         del made, prepared  # Windows removes no file that is mapped
     return record

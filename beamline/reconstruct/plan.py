@@ -32,7 +32,6 @@ from beamline.reconstruct.memory import (
     refuse_whole,
 )
 from beamline.reconstruct.options import (
-    OutputPaths,
     ReconOptions,
 )
 from beamline.reconstruct.region import Region, locate
@@ -291,7 +290,11 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 def _refuse_several_volumes(options: ReconOptions) -> None:
     """Raises ConfigError where options of one volume stand beside a method that makes several."""
     if options.method.traits.in_time:
-        _require_hdf5(options.target)
+        target = options.target
+        if target.written and target.output.suffix.lower() not in SUFFIXES:
+            raise ConfigError(
+                f"-o {target.output}: several volumes can only be written to HDF5; give a name that ends in .h5."
+            )
         of_one = ("region", "truth", "uncertainty", "cluster", "partial")
         if wrong := [name for name in of_one if getattr(options, name)]:
             raise ConfigError(
@@ -332,11 +335,3 @@ def _check_device(device: str) -> None:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:
         raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
-
-
-def _require_hdf5(target: OutputPaths) -> None:
-    """Raises ConfigError for a file that holds one volume."""
-    if target.written and target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(
-            f"-o {target.output}: several volumes can only be written to HDF5; give a name that ends in .h5."
-        )

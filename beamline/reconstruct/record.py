@@ -60,7 +60,6 @@ def write_result(
     context: ReportContext,
     sink: Sink,
     clock: Clock,
-    in_parts: bool = False,
 ) -> ReconRecord:
     """Assess the volume, write its file and the report, and send the event `done` with the returned record.
 
@@ -82,18 +81,19 @@ def write_result(
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
-    timed: Callable[[float], None] = _nothing
+    state_time: Callable[[float], None] | None = None  # on the page
     if (page := target.report) is not None:
         phases.enter("report")
         try:
-            timed = _report(page, checked, volumes, record.parameters, context)
+            state_time = _report(page, checked, volumes, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
             record = replace(record, report=None, warnings=(*record.warnings, said))
     phases.end()
     elapsed = clock.now() - context.started
-    timed(elapsed)
+    if state_time is not None:
+        state_time(elapsed)
     record = replace(record, elapsed=elapsed, times=phases.seconds)  # reads the voxels, so that it comes first
     record = _with_voxels_in_files(record, target)
     sink(VolumeDone(record, time=clock.now()))
@@ -118,10 +118,6 @@ def _report(
     report = replace(report, volume=target.output.name if target.written else "")
     write_report(page, report, replace=target.replace)
     return partial(write_timed, page, report, label_of(made.method))
-
-
-def _nothing(elapsed: float) -> None:
-    """There is no page that states the time."""
 
 
 def _record(

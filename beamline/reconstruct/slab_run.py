@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, replace
 from math import nan
 from pathlib import Path
 from typing import Any, TypeVar
@@ -67,7 +67,7 @@ def in_slabs(
     Raises:
         DataError: the views are zero everywhere, or the partial volume is of other data or options.
     """
-    job = _SlabJob(run, prepared, options, slabs, control, say)
+    job = _SlabJob(run, prepared, options, slabs, control, say, begin=control.now())
     partial = job.resumed()
     missing = [n for n in busiest_first(prepared, job.grid, slabs) if partial is None or not partial.has(n)]
     if partial is None:
@@ -79,12 +79,10 @@ def in_slabs(
             decide = Decisions(options.seed, decided)
             _add(partial, n, *job.made(n, run, decide, partial.n_slices_done, first=False), warn)
     else:
-        worker = workers.run
-
-        def by_worker(n: int) -> tuple[Reconstruction | None, str]:
-            return job.made(n, worker, Decisions(options.seed, decided), 0, first=False)
-
-        for n, (result, remark) in _as_they_come(by_worker, missing, workers.count):
+        made = _as_they_come(
+            lambda n: job.made(n, workers.run, Decisions(options.seed, decided), 0, first=False), missing, workers.count
+        )
+        for n, (result, remark) in made:
             _add(partial, n, result, remark, warn)
             job.tell(partial.n_slices_done)
     if control.decide is not None:
@@ -102,10 +100,7 @@ class _SlabJob:
     slabs: Sequence[Slab]
     control: RunControl
     say: Callable[[str], None]
-    begin: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "begin", self.control.now())
+    begin: float
 
     @property
     def grid(self) -> Grid:
