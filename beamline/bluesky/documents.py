@@ -12,22 +12,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+from typing import Any, NamedTuple, TextIO
 from urllib.parse import urlsplit
 
 import click
 
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone
+from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone, Sink
 from beamline.scan.preflight import dry_run
 from beamline.storage.writers import layout
 
 Emit = Callable[[str, Mapping[str, Any]], object]
 """Takes a document: its name and its values."""
-
-if TYPE_CHECKING:
-    from beamline.core.events import Sink
 
 STREAM = "primary"
 REACH = 1.0
@@ -201,14 +198,10 @@ def file_url(path: Path) -> str:
     return path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
 
 
-def json_lines(stream: TextIO) -> Emit:
-    """Writes each document as one line, as bluesky's own JSONLinesWriter does, and flushes it."""
-
-    def emit(name: str, document: Mapping[str, Any]) -> None:
-        stream.write(json.dumps({"name": name, "doc": document}) + "\n")
-        stream.flush()
-
-    return emit
+def _write_line(stream: TextIO, name: str, document: Mapping[str, Any]) -> None:
+    """Writes a document as one line, as bluesky's own JSONLinesWriter does, and flushes it."""
+    stream.write(json.dumps({"name": name, "doc": document}) + "\n")
+    stream.flush()
 
 
 @contextmanager
@@ -265,4 +258,4 @@ def sink(config: Config, place: str, held: ExitStack) -> Sink:
         stream = held.enter_context(path.open("a", encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path} cannot be written to ({error.strerror}). Nothing was started.") from error
-    return Documents(config, json_lines(stream))
+    return Documents(config, partial(_write_line, stream))

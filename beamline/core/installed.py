@@ -41,10 +41,10 @@ def package_problem(home: str) -> str:
         if origin is None:
             return f"splatline is incomplete: Python finds no package {name!r}. {_AGAIN}."
         if origin != ours and os.path.realpath(origin) != os.path.realpath(ours):
-            return f"Python finds {name!r} at {origin}, not splatline's at {ours}: {_way_out(name, origin)}."
+            return f"Python finds {name!r} at {origin}, not splatline's at {ours}: {_way_out(origin)}."
         with open(origin, "rb") as file:  # noqa: PTH123
             if _MARK not in file.readline():
-                return f"{origin} is not splatline's: {_way_out(name, origin)}."
+                return f"{origin} is not splatline's: {_way_out(origin)}."
     return ""
 
 
@@ -59,7 +59,7 @@ def _origin(name: str) -> str | None:
 _AGAIN = "Install it again: `pip install --force-reinstall --no-deps splatline`"
 
 
-def _way_out(name: str, origin: str) -> str:
+def _way_out(origin: str) -> str:
     """What to do about a module that is not ours."""
     if not any(f"{os.sep}{folder}{os.sep}" in origin for folder in ("site-packages", "dist-packages")):
         return "rename that one, or work in another folder"

@@ -184,9 +184,9 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         with whole_file(place) as work:
             work.mkdir()
             log = work / "stderr.txt"
-            ending, code, stderr = run_to_end(
-                [*COMMAND, *_arguments(options, row.scan, work)], log, pass_on, silence=_SILENCE
-            )
+            recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
+            call = [*COMMAND, "recon", row.scan, *recipe, "--output", str(work / RECON), "--beside-scan", "--json"]
+            ending, code, stderr = run_to_end(call, log, pass_on, silence=_SILENCE)
             log.unlink()
             reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
             if ending is ProcessEnd.SILENT:
@@ -201,19 +201,6 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         residual=last.get("residual_held_out", last.get("residual")),
         message="" if state == "done" else one_line(reason, SENTENCE),
     )  # fmt: skip
-
-
-def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
-    recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-    return [
-        "recon",
-        scan,
-        *recipe,
-        "--output",
-        str(work / RECON),
-        "--beside-scan",
-        "--json",
-    ]
 
 
 def _read(folder: Path) -> list[BatchRow]:

@@ -56,12 +56,8 @@ def _values(record: ReconRecord) -> Any:
 
 def _place(record: ReconRecord) -> dict[str, Any]:
     first = [float(centres[0]) for centres in record.volume.grid.coordinates()]
-    return {"scale": tuple(map(float, record.volume.grid.spacing)), "translate": tuple(first), "units": _units(record)}
-
-
-def _units(record: ReconRecord) -> tuple[str, str, str]:
     unit = "pixel" if record.length_unit == "px" else record.length_unit
-    return unit, unit, unit
+    return {"scale": tuple(map(float, record.volume.grid.spacing)), "translate": tuple(first), "units": (unit,) * 3}
 
 
 def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:

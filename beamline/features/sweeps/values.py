@@ -10,8 +10,8 @@ from beamline.core.text import NUMBER
 from recon.base.registry import did_you_mean
 
 MOST = 64
-_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
 """Slices of a sheet."""
+_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
 _SIGNED = rf"[-+]?{NUMBER}"
 _RANGE = re.compile(rf"({_SIGNED}):({_SIGNED}):({_SIGNED})")
 
@@ -84,9 +84,9 @@ def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
     names = [option.name for option in options]
     if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
         raise ValueError(f"{len(names)} options are given ({', '.join(names) or 'none'}); expected one, or two others")
-    combined = [
+    combined: list[Mapping[str, str]] = [
         dict(zip(names, values, strict=True)) for values in itertools.product(*(option.values for option in options))
     ]
     if len(combined) > MOST:
         raise ValueError(f"{len(combined)} combinations are more than {MOST}: give fewer values")
-    return list(combined)
+    return combined

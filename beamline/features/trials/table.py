@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,9 +17,6 @@ from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.methods import by_name
-
-if TYPE_CHECKING:
-    pass
 
 FIGURES = {
     "psnr": ("PSNR", "dB against the truth"),
@@ -38,6 +34,11 @@ _QUALITY = {
     "psnr_all": "PSNR all views (dB)",
     HELD_OUT: "−20 log₁₀ of the held-out residual (dB)",
 }
+_COSTS: dict[str, Callable[[Outcome], float]] = {
+    "time (s)": lambda outcome: outcome.seconds,
+    "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
+    "dose (frames)": lambda outcome: outcome.trial.frames,  # those that several views share are counted once
+}  # that a picture shows, by the label of their axis
 _NEAR = 1.0  # dB below the best figure: a tenth more error
 _SHOWN_DB = 12.0  # below the best; worse trials are not drawn
 _WIDTH = 120  # characters
@@ -208,11 +209,10 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
 
 def quality_plot(table: TrialTable) -> bytes:
     """Quality against time, memory and dose as PNG: a colour a method, and a line along the front of time."""
-    costs = _costs(table)
     shown = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
     figure = new_figure((WIDTH, 4.2))
-    panels = figure.subplots(1, len(costs), sharey=True)
-    for axes, (label, cost) in zip(panels, costs.items(), strict=True):
+    panels = figure.subplots(1, len(_COSTS), sharey=True)
+    for axes, (label, cost) in zip(panels, _COSTS.items(), strict=True):
         for n, method in enumerate(dict.fromkeys(outcome.trial.method for outcome in shown)):
             points = [(cost(o), o.quality(table.by)) for o in shown if o.trial.method == method]
             axes.plot(*zip(*points, strict=True), "os^vD"[n // 10 % 5], ms=4, color=f"C{n % 10}", label=method)
@@ -229,12 +229,3 @@ def quality_plot(table: TrialTable) -> bytes:
     panels[0].set_ylabel(_QUALITY[table.by])
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     return png(figure)
-
-
-def _costs(table: TrialTable) -> dict[str, Callable[[Outcome], float]]:
-    """The costs that a picture shows, by the label of their axis. Frames that several views share are counted once."""
-    return {
-        "time (s)": lambda outcome: outcome.seconds,
-        "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
-        "dose (frames)": lambda outcome: outcome.trial.frames,
-    }

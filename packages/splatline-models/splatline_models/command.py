@@ -136,8 +136,9 @@ def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> N
         except ValueError as error:
             raise DataError(f"{volume}: {error}. Nothing was written.") from error
         with whole_file(output) as partial:
-            cells = [("triangle", mesh.faces)]
-            meshio.Mesh(mesh.vertices, cells).write(partial, output.suffix[1:].lower(), **_binary(output))
+            suffix = output.suffix.lower()
+            how = {} if suffix == ".obj" else {"binary": True}  # OBJ is text
+            meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)]).write(partial, suffix[1:], **how)
         facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "euler": mesh.euler}
         answer.done(
             {"output": output, "level": level, **facts, "volume": mesh.volume, "unit": record.length_unit},
@@ -145,8 +146,3 @@ def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> N
             f"level   {level:.4g} {record.unit}",
             f"volume  {mesh.volume:.6g} {record.length_unit}³",
         )
-
-
-def _binary(output: Path) -> dict[str, bool]:
-    """OBJ is text."""
-    return {} if output.suffix.lower() == ".obj" else {"binary": True}
