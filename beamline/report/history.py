@@ -98,7 +98,9 @@ def quality_against_time(
     left, *others = np.ravel(figure.subplots(1, 1 + (curve is not None) + bool(growing)))
     _misfit(left, history)
     if curve is not None:
-        _decibels(others.pop(0), curve)
+        axes = others.pop(0)
+        axes.plot(*curve.decibels, color="tab:green", lw=1.2, marker=".", ms=3)
+        finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)
     if growing:
         axes = others.pop(0)
         for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):
@@ -131,9 +133,3 @@ def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
     else:
         axes.set_ylim(bottom=0)
     finish(axes, "time (s)", "", "Misfit", grid=True)
-
-
-def _decibels(axes: Axes, curve: ResidualCurve) -> None:
-    """The residual as dB below the data."""
-    axes.plot(*curve.decibels, color="tab:green", lw=1.2, marker=".", ms=3)
-    finish(axes, "time (s)", "dB below the data", f"Residual, {curve.views}", grid=True)
