@@ -348,13 +348,13 @@ def _results(result: RunResult) -> str:
     from beamline.core.files import RECON
     from beamline.storage.flag_legend import counted
 
-    lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]
-    if result.flags:
-        lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
-    if result.retaken:
-        lines.append(f"{'retaken':<10}{result.retaken} flagged views; `beamline recon` uses the new ones")
-    if result.recon is not None:
-        lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
-        if report := result.recon.get("report"):
-            lines.append(f"{'report':<10}{report}")
-    return "\n".join(lines)
+    folder, recon = result.path.parent, result.recon
+    rows = {
+        "scan": result.path,
+        "frames": str(result.n_frames),
+        "flagged": result.flags and f"{counted(result.flags)}; see {folder}",
+        "retaken": result.retaken and f"{result.retaken} flagged views; `beamline recon` uses the new ones",
+        "volume": None if recon is None else recon.get("output", folder / RECON),
+        "report": None if recon is None else recon.get("report"),
+    }
+    return "\n".join(f"{name:<10}{text}" for name, text in rows.items() if text)

@@ -227,12 +227,9 @@ def fit(at: FitReached) -> str:
     parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
     parts += [f"{at.n_views} views"]
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
-    if at.residual is not None and math.isfinite(at.residual):
-        parts.append(f"residual {at.residual:.4f}")
-    if at.held_out is not None and math.isfinite(at.held_out):
-        parts.append(f"held out {at.held_out:.4f}")
-    if at.eta_s is not None:
-        parts.append(f"{timedelta(seconds=round(at.eta_s))} left")
+    errors = {"residual": at.residual, "held out": at.held_out}
+    parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
+    parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} left"]
     return ", ".join(parts)
 
 
@@ -254,20 +251,18 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 
 def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
-    lines = [f"{'output':<10}{record.output}"]
-    if record.report:
-        drawn = record.times.get("report")
-        lines.append(f"{'report':<10}{record.report}" + (f" ({drawn:.1f} s)" if drawn else ""))
     shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
-    if len(seconds):
-        lines.append(
-            f"{'volumes':<10}{len(seconds)} of {shape} in {record.unit}, {seconds[0]:.4g} to {seconds[-1]:.4g} s"
-        )
-    else:
-        several = "" if record.series is None else f"{record.series.n} of "
-        lines.append(f"{'volumes' if several else 'volume':<10}{several}{shape} in {record.unit or 'volume fractions'}")
-    lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
-    lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
+    several = "" if record.series is None else f"{record.series.n} of "
+    span = f", {seconds[0]:.4g} to {seconds[-1]:.4g} s" if len(seconds) else ""
+    drawn = f" ({record.times['report']:.1f} s)" if record.times.get("report") else ""
+    rows = {
+        "output": record.output,
+        "report": record.report and f"{record.report}{drawn}",
+        "volumes" if several else "volume": f"{several}{shape} in {record.unit or 'volume fractions'}{span}",
+        "axis_col": f"{record.axis_col:.2f}",
+        "chosen": record.chosen,
+    }
+    lines = [f"{name:<10}{text}" for name, text in rows.items() if text]
     return "\n".join([*lines, "", *_metrics_of(record)])
 
 

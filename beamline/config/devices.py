@@ -232,16 +232,16 @@ class DeviceSection(Section):
     def simulated_or_not(self) -> dict[str, bool]:
         """Each device that can be simulated, and whether it is."""
         stage, shutter = self.stage.simulated, self.shutter.kind
-        simulated = {
+        always = {
             "stage": stage,
             "camera": self.camera.kind == "simulated_orca",
             "shutter": shutter == "simulated" or (shutter == "stage_output" and stage),
             "sample_mover": _simulated(self.sample_mover),
         }
-        if not isinstance(self.filter, NoFilter):
-            simulated["filter"] = _simulated(self.filter)
-        if not isinstance(self.monochromator, NoMonochromator):
-            simulated["monochromator"] = self.monochromator.kind == "simulated"
-        if self.beam_monitor.counterpart is not None:
-            simulated["beam_monitor"] = self.beam_monitor.simulated
-        return simulated
+        mono, monitor = self.monochromator, self.beam_monitor
+        perhaps = {
+            "filter": None if isinstance(self.filter, NoFilter) else _simulated(self.filter),
+            "monochromator": None if isinstance(mono, NoMonochromator) else mono.kind == "simulated",
+            "beam_monitor": None if monitor.counterpart is None else monitor.simulated,
+        }
+        return always | {name: is_so for name, is_so in perhaps.items() if is_so is not None}

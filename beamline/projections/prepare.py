@@ -366,16 +366,25 @@ def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> floa
 def report_defects(projections: Projections, warn: Warn) -> None:
     """Report repaired pixels if there are more than one in a thousand."""
     unseen = areas(projections.masked)
-    masked = float((projections.masked & ~unseen).mean())
-    if unseen.mean() > 1e-3:
-        warn(Note(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured."))
-    if masked > 1e-3:
-        warn(Note(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours."))
-    if projections.replaced > 1e-3:
-        replaced = f"{projections.replaced:.1%} of the pixels were zingers or not finite"
-        warn(Note(f"{replaced}: filled from their neighbours."))
-    if projections.floored > 1e-3:
-        warn(
-            f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
-            "least what the volume says, unless the darks are too high."
-        )
+    shares = (
+        (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
+        (
+            (projections.masked & ~unseen).mean(),
+            Note,
+            "of the detector's pixels are dead or hot and were filled from their neighbours.",
+        ),
+        (
+            projections.replaced,
+            Note,
+            "of the pixels were zingers or not finite: filled from their neighbours.",
+        ),
+        (
+            projections.floored,
+            str,
+            "of the pixels let less light through than the floor; their attenuation is at least what the volume says, "
+            "unless the darks are too high.",
+        ),
+    )
+    for share, kind, text in shares:
+        if share > 1e-3:
+            warn(kind(f"{share:.1%} {text}"))

@@ -101,50 +101,53 @@ def _footnotes(
     unexplained: Unexplained | None,
 ) -> list[str]:
     """What the figures of merit mean, as far as there are any."""
-    footnotes = [
-        "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
-        if made.series is None
-        else "Data residual: what the volumes, in each view as it shows them, leave of all views. It falls with noise.",
-        "Time of the whole command: from its start until volume and page are written, with reading and measuring.",
-    ]
-    if any("cnr" in values for values in metrics.values()):
-        footnotes.append(
+    of_several = "what the volumes, in each view as it shows them, leave of all views. It falls with noise."
+    of_one = "|A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
+    slices = 0 if unexplained is None else len(unexplained.significance)
+    footnotes = (
+        (True, f"Data residual: {of_one if made.series is None else of_several}"),
+        (
+            True,
+            "Time of the whole command: from its start until volume and page are written, with reading and measuring.",
+        ),
+        (
+            any("cnr" in values for values in metrics.values()),
             "SNR, CNR: between the dense and the empty part (k-means of two classes) of "
             f"{'the truth' if truth else 'FBP of these views'}, without voxels near the other part; the same of all "
             "volumes. A smoother volume has more of both, though it may show less: look for cracks and pores in the "
-            "pictures."
-        )
-    if any("air" in values for values in metrics.values()):
-        footnotes.append(
+            "pictures.",
+        ),
+        (
+            any("air" in values for values in metrics.values()),
             "Level of air: the mean of the voxels that views show to be empty, within the field of all views, over the "
-            "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter."
-        )
-    if views_grew(made):
-        footnotes.append(
+            "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter.",
+        ),
+        (
+            views_grew(made),
             "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
-            "the scan."
-        )
-    if made.ending.resumed_from:
-        footnotes.append(
-            f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before."
-        )
-    if unexplained is not None:
-        footnotes.append(
-            "Matter that leaves structure: voxels at which the back-projected residual of "
-            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above "
-            f"{UNEXPLAINED_LIMIT:g} a fit hides something. It compares fits of the same views: views that are "
-            "displaced have more noise, so less exceeds it."
-        )
-    if "stray" in metrics[made.method]:
-        footnotes.append(
+            "the scan.",
+        ),
+        (
+            bool(made.ending.resumed_from),
+            f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before.",
+        ),
+        (
+            unexplained is not None,
+            f"Matter that leaves structure: voxels at which the back-projected residual of {slices} slices exceeds "
+            f"four standard deviations of its noise; above {UNEXPLAINED_LIMIT:g} a fit hides something. It compares "
+            "fits of the same views: views that are displaced have more noise, so less exceeds it.",
+        ),
+        (
+            "stray" in metrics[made.method],
             "Mass where views show nothing: share of the volume's mass in voxels whose rays meet no matter in two "
-            "views at least. Sparse views leave blobs and streaks there."
-        )
-    if truth is not None:
-        footnotes.append(
-            "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
-        )
-    return footnotes
+            "views at least. Sparse views leave blobs and streaks there.",
+        ),
+        (
+            truth is not None,
+            "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions.",
+        ),
+    )
+    return [text for concerns, text in footnotes if concerns]
 
 
 def _further(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Iterator[Picture]:

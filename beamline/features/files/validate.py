@@ -47,20 +47,21 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
             bad, first = bad + int((~finite).sum()), z if first is None else first
         if finite.any():
             low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
-    if bad:
-        yield Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")
-    if low == high:
-        yield Finding("error", "voxels", f"Every voxel is {low:g}.")
-    if there := record.parameters.get("partial"):
-        yield Finding(
-            "error", "partial", f"Partial: {there} are there, the others are empty. recon --resume makes them."
-        )
-    if record.ending.early:
-        yield Finding("warning", "ended-early", "The reconstruction was stopped early; this is what it had reached.")
-    if record.length_unit != "mm":
-        yield Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")
-    if record.parameters and not Path(record.raw_file).exists():
-        yield Finding("info", "raw-file", f"The scan that it was made from, {record.raw_file}, is not there.")
+    raw, there = record.raw_file, record.parameters.get("partial")
+    partial = f"Partial: {there} are there, the others are empty. recon --resume makes them."
+    early = "The reconstruction was stopped early; this is what it had reached."
+    rules = (
+        (bad > 0, Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")),
+        (low == high, Finding("error", "voxels", f"Every voxel is {low:g}.")),
+        (bool(there), Finding("error", "partial", partial)),
+        (record.ending.early, Finding("warning", "ended-early", early)),
+        (record.length_unit != "mm", Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")),
+        (
+            bool(record.parameters) and not Path(raw).exists(),
+            Finding("info", "raw-file", f"The scan that it was made from, {raw}, is not there."),
+        ),
+    )
+    yield from (finding for broken, finding in rules if broken)
 
 
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:

@@ -116,21 +116,20 @@ def summary(result: Segmented, options: SegmentOptions) -> str:
             f"rows {rows.start}-{rows.stop - 1}, columns {cols.start}-{cols.stop - 1} of each slice: the square inside "
             f"the circle of the sample, less {result.margin:.3g} of its side at each end (--crop none, --margin)"
         )
-    lines = [
-        f"{'of use':<12}{result.verdict}",
-        f"{'labels':<12}{options.output}",
-        f"{'table':<12}{options.table}",
-        f"{'picture':<12}{options.picture}",
-        f"{'box':<12}{' x '.join(map(str, result.labels.shape))} voxels of {result.volume.grid.voxel_size:g} {unit}",
-        f"{'crop':<12}{crop}",
-        f"{'clusters':<12}{result.clusters.centres.size}, threshold {result.clusters.threshold:.3f} of the range",
-        f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
-    ]
-    if result.outside:
-        bodies, verb = ("1 body", "is") if result.outside == 1 else (f"{result.outside} bodies", "are")
-        bodies = f"{bodies} as bright outside the square {verb}"
-        lines.append(f"{'left out':<12}{bodies} no particle here; --crop none takes the whole volume, with its wall")
-    if "d50" in figures:
-        sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
-        lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")
-    return "\n".join(lines)
+    bodies, verb = ("1 body", "is") if result.outside == 1 else (f"{result.outside} bodies", "are")
+    sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90") if name in figures)
+    facts = {
+        "of use": result.verdict,
+        "labels": options.output,
+        "table": options.table,
+        "picture": options.picture,
+        "box": f"{' x '.join(map(str, result.labels.shape))} voxels of {result.volume.grid.voxel_size:g} {unit}",
+        "crop": crop,
+        "clusters": f"{result.clusters.centres.size}, threshold {result.clusters.threshold:.3f} of the range",
+        "particles": f"{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
+        "left out": result.outside
+        and f"{bodies} as bright outside the square {verb} no particle here; --crop none takes the whole volume, with "
+        "its wall",
+        "diameter": sizes and f"{sizes} {unit} (equivalent, of whole particles)",
+    }
+    return "\n".join(f"{name:<12}{text}" for name, text in facts.items() if text)

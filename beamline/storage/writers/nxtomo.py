@@ -312,16 +312,16 @@ class NXtomoWriter:
             raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
-        counts, wrong = frame.counts, ""
-        if not self._open or self._broken:
-            wrong = "the file is closed" if not self._open else "an earlier write failed"
-        elif counts.dtype != np.uint16 or counts.shape != self._shape:
-            wrong = f"it is {counts.dtype} {counts.shape}, expected uint16 {self._shape}"
-        elif digest.preview.shape != self._preview_shape:
-            wrong = f"its preview is {digest.preview.shape}, expected {self._preview_shape}"
-        elif frame.index != self._rows:
-            wrong = f"its index is {frame.index}, expected {self._rows}, the next row"
-        if wrong:
+        counts, preview = frame.counts, digest.preview
+        unlike = counts.dtype != np.uint16 or counts.shape != self._shape
+        faults = {
+            "the file is closed": not self._open,
+            "an earlier write failed": self._broken,
+            f"it is {counts.dtype} {counts.shape}, expected uint16 {self._shape}": unlike,
+            f"its preview is {preview.shape}, expected {self._preview_shape}": preview.shape != self._preview_shape,
+            f"its index is {frame.index}, expected {self._rows}, the next row": frame.index != self._rows,
+        }
+        if wrong := next((fault for fault, there in faults.items() if there), ""):
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
