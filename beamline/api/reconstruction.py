@@ -105,9 +105,9 @@ def target_of(output: str | Path | None) -> Iterator[OutputPaths]:
     """Paths of the result and its report; without an output nothing is written."""
     if output is not None:
         yield OutputPaths(Path(output), report_beside(Path(output)))
-        return
-    with tempfile.TemporaryDirectory(prefix="beamline-") as work:
-        yield OutputPaths(Path(work) / "volume.h5", None, written=False)
+    else:
+        with tempfile.TemporaryDirectory(prefix="beamline-") as work:
+            yield OutputPaths(Path(work) / "volume.h5", None, written=False)
 
 
 def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, int]:

@@ -119,9 +119,9 @@ def scan(request: ScanRequest) -> None:
     _refuse_contradictions(request)
     if _are_several_scans(request.files):
         _queue().take_all(request)
-        return
-    with json_events(request.as_json) as json_sink, ExitStack() as held:
-        _scan_or_series(request, json_sink, held)
+    else:
+        with json_events(request.as_json) as json_sink, ExitStack() as held:
+            _scan_or_series(request, json_sink, held)
 
 
 def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:

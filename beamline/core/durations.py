@@ -44,9 +44,7 @@ class Phases:
     def progress(self, n: int, total: int) -> None:
         """Report that n of `total` are done; n = 0 is not reported."""
         now = self._clock.now()
-        if not n:
-            return
-        if now - self._said >= _SAY_EVERY or n == total:
+        if n and (now - self._said >= _SAY_EVERY or n == total):
             self._said = now
             spent = max(now - self._begun, 1e-9)
             self._say(n, total, n / spent, seconds_left(n, total, spent))

@@ -224,17 +224,16 @@ def connect(
 
 
 @contextmanager
-def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
+def stage_alone(config: Config) -> Iterator[RotationStage]:
     """Connect the configured stage without the rest of the instrument. Nothing moves. Raises DeviceError if it does not
     answer.
     """
     if config.simulation is not None:
-        with connect(config, clock) as instrument:
+        with connect(config) as instrument:
             yield instrument.devices.stage
-        return
-    chosen = config.devices.stage
-    with closing(chosen.connect(clock or SystemClock())) as stage:
-        yield stage
+    else:
+        with closing(config.devices.stage.connect(SystemClock())) as stage:
+            yield stage
 
 
 def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:

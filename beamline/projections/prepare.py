@@ -236,12 +236,11 @@ def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: floa
     """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
     table = stated_poses(source, selection)
     poses_axis = None if table is None else table.axis_col
-    if poses_axis is None or selection.axis_col is not None or abs(poses_axis - axis_col) <= _SAME_AXIS:
-        return
-    warn(
-        f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
-        f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
-    )
+    if poses_axis is not None and selection.axis_col is None and abs(poses_axis - axis_col) > _SAME_AXIS:
+        warn(
+            f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
+            f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
+        )
 
 
 def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:

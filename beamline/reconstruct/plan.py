@@ -232,10 +232,9 @@ def prepare_within(
         shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
         buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
 
-    def check(geometry: Geometry) -> None:
-        refuse_geometry(source, options, plan, geometry)
-
-    prepared = prepare_projections(source, selection, warn, buffer, check, phases)
+    prepared = prepare_projections(
+        source, selection, warn, buffer, lambda geometry: refuse_geometry(source, options, plan, geometry), phases
+    )
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
     if knows_outside(options.method.traits):
@@ -321,12 +320,11 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
 
 def _require_finished(source: ScanSource, options: ReconOptions) -> None:
     """Raises DataError for an unfinished scan, unless it is to be taken as it is."""
-    if source.finished or options.unfinished:
-        return
-    raise DataError(
-        f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
-        "frames recorded so far. Nothing was written."
-    )
+    if not (source.finished or options.unfinished):
+        raise DataError(
+            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
+            "frames recorded so far. Nothing was written."
+        )
 
 
 def _check_device(device: str) -> None:

@@ -133,11 +133,11 @@ def _begin(folder: Path, recipe: bytes) -> None:
     """Make the folder, or check that it belongs to this recipe."""
     if folder.exists():
         _refuse_other(folder, recipe)
-        return
-    with whole_file(folder) as partial:
-        partial.mkdir()
-        (partial / RECIPE).write_bytes(recipe)
-        _write(partial, [])
+    else:
+        with whole_file(folder) as partial:
+            partial.mkdir()
+            (partial / RECIPE).write_bytes(recipe)
+            _write(partial, [])
 
 
 def _refuse_other(folder: Path, recipe: bytes) -> None:

@@ -73,13 +73,12 @@ def info(
         raise click.UsageError("--statistics needs a scan, --truth and --masks need a volume: give one of them.")
     if statistics:
         _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
-        return
-    if truth or masks:
+    elif truth or masks:
         _print_measured(file, truth, masks, as_json)
-        return
-    with answering(as_json) as answer:
-        facts = dict(describe(SourceOptions(file, **scan_facts)))
-        answer.done(facts, *_described(facts))
+    else:
+        with answering(as_json) as answer:
+            facts = dict(describe(SourceOptions(file, **scan_facts)))
+            answer.done(facts, *_described(facts))
 
 
 def _described(facts: Mapping[str, Any]) -> list[str]:

@@ -178,8 +178,7 @@ def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
         for i, frame in enumerate(source.frames()):
             known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
             yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i), aside=frame.aside)
-        return
-    keys, angles, exposures = source.image_key, source.angles, source.exposures
-    for i in range(keys.size):
-        record = Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
-        yield source.read([i])[0], record
+    else:
+        keys, angles, exposures = source.image_key, source.angles, source.exposures
+        for i in range(keys.size):
+            yield source.read([i])[0], Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))

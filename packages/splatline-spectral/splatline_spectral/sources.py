@@ -221,15 +221,14 @@ def results_of(sources: Sequence[str], jobs: Jobs, progress: Callable[[int, int]
 
 @contextmanager
 def _opened(source: str, jobs: Jobs, is_scene: bool, variant: float | PixelBox | None) -> Iterator[Series | XafsCurve]:
-    if not is_scene:
+    if is_scene:
+        charge = variant if isinstance(variant, float) else None
+        yield series_of_scene(source, _grid(jobs), jobs.material, jobs.seed, charge)
+    else:
         region = variant if isinstance(variant, tuple) else None
         span = jobs.low or 0.0, jobs.high or math.inf
         with open_measured(Path(source), span, region, jobs.around, jobs.unit) as opened:
             yield opened
-        return
-
-    charge = variant if isinstance(variant, float) else None
-    yield series_of_scene(source, _grid(jobs), jobs.material, jobs.seed, charge)
 
 
 def _grid(jobs: Jobs) -> Reals:
