@@ -24,26 +24,27 @@ from beamline.core.errors import (
 )
 from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
 from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
-from beamline.core.machine import free_memory
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
-from beamline.core.text import count, size
+from beamline.core.text import count
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
 from beamline.plan.choose import Wish
 from beamline.plan.plan import Block, Retake, spread_retakes
 from beamline.plan.timeline import block_seconds
 from beamline.scan.acquisition import Acquisition
+from beamline.scan.backlog import prepare_memory
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.decider import Decider
+from beamline.scan.flagged import AlarmReaction, FlaggedFrames
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
 from beamline.scan.preflight import ReadyScan, all_of, preflight
-from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
+from beamline.scan.recorder import Recorder
 from beamline.scan.references import REFERENCES, ReferenceReport
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
-from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
+from beamline.scan.supervision import PAUSE_POLL, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
 from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.run_record import RecordFile, RunRecord
@@ -252,7 +253,8 @@ class _Run:
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
         self._set_volume_aside()
-        self._prepare_memory()
+        if sentence := prepare_memory(self.instrument.frame_memory, timeline, self.ready.timing.shape):
+            self.sink(StateEntered(self.states.state, sentence))
         writer = self._writer(path)
         with ExitStack() as ending:
             follower = None
@@ -286,21 +288,6 @@ class _Run:
                         f"{path} could not be renamed ({error.strerror}): there is no volume of all parts of the run."
                     )
                 )
-
-    def _prepare_memory(self) -> None:
-        """Memory for the frames that may wait for the disk, before the first comes. At most a quarter of the free
-        memory, as a live volume takes half."""
-        memory, timeline = self.instrument.frame_memory, self.ready.timeline
-        n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
-        if memory is None or n == 0:
-            return
-        frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
-        try:
-            memory.prepare(n, self.ready.timing.shape)
-            sentence = f"{frames}, is ready"
-        except MemoryError:
-            sentence = f"{frames}, cannot be had before they come"
-        self.sink(StateEntered(self.states.state, sentence[0].upper() + sentence[1:]))
 
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
@@ -343,10 +330,10 @@ class _Run:
             path=path,
             n_frames=n_frames,
             missing=tuple(missing),
-            flags=recorder.flags,
-            alarmed_frames=recorder.alarmed_frames,
-            alarmed_views=recorder.alarmed_views,
-            retaken=recorder.retaken + acquisition.recovered,
+            flags=recorder.flagged.counts,
+            alarmed_frames=len(recorder.flagged.alarmed),
+            alarmed_views=len(recorder.flagged.alarmed_views),
+            retaken=recorder.flagged.retaken + acquisition.recovered,
             reference_faults=tuple(faults.values()),
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
@@ -400,7 +387,8 @@ class _Run:
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             sink=self.sink,
-            consequences=Consequences(
+            flagged=FlaggedFrames(
+                self.sink,
                 AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
                 monitor.retaken_warnings,
             ),
@@ -473,7 +461,9 @@ class _Run:
             return (), 0
         recorder.wait()
         lost, n = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
-        once = [view for view in recorder.views_to_retake if view.trigger < n]  # others were taken again already
+        once = [
+            view for view in recorder.flagged.views_to_retake if view.trigger < n
+        ]  # others were taken again already
         bad = sorted([*once, *lost], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
 
