@@ -17,7 +17,7 @@ from beamline.core.files import CONFIG, SCAN, create_run_folder, write_whole
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import connect
+from beamline.instrument.connect import clock_after, connect
 from beamline.scan.control import State
 from beamline.scan.live_process import Commands
 from beamline.scan.preflight import dry_run, refuse_violations
@@ -115,11 +115,7 @@ def run_energies(
             return SeriesRun(series, tuple(complete), ())
         refuse_violations(dry_run(config, series or place, whole=[energy for energy, _ in complete]).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
-        clock = None
-        if config.simulation is not None:
-            from beamline.instrument.simulated import clock_of
-
-            clock = clock_of(config.simulation.clock, not_before=last)
+        clock = clock_after(config, last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
         folder = series or _new_folder(config, place or Path(config.storage.folder))
         scans, results = list[tuple[float, Path]](), list[RunResult]()

@@ -15,6 +15,12 @@ from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices, Rechecked, RotationStage
 
+SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
+UNSAFE = (
+    "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
+    "the last frames are being written"
+)
+"""The same where a device failed while the instrument was made safe; warnings name it."""
 POLL = 0.02  # s between status queries of a moving stage
 
 

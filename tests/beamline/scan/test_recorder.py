@@ -19,9 +19,8 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start
-from beamline.scan import backlog
+from beamline.scan import backlog, measurement
 from beamline.scan import recorder as module
-from beamline.scan import run as run_module
 from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.recorder import Recorder
 from beamline.storage.readers.open import open_scan
@@ -138,7 +137,7 @@ def hanging(monkeypatch: pytest.MonkeyPatch, hang: Callable[[], object]) -> None
                 hang()
             super().append(frame, digest, flags)
 
-    monkeypatch.setattr(run_module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(measurement, "NXtomoWriter", Hanging)
 
 
 def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
