@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -70,31 +69,20 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> N
         pause.release(Cause.SPACE)
 
 
-@dataclass
-class Workload:
-    """Busy seconds of a recorder's threads: checking frames, and writing them."""
-
-    checking: float = 0.0
-    writing: float = 0.0
-
-    @property
-    def behind(self) -> tuple[str, str]:
-        """The cause of the backlog, and a remedy: the disk if writing took longer than the checks."""
-        if self.writing > self.checking:
-            return "the disk is behind", "a longer period_s or a faster disk"
-        return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
-
-
-def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, work: Workload) -> None:
+def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
     """Pause a fly scan before the queue is full, until few frames wait to be written.
 
     Args:
         most: frames that may wait.
         waiting: frames that do.
-        work: the time that earlier frames took.
+        checking, writing: busy s of the recorder's threads; the disk is behind if writing took longer.
     """
     if 4 * waiting >= 3 * most:
-        what, advice = work.behind
+        what, advice = (
+            ("the disk is behind", "a longer period_s or a faster disk")
+            if writing > checking
+            else ("the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it")
+        )
         pause.hold(
             Cause.BACKLOG,
             f"{what}, {waiting} of at most {most} frames wait in memory. The scan goes on by "

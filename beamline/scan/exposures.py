@@ -78,16 +78,14 @@ class Exposures:
         frames = self._fly(block, taken) if block.trains else self._one_by_one(block, taken)
         for row, (frame, trigger, angle, in_place) in enumerate(frames, first_row):
             taken.frames += 1
-            kind, replaces = block.kind, -1
-            if trigger == EXTRA:
-                kind = FrameKind.INVALID
-            elif not in_place:
-                kind = FrameKind.INVALID
-                taken.astray.setdefault(trigger, []).append((row, angle))
-            else:
+            good = in_place and trigger != EXTRA
+            kind, replaces = block.kind if good else FrameKind.INVALID, -1
+            if good:
                 before = taken.astray.get(trigger, [(-1, 0.0)])[-1]
                 replaces, _ = taken.rows.get(trigger, before)
                 taken.rows[trigger] = row, frame.time
+            elif trigger != EXTRA:
+                taken.astray.setdefault(trigger, []).append((row, angle))
             yield Frame(
                 frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces,
                 block.aside,

@@ -135,10 +135,12 @@ class Measurement:
         with ended.kept():
             recorder.finish()
         faults = self.references.faults(recorder.references)
-        missing, status, closed = acquisition.missing, ended.status, False
+        missing, closed = acquisition.missing, False
+        early = "stopped" if isinstance(ended.error, ScanStopped) else "failed"
+        status, reason = ("complete", "") if ended.error is None else (early, user_message(ended.error))
         with ended.kept():
             if not recorder.hangs:  # a write that does not return holds HDF5's lock: closing would wait for it
-                writer.close(status, missing, beam.readings, ended.reason)
+                writer.close(status, missing, beam.readings, reason)
                 closed = True
         with ended.kept():
             if self.instrument.simulated is not None and not recorder.hangs:
@@ -254,11 +256,12 @@ class Measurement:
         if not chosen:
             return ()
         if len(chosen) < n:
-            message = (
-                f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
-                f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
+            self.sink(
+                Warned(
+                    f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
+                    f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
+                )
             )
-            self.sink(Warned(message))
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
@@ -270,9 +273,7 @@ class Measurement:
             return (), 0
         recorder.wait()
         lost, n = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
-        once = [
-            view for view in recorder.flagged.views_to_retake if view.trigger < n
-        ]  # others were taken again already
+        once = [view for view in recorder.flagged.views_to_retake if view.trigger < n]  # others were taken again
         bad = sorted([*once, *lost], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
 
@@ -304,14 +305,3 @@ class _Ending:
             if isinstance(self.error, ScanStopped | LedgerError):
                 self.error, after = after, self.error
             self._sink(Warned(str(after)))
-
-    @property
-    def status(self) -> str:
-        """Status of the scan so far: complete, stopped or failed."""
-        if self.error is None:
-            return "complete"
-        return "stopped" if isinstance(self.error, ScanStopped) else "failed"
-
-    @property
-    def reason(self) -> str:
-        return "" if self.error is None else user_message(self.error)

@@ -141,10 +141,7 @@ def make_safe(
         failed.append(failures[0])
         return False
 
-    def slow_down() -> None:
-        stand(stage, clock, stop)
-
-    halts = (slow_down, slow_down, stage.abort)
+    halts = (*[lambda: stand(stage, clock, stop)] * 2, stage.abort)
     attempt(*((stage.abort, stage.abort) if stop.aborting else halts))
     attempt(camera.disarm, camera.disarm)
     attempt(shutter.close, shutter.close)

@@ -25,7 +25,7 @@ from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import Monitor, look_past_failures
 from beamline.plan.plan import Timeline
-from beamline.scan.backlog import CHECKED_FRAMES, Progress, Workload, hold_for_backlog, hold_for_space, room
+from beamline.scan.backlog import CHECKED_FRAMES, Progress, hold_for_backlog, hold_for_space, room
 from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.references import ReferenceLog
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -96,7 +96,7 @@ class Recorder:
         self.announced, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
-        self._work = Workload()
+        self._checking = self._writing = 0.0  # busy s of the threads
         self._most, views = room(timeline), timeline.views
         self._waiting: Queue[Frame | _Call | None] = Queue(self._most)
         self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
@@ -224,7 +224,7 @@ class Recorder:
         except BaseException as error:
             return error
         finally:
-            self._work.checking += time.monotonic() - begun
+            self._checking += time.monotonic() - begun
 
     def _next_checked(self) -> _Item:
         """The next item of the second thread, which digests frames itself once the checks hang."""
@@ -278,7 +278,7 @@ class Recorder:
                 with suppress(BaseException):  # the first one counts
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
-            self._work.writing += time.monotonic() - begun
+            self._writing += time.monotonic() - begun
             self._writing_since = math.inf
             if item is None:
                 return
@@ -299,7 +299,7 @@ class Recorder:
     def _look_at_backlog(self) -> None:
         if self._flies:
             waiting = self._waiting.qsize() if self._flying else 0  # other frames wait in `put`
-            hold_for_backlog(self._pause, self._most, waiting, self._work)
+            hold_for_backlog(self._pause, self._most, waiting, self._checking, self._writing)
 
     def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...] | None) -> None:
         if flags is None:

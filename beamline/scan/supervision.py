@@ -57,20 +57,17 @@ class Supervision:
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 
-@dataclass(frozen=True)
-class BeamLimits:
-    """Beam intensities at which a scan pauses and resumes, in the beam monitor's unit."""
-
-    pause_below: float  # a reading below it pauses the scan
-    resume_above: float  # readings of at least so much mean that the beam is back
-    settle: float  # s for which they must be so, before the scan goes on
-
-
 class BeamGuard:
-    """Pauses a scan while the beam monitor reads too little beam."""
+    """Pauses a scan while the beam monitor reads too little beam.
 
-    def __init__(self, limits: BeamLimits, pause: PauseRequest) -> None:
-        self._limits, self._pause = limits, pause
+    Args:
+        pause_below: a reading below it pauses the scan, in the monitor's unit.
+        resume_above: readings of at least so much mean that the beam is back.
+        settle: s for which they must be so, before the scan goes on.
+    """
+
+    def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
+        self._pause_below, self._resume_above, self._settle, self._pause = pause_below, resume_above, settle, pause
         self._good = -math.inf
         """Time of the last reading with beam."""
         self._back: float | None = None
@@ -79,22 +76,21 @@ class BeamGuard:
 
     def __call__(self, reading: BeamReading) -> None:
         """Record the next reading, and act."""
-        limits = self._limits
         if not self._paused:
-            if reading.value >= limits.pause_below:
+            if reading.value >= self._pause_below:
                 self._good = reading.time
                 return
             self._paused = True
             self._pause.no_beam(
-                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {limits.pause_below:.4g}. The "
-                f"scan goes on by itself when it has read {limits.resume_above:.4g} again for {limits.settle:g} s",
+                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {self._pause_below:.4g}. The "
+                f"scan goes on by itself when it has read {self._resume_above:.4g} again for {self._settle:g} s",
                 self._good,
             )
-        if reading.value < limits.resume_above:
+        if reading.value < self._resume_above:
             self._back = None
             return
         self._back = reading.time if self._back is None else self._back
-        if reading.time - self._back >= limits.settle:
+        if reading.time - self._back >= self._settle:
             self._paused, self._back, self._good = False, None, reading.time
             self._pause.release(Cause.BEAM)
 
@@ -187,5 +183,5 @@ def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink,
         return BeamLog(None, math.inf, sink)
     guard = None
     if config.pause_below is not None:
-        guard = BeamGuard(BeamLimits(config.pause_below, config.resumes_at, config.settle_s), pause)
+        guard = BeamGuard(config.pause_below, config.resumes_at, config.settle_s, pause)
     return BeamLog(monitor, config.period_s, sink, guard)

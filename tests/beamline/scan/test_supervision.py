@@ -11,7 +11,7 @@ import pytest
 from beamline.core.stop import Cause, PauseRequest
 from beamline.instrument.connect import ConnectedDevices
 from beamline.scan.control import State
-from beamline.scan.supervision import BeamGuard, BeamLimits
+from beamline.scan.supervision import BeamGuard
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
@@ -32,7 +32,7 @@ def test_too_little_beam_pauses_until_there_has_been_enough_for_a_while(
     readings: list[float], paused: list[bool], since: float
 ) -> None:
     pause = PauseRequest()
-    guard, seen = BeamGuard(BeamLimits(50, 55, 20), pause), []
+    guard, seen = BeamGuard(50, 55, 20, pause), []
     for i, value in enumerate(readings):
         guard(BeamReading(value, "mA", 10.0 * i))
         seen.append(bool(pause.reason))
