@@ -152,7 +152,7 @@ class Timeline:
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
-        plan: that it is computed of.
+        plan: that it is computed from.
         retake_seconds: for the most views that may be taken again.
     """
 

@@ -30,7 +30,7 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
     def next_pass(passes: Passes) -> Choice:
         choice = choose(passes)
         numbers[-1] += 1
-        values = {"number": numbers[-1], "n_views": passes.n_views, "choice": choice, "predicted": float("nan")}
+        values = {"number": numbers[-1], "n_views": passes.n_frames, "choice": choice, "predicted": float("nan")}
         recorders[-1].add_decision(values)
         return choice
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from beamline.plan.choose import Wish, choose, options, rest_gain
+from beamline.plan.choose import Wish, choose, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
@@ -64,7 +64,7 @@ def way(number: int, seed: int, kept: Kept, wish: Wish) -> tuple[list[Step], Sta
         if not (passes.to_come or passes.wide or passes.retakes):
             return steps, state
         law = kept.law(number, seed, state)
-        offered, rest = options(passes, law, timeline, seconds_of), rest_gain(passes, law)
+        offered, rest = options(passes, law, timeline, seconds_of), remaining_gain(passes, law)
         choice, _ = choose(offered, wish, rest, 0.0, 0.0)
         steps.append(Step(state, law, choice, rest.mean))
         match choice:

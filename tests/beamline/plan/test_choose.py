@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.plan.timeline import block_seconds
@@ -105,10 +105,10 @@ def test_the_choice_and_its_reason(
 
 def test_the_rest_is_all_that_the_plan_still_has() -> None:
     timeline = scan(wide=5)
-    assert rest_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
+    assert remaining_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
     later = after(timeline, 1, retakes=3).after(Choice.NEXT)
-    assert rest_gain(later, LAW) == replace(LAW, n_views=24).gain(views=27, wide=True)
-    assert rest_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
+    assert remaining_gain(later, LAW) == replace(LAW, n_views=24).gain(views=27, wide=True)
+    assert remaining_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -147,9 +147,9 @@ def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
     passes, choices = after(TIMELINE, 1, retakes=3), list[Choice]()
     seconds, dose = seconds_of(passes.done[0]), 12 * frame_dose(TIMELINE)
     while passes.to_come or passes.wide or passes.retakes:
-        so_far = replace(law, n_views=passes.n_views)
+        so_far = replace(law, n_views=passes.n_frames)
         offered = options(passes, so_far, TIMELINE, seconds_of)
-        choice, _ = choose(offered, wish, rest_gain(passes, so_far), seconds, dose)
+        choice, _ = choose(offered, wish, remaining_gain(passes, so_far), seconds, dose)
         choices.append(choice)
         if choice is Choice.ENOUGH:
             break
@@ -157,7 +157,7 @@ def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
         assert one.gain > 0  # nothing that brings nothing is taken before ENOUGH
         seconds, dose = seconds + one.seconds, dose + one.dose
         passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
-    return choices, passes.n_views, seconds, dose
+    return choices, passes.n_frames, seconds, dose
 
 
 @given(LAWS, WISHES)

@@ -103,7 +103,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
             assert len(pass_ends_in(file)) in (len(decisions), len(decisions) + 1)
             assert file[layout.STATUS][()].decode() == "complete"
         assert next_step(ran.folder / "scan.h5") == ""  # it has what it was to take
-        so_far = [passes.n_views for passes in asked.asked]
+        so_far = [passes.n_frames for passes in asked.asked]
         assert so_far == [values["n_views"] for values in decisions]
 
 
