@@ -21,7 +21,7 @@ from drivers.base.errors import DeviceError
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
-CHOICES = ("next", "again", "wide", "retake", "enough")  # those of `beamline.plan.passes`, which help does not load
+CHOICES = ("next", "again", "wide", "retake", "enough")  # those of `plan.passes.Choice`, which help does not load
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
@@ -61,9 +61,9 @@ def _require_chosen(run: Path, choice: str) -> None:
         decisions = [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
     last = decisions[-1] if decisions else {}
     if last.get("choice") != choice:
-        taken = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing"
+        instead = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing so far"
         raise ConfigError(
-            f"the scan in {run} does not take {choice}, which was not on offer or came too late; {taken}."
+            f"the scan in {run} does not take {choice}, which was not on offer or came too late; {instead}."
         )
 
 

@@ -59,7 +59,7 @@ class Decider:
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
     _law: LawMeasured = _NO_LAW  # the newest
-    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options, by the number of the pass before each
+    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options, by the pass before each
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # what came of a choice, as `NextChosen` has it
     _no_more_laws: str = ""  # why, once that was told
     _answers: frozenset[Choice] = frozenset()  # that the operator can give now
@@ -94,8 +94,8 @@ class Decider:
             by, (choice, reason) = "program", choose(offered, self.wish, remaining_gain(passes, law), *spent)
         else:
             by, choice, self._no_more_laws = "plan", Choice.NEXT, self.unable()
-            refused = self._law.reason if self._law.number == self.number else ""
-            reason = self._no_more_laws or refused or f"no prediction within {self.wait:g} s"
+            refusal = self._law.reason if self._law.number == self.number else ""
+            reason = self._no_more_laws or refusal or f"no prediction within {self.wait:g} s"
         asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
         pass_ended = self.number, passes.n_frames // self.timeline.plan.frames_per_view
         rows = [  # an event has None for NaN
@@ -120,8 +120,12 @@ class Decider:
         """
         law = self._newest_law(passes)
         offered = options(passes, law, self.timeline, self.seconds_of)
-        spent = self._spent(passes)
-        if law is None or self.asks or self.unable() or not next_is_sure(passes, offered, self.wish, law, *spent):
+        if (
+            law is None
+            or self.asks
+            or self.unable()
+            or not next_is_sure(passes, offered, self.wish, law, *self._spent(passes))
+        ):
             if not self._law_has_come():
                 self.close_shutter()  # a law takes seconds
                 self._wait(self._law_has_come)

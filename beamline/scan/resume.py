@@ -207,25 +207,26 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], tuple[str, ...]]:
     """Triggers of the views, and of the wide ones, that need not be taken: those in the files, and those that the scan
-    decided against. And what it chose after each pass that ended; where it says nothing, the plan went on."""
-    views, wide, since, chosen, ended, decides = set[int](), set[int](), set[int](), dict[Any, Any](), 0, False
+    decided against. And what it chose after each pass that ended; where the files do not say, the plan went on."""
+    views, wide, in_last_pass = set[int](), set[int](), set[int]()  # the last: since a pass has ended
+    chosen, n_ended, decides = dict[Any, Any](), 0, False  # choices, by the number of the pass before
     for part in parts:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             decides, ends = layout.PASS_ENDS in file, pass_ends_in(file)
-            since = {*views_in(file, int(ends[-1]))} if ends.size else since | views_in(file)
+            in_last_pass = {*views_in(file, int(ends[-1]))} if ends.size else in_last_pass | views_in(file)
             views |= views_in(file)
             wide |= views_in(file, kind=FrameKind.ALIGNMENT)  # as which wide views are written
-            ended += ends.size
+            n_ended += ends.size
             chosen |= {values.get("number"): values.get("choice") for values in decisions_in(file)}
     if not decides:
         return views, wide, ()
-    choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, ended + 1))
+    choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, n_ended + 1))
     plan = replace(plan_of(config), choices=choices)
     stage, camera, to_counts = connect.describe(config)
     passes = passes_at_start(work_out(plan, stage, to_counts, camera).views, plan)
     missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
     if choices[-1:] == (Choice.AGAIN,):
-        missing |= triggers_to_take(passes.done[-1]) - since
+        missing |= triggers_to_take(passes.done[-1]) - in_last_pass
     if Choice.ENOUGH in choices:
         wide |= {plan.angles.size + i for i in range(plan.wide_views * len(plan.wide_places))}
     return {*range(plan.angles.size)} - missing, wide, choices

@@ -72,7 +72,7 @@ def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass: values of the event `next_chosen`, likewise."""
+    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty likewise."""
     return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
 
 

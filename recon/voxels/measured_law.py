@@ -51,14 +51,14 @@ _CIRCLE = 0.95  # of the field's radius, where errors count
 
 
 def measured_law(
-    data: F32, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator, open_beam: F32
+    data: F32, geometry: Geometry, views_at_ends: Sequence[int], rng: np.random.Generator, open_beam: F32
 ) -> tuple[ErrorLaw, float | None]:
     """The law of the error of the volume of these views, and dB by those of the last pass (None: not known).
 
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
         geometry: of these views: parallel beam, straight.
-        sizes: numbers of views at the ends of passes so far, the last of all.
+        views_at_ends: numbers of views at the ends of passes so far, the last of all.
         open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
             binned as the views.
 
@@ -66,10 +66,13 @@ def measured_law(
         ValueError: a cone, fewer than 40 views or 3 frames of the open beam, or views without matter.
     """
     n = len(data)
-    if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
-        there, needed = f"{n} views and {len(open_beam)} frames", f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
-        why = "the beam is a cone" if geometry.is_cone else f"{there} of the open beam are there, {needed}"
-        raise ValueError(f"the error of a volume is not measured: {why}")
+    if geometry.is_cone:
+        raise ValueError("the error of a volume is not measured: the beam is a cone")
+    if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
+        raise ValueError(
+            f"the error of a volume is not measured: {n} views and {len(open_beam)} frames of the open beam are there, "
+            f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
+        )
     sample = sample_radius(data, geometry)
     slab = _Slab.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
     most, held_out = split_views(slab.geometry)
@@ -92,10 +95,10 @@ def measured_law(
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0
     law = ErrorLaw(n, exponent, _EXPONENT_ERROR * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    if not fall_ratio or len(sizes) < 2 or min(errors) <= 0:
+    if not fall_ratio or len(views_at_ends) < 2 or min(errors) <= 0:
         return law, None
     fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])  # of the scan, from half to most views
-    return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / sizes[-2])
+    return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])
 
 
 def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
@@ -157,8 +160,7 @@ class _Slab:
     @classmethod
     def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32) -> _Slab:
         """Rows with most matter of a scan whose sample is `width` times as wide as the field."""
-        halvings = math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))
-        factor = 2 ** max(0, math.ceil(halvings))
+        factor = 2 ** max(0, math.ceil(math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))))
         rows = busiest_rows(data, min(_ROWS * factor, data.shape[1]))
         views, geometry = np.ascontiguousarray(data[:, rows]), geometry.rows(rows.start, rows.stop)
         change = np.diff(open_beam, axis=0)

@@ -1,4 +1,4 @@
-"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control also verbs and answers to it."""
+"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control it takes verbs and answers."""
 
 from __future__ import annotations
 
@@ -139,15 +139,17 @@ class RunServer:
             self._refuse(pv, op, error)
             return
         if done:
-            pv.post(_posted("" if pv is self._decide else False, Stamp(self._now())))
-            op.done()
+            self._end(pv, op, Stamp(self._now()))
         else:
             self._asked.append((pv, op, asked))
 
     def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
-        stamp = Stamp(self._now(), Severity.MAJOR, user_message(error))
+        self._end(pv, op, Stamp(self._now(), Severity.MAJOR, user_message(error)))
+
+    def _end(self, pv: Any, op: Any, stamp: Stamp) -> None:
+        """Post what a PV held before it was written to, and answer its client."""
         pv.post(_posted("" if pv is self._decide else False, stamp))
-        op.done(error=stamp.message)
+        op.done(error=stamp.message or None)
 
 
 def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:
