@@ -3,11 +3,12 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 
-from beamline.core.events import Event, LawMeasured
+from beamline.core.events import Event, LawMeasured, event_of
 from beamline.core.stop import StopRequest
 from beamline.plan.choose import Wish
 from beamline.plan.passes import Choice, Passes, pass_blocks
@@ -17,12 +18,18 @@ from beamline.scan.decider import Decider
 from beamline.scan.supervision import PAUSE_POLL
 from tests.beamline.fakes import FakeInstrument
 
-EACH = 12  # views of each of four passes
+PASS_VIEWS = 12  # of each of four passes
 QUALITY = Wish(quality_db=1.0)
 
 
-def law(n: int, exponent: float = 1.0, error: float = 0.1, noise: float = 0.3, **more: Any) -> LawMeasured:
-    return LawMeasured(-(-n // EACH), n, exponent, error, noise, 0.0, **more)
+def law(
+    n: int, exponent: float | None = 1.0, error: float | None = 0.1, noise: float | None = 0.3, **more: Any
+) -> LawMeasured:
+    """The law of n views, as the line of another process gives it: None is a null there."""
+    numbers = {"exponent": exponent, "exponent_error": error, "noise": noise, "offset": 0.0}
+    event = event_of({"event": "error_law", "number": -(-n // PASS_VIEWS), "n_views": n, **numbers, **more})
+    assert isinstance(event, LawMeasured)
+    return event
 
 
 class Scan:
@@ -30,7 +37,7 @@ class Scan:
 
     def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, **more: Any) -> None:
         instrument = FakeInstrument()
-        plan = replace(instrument.plan(4 * EACH, passes=4), retake_share=0.25)
+        plan = replace(instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25)
         self.timeline = instrument.worked_out(plan)
         self.moments: list[Callable[[], object]] = []
         self.waited, self.reason = 0, ""
@@ -57,7 +64,7 @@ class Scan:
 
     def after(self, n: int, *measured: LawMeasured, retakes: int = 0, again: int = 0) -> Choice:
         """What follows n passes and some that were taken again; the laws come one by one while it waits."""
-        self.moments += [lambda each=each: self.decide.add_law(each) for each in measured]  # type: ignore[misc]
+        self.moments += [partial(self.decide.add_law, each) for each in measured]
         self.waited, self.decide.number = 0, n - 1
         each = pass_blocks(self.timeline.views, 0)
         done, to_come = each[: n - again], each[n - again : len(each) - again]
@@ -236,7 +243,7 @@ def test_the_shutter_stays_open_where_the_law_is_there() -> None:
 @pytest.mark.parametrize("asks", [False, True])
 def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
     scan = Scan(asks=asks, wait=0.5)
-    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")  # type: ignore[arg-type]
+    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")
     assert scan.after(1, none) is Choice.NEXT
     assert scan.waited == 1 or asks
     assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: 30 views are few."
@@ -250,5 +257,5 @@ def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
 
 def test_a_law_without_its_numbers_is_none() -> None:
     scan = Scan(wait=0.2)
-    assert scan.after(1, law(12, exponent=None)) is Choice.NEXT  # type: ignore[arg-type]
+    assert scan.after(1, law(12, exponent=None)) is Choice.NEXT
     assert scan.chosen["by"] == "plan"

@@ -27,7 +27,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.chosen import Asked, choosing
+from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true, decode
 from tests.beamline.ran import Ran, killed
 
@@ -74,11 +74,11 @@ def frames_of(path: Path) -> list[Frame]:
 @given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH])))
 def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> None:
     words, pass_views, sizes = MODES[mode]
-    asked = Asked(script)
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+    chooser = Scripted(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, chooser, pass_views):
         ran = Ran(Path(folder), FakeInstrument(), *WORDS, *words)
         ran.assert_safe()
-        sets = expected(sizes, asked.answers)
+        sets = expected(sizes, chooser.answers)
         frames = frames_of(ran.folder / "scan.h5")
         views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
         assert [frame.trigger for frame in views] == [trigger for one in sets for trigger in one]
@@ -86,7 +86,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         assert len(views) <= VIEWS + WIDE and all(frame.replaces < 0 for frame in frames)
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         assert [decode(frame.counts)[3] for frame in frames] == list(range(len(frames)))
-        enough = Choice.ENOUGH in asked.answers
+        enough = Choice.ENOUGH in chooser.answers
         assert len(frames) == FIRST + len(views) + 2  # flats of the end
         assert ran.error is None
         assert (ran.result.missing, ran.result.n_frames, ran.result.retaken) == ((), len(frames), 0)
@@ -95,15 +95,15 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
             assert len(views) < VIEWS + WIDE or last["n"] == last["of"] == len(frames)
         assert sum(event.data["n"] for event in ran.of("block_started")) == len(frames)
         with h5py.File(ran.folder / "scan.h5") as file:
-            asked_for = sets if len(asked.answers) >= len(sets) else sets[: len(asked.answers) + 1]
-            rows = [FIRST + sum(map(len, sets[: i + 1])) for i in range(len(asked_for))]
+            ended = sets if len(chooser.answers) >= len(sets) else sets[: len(chooser.answers) + 1]
+            rows = [FIRST + sum(map(len, sets[: i + 1])) for i in range(len(ended))]
             assert pass_ends_in(file).tolist() == rows[: len(pass_ends_in(file))]
             decisions = decisions_in(file)
-            assert [values["choice"] for values in decisions] == asked.answers
+            assert [values["choice"] for values in decisions] == chooser.answers
             assert len(pass_ends_in(file)) in (len(decisions), len(decisions) + 1)
             assert file[layout.STATUS][()].decode() == "complete"
         assert next_step(ran.folder / "scan.h5") == ""  # it has what it was to take
-        so_far = [passes.n_frames for passes in asked.asked]
+        so_far = [passes.n_frames for passes in chooser.asked]
         assert so_far == [values["n_views"] for values in decisions]
 
 
@@ -122,12 +122,12 @@ def test_views_are_taken_again_between_passes_within_the_budget(
     words, pass_views, sizes = MODES[mode]
     n = sizes[0]
     lost, flagged = FIRST + 1, {FIRST + 2, FIRST + n + 3 + 1}
-    asked = Asked([Choice.RETAKE, Choice.RETAKE, Choice.NEXT])
+    chooser = Scripted([Choice.RETAKE, Choice.RETAKE, Choice.NEXT])
     retake = ("monitor.retake=true", "monitor.retake_share=0.25")
-    with choosing(monkeypatch, asked, pass_views):
+    with choosing(monkeypatch, chooser, pass_views):
         ran = Ran(tmp_path, FakeInstrument(Faults(lost={lost}, repeats=flagged)), *WORDS, *retake, *words)
-    assert asked.answers[:2] == [Choice.RETAKE, Choice.NEXT]  # each view is taken again once
-    assert [passes.retakes for passes in asked.asked][:2] == [2, 0]
+    assert chooser.answers[:2] == [Choice.RETAKE, Choice.NEXT]  # each view is taken again once
+    assert [passes.retakes for passes in chooser.asked][:2] == [2, 0]
     frames = frames_of(ran.result.path)
     again = [frame for frame in frames if frame.trigger >= VIEWS and frame.kind is FrameKind.PROJECTION]
     assert (ran.result.missing, ran.result.retaken, len(again)) == ((), 3, 2)
@@ -143,7 +143,7 @@ def test_a_view_without_a_frame_has_one_when_its_pass_is_taken_again(
 ) -> None:
     words, _, sizes = MODES["fly"]
     faults = Faults(lost={FIRST + 1, FIRST + sizes[0] + 2})  # another one when it is taken again
-    with choosing(monkeypatch, Asked([Choice.AGAIN])):
+    with choosing(monkeypatch, Scripted([Choice.AGAIN])):
         ran = Ran(tmp_path, FakeInstrument(faults), *WORDS, *words)
     assert (ran.result.missing, ran.result.retaken) == ((), 1)
     triggers = [frame.trigger for frame in frames_of(ran.result.path) if frame.kind is FrameKind.PROJECTION]
@@ -177,8 +177,8 @@ CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choi
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
-    asked = Asked(script)
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+    chooser = Scripted(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, chooser, pass_views):
         for part, cut in enumerate([*cuts, None]):
             stop, instrument = StopRequest(), FakeInstrument()
             instrument.clock.sleep(1e4 * part)
@@ -192,7 +192,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         recover_run(ran.folder)
         with pytest.raises(NothingMissing), open_for_resume(ran.folder):
             ...
-        sets = expected(sizes, asked.answers)
+        sets = expected(sizes, chooser.answers)
         path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
         frames = frames_of(path)
         rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
@@ -202,7 +202,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
             ends, decisions = pass_ends_in(file), decisions_in(file)
             assert ending_in(file).missing == ()
         assert next_step(path) == ""
-        assert [values["choice"] for values in decisions] == asked.answers
+        assert [values["choice"] for values in decisions] == chooser.answers
         so_far = [sum(frame.index < end for frame in rows) for end in ends]
         assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]
         assert len(ends) in (len(decisions), len(decisions) + 1)
@@ -215,18 +215,18 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     """By validate, by a copy, by the monitor over the file, and by a reconstruction."""
     words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 32, passes: 4}", "scan.period_s=0.4")
     wide = ("scan.wide_views=2", "sample.diameter_mm=0.9")
-    asked = Asked([Choice.AGAIN, Choice.WIDE])
-    with choosing(monkeypatch, asked):
+    chooser = Scripted([Choice.AGAIN, Choice.WIDE])
+    with choosing(monkeypatch, chooser):
         ran = Ran(tmp_path / "runs", FakeInstrument(), *words, *wide)
     path = ran.result.path
-    assert asked.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
+    assert chooser.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
     assert ran.result.flags == {}
     ingest(path, tmp_path / "copy.h5")
     for file in (path, tmp_path / "copy.h5"):
         assert [one.message for one in validate(file) if one.severity != "info"] == []
         with open_scan(file) as source:
             assert source.pass_ends.tolist() == [13, 21, 25, 33, 41]
-            assert [values["choice"] for values in source.decisions] == asked.answers
+            assert [values["choice"] for values in source.decisions] == chooser.answers
             assert usable_views(source, use_flags=True).frames.size == 32
             assert judged_flags(source).flagged.sum() == 0
     out = tmp_path / "volume.h5"
