@@ -41,12 +41,10 @@ _NOISE_PRODUCT = 0.08, 0.16  # noise x ratio of falls: below the first other err
 _EXPONENT_ERROR = 0.25  # over the exponent: a convention, by which a gain's range is half to one and a half times it
 _SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
-_USUAL_FALL_RATIO = 0.6  # where it is not measured
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
 _LEAST_FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
-_WEIGHT_EXPONENT = 0.6  # the weight of total variation grows with the number of views to this power
 _CIRCLE = 0.95  # of the field's radius, where errors count
 
 
@@ -90,7 +88,7 @@ def measured_law(
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
     gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
-    product = 1.0 if gaps else noise * (_USUAL_FALL_RATIO if fall_ratio is None else fall_ratio)
+    product = 1.0 if gaps else noise * (1.0 if fall_ratio is None else fall_ratio)
     exponent = float(np.interp(product, _NOISE_PRODUCT, (_OTHER_EXPONENT, _NOISE_EXPONENT)))
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0
@@ -118,13 +116,16 @@ def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class _TotalVariation:
-    """FISTA-TV with a weight that is stated for one view."""
+    """FISTA-TV with a weight that is stated for one view.
+
+    That of n views is as many times it as the noise in the gradient of the sum over them: √n.
+    """
 
     weight: float
     iterations: int = _SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        weight = self.weight * problem.projector.geometry.n_views**_WEIGHT_EXPONENT
+        weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
         subsets = Subsets.of(problem, _SUBSETS)
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
 
@@ -185,7 +186,7 @@ class _Slab:
         by_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
         tried = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         self.volume(_WeightByNoise(), self.views, tried)
-        first = float(self.decisions["weight"][0] / len(tried) ** _WEIGHT_EXPONENT)
+        first = float(self.decisions["weight"][0] / math.sqrt(len(tried)))
         seen, unseen = (tried[part] for part in split_views(self.geometry.select(tried)))
         projector, held_out = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
 
