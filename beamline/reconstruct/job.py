@@ -36,7 +36,8 @@ from recon.base.method import (
     candidates_of,
     setting,
 )
-from recon.base.volume import Grid, Slab
+from recon.base.slabs import Slab
+from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import LastRound
