@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 import recon
 from beamline.core.durations import Phases, seconds_left
 from beamline.core.errors import DataError
-from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
+from beamline.core.events import KernelsCompiled, Sink, StateEntered
+from beamline.core.recon_events import FitReached
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
+from beamline.core.events import Sink
 from beamline.core.files import write_whole
+from beamline.core.recon_events import SlicesDrawn, SnapshotWritten
 from beamline.core.sinks import Warnings
 from beamline.plan.plan import one_way
 from beamline.projections.correction import ScanCorrection
