@@ -16,8 +16,9 @@ from beamline.api.instrument import Say, to_stderr
 from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
-from beamline.core.events import Event, VolumeDone
+from beamline.core.events import Event
 from beamline.core.files import JOINED, SCAN, parts_of
+from beamline.core.recon_events import VolumeDone
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.monitor.checks import CHECKS

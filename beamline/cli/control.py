@@ -54,7 +54,7 @@ def _send(run: Path | None, word: str) -> None:
 
 def _require_chosen(run: Path, choice: str) -> None:
     """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
-    from beamline.core.events import event_in
+    from beamline.core.event_lines import event_in
     from beamline.core.files import EVENTS, parts_of
 
     with (parts_of(run)[-1] / EVENTS).open("rb") as log:

@@ -20,20 +20,22 @@ from beamline.core.events import (
     FrameStored,
     NextChosen,
     PassEnded,
-    ReconDone,
-    ReconStarted,
     RunDone,
     RunStarted,
     ScanDone,
     Sink,
-    SnapshotWritten,
     StateEntered,
-    StudyStarted,
-    TradeoffStarted,
-    TrialDone,
     Warned,
 )
 from beamline.core.flag import Level
+from beamline.core.recon_events import (
+    ReconDone,
+    ReconStarted,
+    SnapshotWritten,
+    StudyStarted,
+    TradeoffStarted,
+    TrialDone,
+)
 from beamline.core.text import SENTENCE, count, one_line, size, spans
 from drivers.base.clock import Clock
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import ConfigError, DataError, user_message
-from beamline.core.events import event_in
+from beamline.core.event_lines import event_in
 from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched

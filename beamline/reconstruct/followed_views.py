@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LawMeasured, Sink
+from beamline.core.events import Sink
+from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection

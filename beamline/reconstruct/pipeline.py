@@ -11,7 +11,8 @@ from pathlib import Path
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.events import ReconStarted, Sink, StateEntered
+from beamline.core.events import Sink, StateEntered
+from beamline.core.recon_events import ReconStarted
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.events import Sink, VolumeDone, Warned
+from beamline.core.events import Sink, Warned
+from beamline.core.recon_events import VolumeDone
 from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded

@@ -10,7 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from beamline.core.events import LawMeasured, NextChosen, PassEnded, Sink, Warned
+from beamline.core.events import NextChosen, PassEnded, Sink, Warned
+from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
 from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LARGEST_LOG, LONGEST
+from beamline.core.event_lines import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum

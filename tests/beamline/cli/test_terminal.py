@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 
 from beamline.cli.terminal import Terminal
-from beamline.core.events import FitReached, FrameStored, Warned, event_of
+from beamline.core.event_lines import event_of
+from beamline.core.events import FrameStored, Warned
+from beamline.core.recon_events import FitReached
 from beamline.core.sinks import UserLog, sentence
 
 FRAME: dict[str, Any] = {

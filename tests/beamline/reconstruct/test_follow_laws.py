@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.core.events import Event, LawMeasured
+from beamline.core.events import Event
+from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
-from beamline.core.events import Event, LawMeasured, event_of
+from beamline.core.event_lines import event_of
+from beamline.core.events import Event
+from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
 from beamline.plan.choose import Wish
 from beamline.plan.passes import Choice, Passes, pass_blocks

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ScanStopped
-from beamline.core.events import Event, LawMeasured
+from beamline.core.events import Event
 from beamline.core.process import ChildProcess
+from beamline.core.recon_events import LawMeasured
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import live_process
