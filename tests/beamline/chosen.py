@@ -49,8 +49,8 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         for module in ("preflight", "resume"):
             patched.setattr(f"beamline.scan.{module}.plan_of", in_passes)
         patched.setattr("beamline.scan.run.preflight", ready)
-        patched.setattr("beamline.scan.run.Recorder", recorder)
-        patched.setattr("beamline.scan.run.Supervision", supervised)
+        patched.setattr("beamline.scan.measurement.Recorder", recorder)
+        patched.setattr("beamline.scan.measurement.Supervision", supervised)
         yield
 
 
