@@ -15,13 +15,14 @@ from beamline.cli.options import POSITIVE, config_argument, json_events, json_op
 from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.events import Done, Sink
 from beamline.core.stop import terminated_like_interrupted
+from beamline.plan.passes import Choice
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
-CHOICES = ("next", "again", "wide", "retake", "enough")  # those of `plan.passes.Choice`, which help does not load
+CHOICES = tuple(Choice)
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
@@ -39,7 +40,6 @@ def _command(verb: str, help_text: str) -> click.Command:
 def _send(run: Path | None, word: str) -> None:
     """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # here: help does not need it
-    from beamline.plan.passes import Choice
     from beamline.scan.control import Verb, tell
 
     runs = Path(StorageSection.model_fields["folder"].default)

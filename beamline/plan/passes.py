@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import accumulate, pairwise
 
-from beamline.plan.plan import Block, ScanPlan
+from beamline.plan.plan import Block
 
 
 class Choice(StrEnum):
@@ -61,24 +61,26 @@ def triggers_to_take(*blocks: Block) -> frozenset[int]:
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def passes_at_start(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
-    """A scan at the end of the pass that it begins with, or that a resumed scan is in when it goes on.
+def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Iterable[Block] = ()) -> Passes:
+    """A scan at the end of the pass that it begins with, or, after these choices, of the one that it goes on with.
 
     Its passes are those of the whole plan, also where earlier files have some of their views.
+
+    Args:
+        size: frames of a pass, as of `pass_blocks`.
     """
-    blocks = pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view)
-    passes = Passes((), blocks, (*wide,))
-    for choice in (Choice.NEXT, *plan.choices):
+    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), size), (*wide,))
+    for choice in (Choice.NEXT, *choices):
         passes = passes.after(Choice(choice))
     return passes
 
 
-def pass_blocks(views: Block, step_frames: int) -> tuple[Block, ...]:
+def pass_blocks(views: Block, size: int) -> tuple[Block, ...]:
     """The passes of a block of views: its trains, or, of a step scan, so many frames each (0: all).
 
     Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
     """
-    size = step_frames or views.n
+    size = size or views.n
     sizes = [train.n for train in views.trains] or [size] * -(-views.n // size)
     spans = pairwise(accumulate(sizes, initial=0))
     blocks = (replace(views, stored=views.stored.union(range(first), range(end, views.n))) for first, end in spans)

@@ -56,6 +56,7 @@ class ScanPlan:
             have them, or the scan decided against them.
         choices: what earlier files of the same scan chose after each pass that ended in them (`passes.Choice`), oldest
             first. A scan that goes on is in the pass that the last one began.
+        choice_due: that pass has ended, and nothing was chosen yet.
         pass_views: views of a pass of a step scan; 0: all. The passes of a fly scan are its trains.
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
         end_references: kinds of references that are still to be taken after the views, where all else but wide views
@@ -77,6 +78,7 @@ class ScanPlan:
     retake_share: float = 0.0
     stored: frozenset[int] = frozenset()
     choices: tuple[str, ...] = ()
+    choice_due: bool = False
     pass_views: int = 0
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0

@@ -141,9 +141,11 @@ class Acquisition:
         """The views in passes, and what is chosen after each. What nobody chose is left to the plan.
 
         A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
+        Where that pass had ended, it does not end anew, and the choice comes next.
         """
         plan, wide = self._timeline.plan, [b for b in self._timeline.blocks if b.kind is FrameKind.WIDE_VIEW and b.left]
-        passes, choice = passes_at_start(views, plan, wide), Choice((Choice.NEXT, *plan.choices)[-1])
+        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, wide)
+        choice, ended = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         rest = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         due = [*([rest] if rest.left else []), *(wide if choice is Choice.WIDE else [])]
         while True:
@@ -156,7 +158,9 @@ class Acquisition:
                 yield from self._retake(views)
             if self._stop.stopping:
                 return
-            self._supervision.pass_ended()
+            if not ended:
+                self._supervision.pass_ended()
+            ended = False
             passes = replace(passes, retakes=self._supervision.n_retakable(missing_views(self._done)))
             if not (passes.to_come or passes.wide or passes.retakes):
                 return

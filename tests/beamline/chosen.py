@@ -14,12 +14,12 @@ from beamline.scan.preflight import preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.supervision import Supervision
 
-Chooser = Callable[[Passes], Choice]
+Chooser = Callable[[Passes], Choice | None]
 
 
 @contextmanager
 def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
-    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded."""
+    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded; None is no answer."""
     recorders: list[Recorder] = []
     pass_numbers = [0]  # of the newest pass of each scan, from 1; a resumed one counts on
 
@@ -28,7 +28,8 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         return recorders[-1]
 
     def next_pass(passes: Passes) -> Choice:
-        choice = choose(passes)
+        if (choice := choose(passes)) is None:
+            return Choice.NEXT
         pass_numbers[-1] += 1
         values = {"number": pass_numbers[-1], "n_views": passes.n_frames, "choice": choice, "predicted": float("nan")}
         recorders[-1].add_decision(values)
@@ -46,8 +47,7 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         return Supervision(*given, **more | {"next_pass": next_pass})
 
     with patch.context() as patched:
-        for module in ("preflight", "resume"):
-            patched.setattr(f"beamline.scan.{module}.plan_of", in_passes)
+        patched.setattr("beamline.scan.preflight.plan_of", in_passes)
         patched.setattr("beamline.scan.run.preflight", ready)
         patched.setattr("beamline.scan.measurement.Recorder", recorder)
         patched.setattr("beamline.scan.measurement.Supervision", supervised)

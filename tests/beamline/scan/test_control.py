@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from beamline.cli.control import CHOICES
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, NextChosen
@@ -88,7 +87,6 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert tuple(Choice) == CHOICES
     run = tmp_path / "runs" / "a"
     run.mkdir(parents=True)
     (run / "config.resolved.yaml").touch()

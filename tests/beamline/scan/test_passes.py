@@ -209,6 +209,60 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         assert [one for one in validate(path, lambda done, of: None) if one.severity == "error"] == []
 
 
+@pytest.mark.parametrize(
+    ("script", "cut", "missing", "words"),
+    [
+        ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in the last flats
+        ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
+        ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
+    ],
+)
+def test_views_that_the_scan_decided_against_are_not_missing(
+    script: list[Choice], cut: int, missing: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither of the file whose writer died, nor of the one that joins the parts."""
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted(script)), killed(monkeypatch):
+        ran = Ran(tmp_path, FakeInstrument(at={cut: stop.abort}), *WORDS[1:], *MODES["fly"][0], stop=stop)
+    (recovered,), _ = recover_run(ran.folder)
+    assert recovered.missing == missing
+    (unfinished,) = [one.message for one in validate(ran.folder / "scan.h5") if one.rule == "unfinished"]
+    assert words in unfinished and ("--resume" in unfinished) is (missing > 0)
+    stop, instrument = StopRequest(), FakeInstrument()
+    instrument.clock.sleep(1e4)
+    instrument.at = {FIRST: stop.stop}
+    with choosing(monkeypatch, Scripted([])), open_for_resume(ran.folder) as series, suppress(ScanStopped):
+        run_scan(series.config, series, stop=stop, instrument=instrument.connected())
+    *_, joined = recover_run(ran.folder)[0]
+    assert joined.missing == max(0, missing - 1)
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words, pass_views, sizes = MODES[mode]
+    for folder, ending in (("stopped", nullcontext()), ("died", killed(monkeypatch))):
+        stop = StopRequest()
+        with choosing(monkeypatch, lambda passes, stop=stop: stop.stop(), pass_views), ending:  # type: ignore[misc]
+            ran = Ran(tmp_path / folder, FakeInstrument(), *WORDS, *words, stop=stop)
+        instrument = FakeInstrument()
+        instrument.clock.sleep(1e4)
+        again = Scripted([Choice.NEXT, Choice.ENOUGH])
+        with choosing(monkeypatch, again, pass_views), open_for_resume(ran.folder) as series:
+            run_scan(series.config, series, instrument=instrument.connected())
+        assert [(len(passes.done), len(passes.to_come)) for passes in again.asked] == [
+            (1, len(sizes) - 1),
+            (2, len(sizes) - 2),
+        ]
+        with open_scan(ran.folder / "joined.h5") as source:
+            assert [values["number"] for values in source.decisions] == [1, 2]
+            views = [frame.index for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
+            assert [sum(row < end for row in views) for end in source.pass_ends] == [sizes[0], sum(sizes[:2])]
+        with pytest.raises(NothingMissing), open_for_resume(ran.folder):
+            ...
+
+
 def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
