@@ -71,11 +71,11 @@ def options(
     offered, n = [], passes.retakes
     if passes.to_come:
         following, last = passes.to_come[0], passes.done[-1]
-        offered.append(option(Choice.NEXT, following.left, seconds_of(following), views=following.left))
+        offered.append(option(Choice.NEXT, following.n_to_take, seconds_of(following), views=following.n_to_take))
         if passes.may_repeat:
-            offered.append(option(Choice.AGAIN, last.left, seconds_of(last), again=last.left))
+            offered.append(option(Choice.AGAIN, last.n_to_take, seconds_of(last), again=last.n_to_take))
     if passes.wide:
-        frames, seconds = sum(block.left for block in passes.wide), sum(map(seconds_of, passes.wide))
+        frames, seconds = sum(block.n_to_take for block in passes.wide), sum(map(seconds_of, passes.wide))
         offered.append(option(Choice.WIDE, frames, seconds, wide=True))
     if n:
         offered.append(option(Choice.RETAKE, n, n * timeline.retake_seconds / timeline.plan.retakes, views=n))
@@ -115,7 +115,7 @@ def choose(
 
 def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
     """The gain by all that the plan still has."""
-    views = sum(block.left for block in passes.to_come) + passes.retakes
+    views = sum(block.n_to_take for block in passes.to_come) + passes.retakes
     return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.wide))
 
 

@@ -39,12 +39,12 @@ class Passes:
     @property
     def n_frames(self) -> int:
         """Frames of views so far: of each view `ScanPlan.frames_per_view`."""
-        return sum(block.left for block in self.done)
+        return sum(block.n_to_take for block in self.done)
 
     @property
     def may_repeat(self) -> bool:
         """Whether the last pass can be taken again: a pass is still to come, with at least as many views."""
-        return bool(self.to_come) and self.done[-1].left <= self.to_come[-1].left
+        return bool(self.to_come) and self.done[-1].n_to_take <= self.to_come[-1].n_to_take
 
     def after(self, choice: Choice) -> Passes:
         """The scan at the end of what it chose. Where the last pass cannot be taken again, AGAIN is NEXT."""
@@ -84,4 +84,4 @@ def pass_blocks(views: Block, size: int) -> tuple[Block, ...]:
     sizes = [train.n for train in views.trains] or [size] * -(-views.n // size)
     spans = pairwise(accumulate(sizes, initial=0))
     blocks = (replace(views, stored=views.stored.union(range(first), range(end, views.n))) for first, end in spans)
-    return tuple(block for block in blocks if block.left)
+    return tuple(block for block in blocks if block.n_to_take)

@@ -34,10 +34,10 @@ class Decider:
         seconds_of: duration of a block, from where the stage stands.
         now: the instrument's clock, s.
         began: time of the first frame.
-        seconds: count as taken beside those since `began`: of earlier parts of the run, and of what must follow
+        added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of what must follow
             the views.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
-        unable: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
+        why_no_law: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
         close_shutter: called before the scan waits.
         record: takes the values of a decision, for the file.
@@ -53,9 +53,9 @@ class Decider:
     stop: StopRequest
     sink: Sink
     began: float = math.inf
-    seconds: float = 0.0
+    added_seconds: float = 0.0
     number: int = 0
-    unable: Callable[[], str] = lambda: ""
+    why_no_law: Callable[[], str] = lambda: ""
     wait_a_moment: Callable[[], bool] = lambda: False
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
@@ -94,7 +94,7 @@ class Decider:
             spent = self._spent(passes)
             by, (choice, reason) = "program", choose(offered, self.wish, remaining_gain(passes, law), *spent)
         else:
-            by, choice, self._no_more_laws = "plan", Choice.NEXT, self.unable()
+            by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
             refusal = self._law.reason if self._law.number == self.number else ""
             reason = self._no_more_laws or refusal or f"no prediction within {self.wait:g} s"
         asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
@@ -124,7 +124,7 @@ class Decider:
         if (
             law is None
             or self.asks
-            or self.unable()
+            or self.why_no_law()
             or not next_is_sure(passes, offered, self.wish, law, *self._spent(passes))
         ):
             if not self._law_has_come():
@@ -136,7 +136,7 @@ class Decider:
 
     def _law_has_come(self) -> bool:
         """Whether the law of all views so far is there, or none can come."""
-        return self._law.number == self.number or bool(self.unable())
+        return self._law.number == self.number or bool(self.why_no_law())
 
     def _newest_law(self, passes: Passes) -> ErrorLaw | None:
         """The newest law, as of all frames so far; None: none is known.
@@ -152,8 +152,8 @@ class Decider:
         """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        frames = passes.n_frames + retaken + wide - sum(block.left for block in passes.wide)
-        return self.now() - self.began + self.seconds, frames * frame_dose(self.timeline)
+        frames = passes.n_frames + retaken + wide - sum(block.n_to_take for block in passes.wide)
+        return self.now() - self.began + self.added_seconds, frames * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait until this is so, but `wait` s at most, and not beyond a stop."""

@@ -42,7 +42,7 @@ class Scan:
         plan = replace(instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25)
         self.timeline = instrument.worked_out(plan)
         self.moments: list[Callable[[], object]] = []
-        self.waited, self.reason = 0, ""
+        self.waited, self.why_no_law = 0, ""
         self.events: list[Event] = []
         self.recorded: list[Any] = []
         self.log: list[str] = []
@@ -56,7 +56,7 @@ class Scan:
         self.decide = Decider(
             asks=asks, wish=wish, wait=wait, timeline=self.timeline, seconds_of=seconds_of, now=lambda: self.now,
             states=self.states, stop=self.stop, sink=self.events.append, began=90.0, **more,
-            unable=lambda: self.reason, wait_a_moment=self.moment, record=self.recorded.append,
+            why_no_law=lambda: self.why_no_law, wait_a_moment=self.moment, record=self.recorded.append,
             close_shutter=lambda: self.log.append("close shutter"),
         )  # fmt: skip
 
@@ -127,8 +127,8 @@ def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
 
 def test_the_seconds_of_a_wish_are_those_since_the_first_frame_and_what_follows() -> None:
     takes = Scan().decide.seconds_of(pass_blocks(Scan().timeline.views, 0)[1])
-    for beside, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
-        scan = Scan(Wish(seconds=10.5 + takes), seconds=beside)
+    for added, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
+        scan = Scan(Wish(seconds=10.5 + takes), added_seconds=added)
         assert scan.after(1, law(12)) is choice
 
 
@@ -165,20 +165,20 @@ def test_a_dead_live_process_means_the_plan_and_is_said_once(asks: bool) -> None
     scan = Scan(asks=asks, wait=0.5)
 
     def die() -> None:
-        scan.reason = "the live reconstruction has ended"
+        scan.why_no_law = "the live reconstruction has ended"
 
     scan.moments = [die]
     assert scan.after(1) is Choice.NEXT and scan.waited == 1
     assert [scan.after(n) for n in (2, 3)] == [Choice.NEXT] * 2
     assert scan.waited == 0 and scan.states.state is State.ACQUIRING
-    assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.reason)]
-    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.reason}."]
+    assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.why_no_law)]
+    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.why_no_law}."]
 
 
 def test_a_law_of_before_does_not_serve_when_the_process_is_dead() -> None:
     scan = Scan(Wish(1.0))
     scan.after(1, law(12, exponent=2.0, noise=0.0))
-    scan.reason = "the live reconstruction has ended"
+    scan.why_no_law = "the live reconstruction has ended"
     assert scan.after(2) is Choice.NEXT and scan.chosen["by"] == "plan"
 
 

@@ -283,7 +283,7 @@ print(json.dumps({"event": "error_law", "n_views": 90}))
 
 
 @pytest.mark.parametrize(("code", "ended"), [("raise SystemExit(1)", True), ("import time; time.sleep(100)", False)])
-def test_one_that_gives_no_law_any_more_is_known(tmp_path: Path, code: str, ended: bool) -> None:
+def test_a_live_reconstruction_that_gives_no_law_any_more_is_known(tmp_path: Path, code: str, ended: bool) -> None:
     command = script(code)(tmp_path / "scan.h5", tmp_path / "recon.h5")
     said: list[Event] = []
     process = LiveReconstruction(command, tmp_path / "recon.log", said.append)
