@@ -83,7 +83,7 @@ class Acquisition:
             ScanAborted: an abort, or a stop before the first frame.
             InstrumentError, DeviceError: a device failed.
         """
-        home: float | None = self._devices.stage.position()
+        home = self._devices.stage.position()
         devices_work = all_taken = False
         try:
             yield from self._blocks()
@@ -98,8 +98,9 @@ class Acquisition:
             self._warn_discrepancies()
             raise
         finally:
-            home = home if devices_work and not self._stop.aborting else None
-            failures, self.unsafe = make_safe(self._devices, home, self._clock, self._stop, self._sink)
+            failures, self.unsafe = make_safe(
+                self._devices, home if devices_work else None, self._clock, self._stop, self._sink
+            )
             for error in failures[1:] if all_taken else failures:
                 self._sink(Warned(in_words(error)))
         if failures:

@@ -118,5 +118,5 @@ class Progress:
         self._last_event = now
         span = self._times[-1] - self._times[0]
         rate = (len(self._times) - 1) / span if span > 0 else 0.0
-        left = float(self._ahead[min(n, self.total)])
-        return FrameStored(n, self.total, frame.kind.name.lower(), rate, rate * self._bytes / 1e6, left, mean)
+        seconds = float(self._ahead[min(n, self.total)])
+        return FrameStored(n, self.total, frame.kind.name.lower(), rate, rate * self._bytes / 1e6, seconds, mean)

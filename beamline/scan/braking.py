@@ -30,7 +30,7 @@ BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not
 class Braking:
     """A stage that was stopped during a train of triggers, and stands."""
 
-    told: float  # time at which it was told, in s
+    stop_sent: float  # time at which it was told to stop, in s
     stood: float  # where it stands, in intervals beyond trigger 0
     deceleration: float  # intervals/s²
 
@@ -70,7 +70,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
         return unassigned(ledger, braking, frame)
     seconds = 1 / (period * braking.deceleration)
     began = phase + (braking.stood - last) * period - seconds / 2
-    if not -EARLY <= began - braking.told <= LATE:
+    if not -EARLY <= began - braking.stop_sent <= LATE:
         return unassigned(ledger, braking, frame)
     if frame.time <= began:
         return frame
@@ -80,7 +80,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign the frame by the number of exposures since the last one at constant speed."""
-    if frame.time < braking.told or ledger.last < 0:
+    if frame.time < braking.stop_sent or ledger.last < 0:
         return unassigned(ledger, braking, frame)
     exposures = ledger.unmatched + frame.framestamp - ledger.exposed
     return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
@@ -88,7 +88,7 @@ def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign no frame after the stop to a trigger."""
-    return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
+    return frame if frame.time < braking.stop_sent else replace(frame, time=math.nan, steady=False)
 
 
 def _matched(ledger: Ledger) -> int:
@@ -97,8 +97,11 @@ def _matched(ledger: Ledger) -> int:
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
     """Whether the intervals between exposures grow from the last steady one on."""
-    steady = [DeliveredFrame(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
-    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
+    steady = [
+        DeliveredFrame(ledger.exposed, ledger.phase),
+        *(frame for frame in frames if frame.time < braking.stop_sent),
+    ]
+    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.stop_sent)]
     intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
     period = ledger.train.period
     return all(later > before - SHRINKS * period for before, later in pairwise([period, *intervals]))
@@ -106,18 +109,22 @@ def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFra
 
 @dataclass
 class Flight:
-    """A pulse train under way: its ledger, its counts, its first trigger within the block, the seconds its move takes.
+    """A pulse train under way.
 
-    `told`: time at which the stage was told to stop during the pass. `paused`: for a pause, after which the triggers
-    that come after the last frame stored are exposed anew. `braking`: for a stop, once the stage stands. `waiting`:
-    frames whose trigger is told by those that follow.
+    Attributes:
+        first: its first trigger within the block.
+        seconds: that its move takes.
+        stop_sent: time at which the stage was told to stop during the pass.
+        paused: for a pause, after which the triggers that come after the last frame stored are exposed anew.
+        braking: for a stop, once the stage stands.
+        waiting: frames whose trigger those that follow show.
     """
 
     ledger: Ledger
     train: TriggerTrain
     first: int
     seconds: float
-    told: float = math.inf
+    stop_sent: float = math.inf
     paused: bool = False
     braking: Braking = NOT_BRAKING
     waiting: list[CameraFrame] = field(default_factory=list)

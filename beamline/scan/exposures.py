@@ -17,9 +17,9 @@ from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, Flight
 from beamline.scan.control import State
 from beamline.scan.ledger import EXTRA, Ledger, Train, settle
-from beamline.scan.moves import POLL, arrive, go, stand
+from beamline.scan.moves import POLL, arrive, go, looked_again, stand
 from beamline.scan.supervision import Supervision
-from beamline.scan.tally import ASTRAY_ADVICE, TRIES, BlockTally, Exposed
+from beamline.scan.tally import TRIES, BlockTally, Exposed
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
@@ -75,7 +75,7 @@ class Exposures:
         accepted = self._camera.configure(
             CameraSettings(block.exposure, source, self._settings.roi, self._settings.binning, self._settings.readout)
         )
-        frames = self._fly(block, taken) if block.trains else self._one_by_one(block, taken)
+        frames = self._fly(taken) if block.trains else self._one_by_one(taken)
         for row, (frame, trigger, angle, in_place) in enumerate(frames, first_row):
             taken.frames += 1
             good = in_place and trigger != EXTRA
@@ -91,10 +91,10 @@ class Exposures:
                 block.aside,
             )  # fmt: skip
 
-    def _fly(self, block: Block, taken: BlockTally) -> Iterator[Exposed]:
-        ahead, i = passes(block), 0
+    def _fly(self, taken: BlockTally) -> Iterator[Exposed]:
+        block, ahead, i = taken.block, passes(taken.block), 0
         # It begins within a pass only after a pause.
-        while (i := self._after_pause(i, block, taken)) < block.n and not self._stop.stopping:
+        while (i := self._after_pause(i, taken)) < block.n and not self._stop.stopping:
             flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
             train, done = flown.train, i - flown.first
             self._supervision.states.enter(State.TAXI)
@@ -102,11 +102,12 @@ class Exposures:
             if not go(self._stage, begin, self._clock, self._stop):
                 return
             rest = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-            i += yield from self._pass(block, taken, rest, i, (begin, flown.end))
+            i += yield from self._pass(taken, rest, i, (begin, flown.end))
 
-    def _after_pause(self, i: int, block: Block, taken: BlockTally) -> int:
+    def _after_pause(self, i: int, taken: BlockTally) -> int:
         """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a
         lost beam it is the first trigger that may lack beam; it and later ones are repeated."""
+        block = taken.block
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()
@@ -120,11 +121,11 @@ class Exposures:
         return first
 
     def _pass(
-        self, block: Block, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
+        self, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
     ) -> Generator[Exposed, None, int]:
         """Fly once over a train whose first trigger within the block is `first`; the stage stands at the first of the
         ends. Returns how many of its triggers are done with: all, or those up to the last frame before a pause."""
-        start, end = ends
+        block, (start, end) = taken.block, ends
         self._camera.arm(train.n)
         self._stage.arm(train)
         before = self._clock.now()
@@ -182,7 +183,7 @@ class Exposures:
             frame = self._next_frame(tail if stands else wait, until_stop=not stands)
             if frame is not None:
                 wait, silent_at = patience, self._clock.now() + patience
-                if not flight.paused or frame.time + tail <= flight.told:
+                if not flight.paused or frame.time + tail <= flight.stop_sent:
                     yield from flight.enter(frame)
             elif stands:
                 break
@@ -205,23 +206,24 @@ class Exposures:
     def _brake(self, flight: Flight) -> None:
         """Slow down within a train, wait until the stage stands, and ask where."""
         train, limits = flight.train, self._stage.limits
-        flight.told, flight.paused = self._clock.now(), not self._stop.stopping
+        flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
         stand(self._stage, self._clock, self._stop)
         if not flight.paused:
             stood = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
-            flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
+            flight.braking = Braking(flight.stop_sent, stood, counts / abs(train.interval))
 
-    def _one_by_one(self, block: Block, taken: BlockTally) -> Iterator[Exposed]:
+    def _one_by_one(self, taken: BlockTally) -> Iterator[Exposed]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each
         frame its trigger, where the stage was, and whether that was its angle."""
+        block = taken.block
         self._camera.arm(block.n)
         period = max(block.period, self._camera.timing.min_period)
         patience = PATIENCE + block.exposure + self._camera.timing.readout
         position = self._stage.position()
         triggered, silent = -math.inf, 0
         owed, i, tried, stands_at = self._stop.stopping, -1, Counter[int](), math.nan
-        while (after := self._after_pause(i + 1, block, taken)) < block.n:
+        while (after := self._after_pause(i + 1, taken)) < block.n:
             if after <= i or tried[after]:
                 self._arm_anew(block.n - after)
             i, angle = after, float(block.angles[after])
@@ -243,7 +245,7 @@ class Exposures:
             if frame is not None:
                 silent, wrong = 0, ""
                 if math.isfinite(angle):
-                    position, wrong = self._looked_again(angle, position)
+                    position, wrong = looked_again(self._stage, angle, position)
                 yield frame, i, position, not wrong
                 if wrong:
                     tried[i] += 1
@@ -266,19 +268,6 @@ class Exposures:
                 )
             self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()
-
-    def _looked_again(self, angle: float, before: float) -> tuple[float, str]:
-        """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
-        anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
-        moving, after = self._stage.moving(), self._stage.position()
-        wanted, most = self._stage.to_counts(angle), self._stage.limits.tolerance
-        if not moving and all(abs(self._stage.to_counts(place) - wanted) <= most for place in (before, after)):
-            return (before + after) / 2, ""
-        return after, (
-            f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
-            f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
-            f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
-        )
 
     def _until_nobody_moves_it(self) -> None:
         deadline = self._clock.now() + STANDS_WITHIN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from beamline.core.errors import BeamlineError, InstrumentError
@@ -10,6 +11,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds
+from beamline.scan.tally import ASTRAY_ADVICE
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
@@ -57,6 +59,20 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
         if clock.now() > deadline:
             raise InstrumentError(f"{stage.name}: it is still moving after a stop. Use its emergency stop.")
         clock.sleep(POLL)
+
+
+def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
+    """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
+    anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
+    moving, after = stage.moving(), stage.position()
+    wanted, most = stage.to_counts(angle), stage.limits.tolerance
+    if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
+        return (before + after) / 2, ""
+    return after, (
+        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
+        f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
+        f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
+    )
 
 
 def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[], None]) -> None:

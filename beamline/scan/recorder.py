@@ -298,8 +298,11 @@ class Recorder:
 
     def _look_at_backlog(self) -> None:
         if self._flies:
-            waiting = self._waiting.qsize() if self._flying else 0  # other frames wait in `put`
-            hold_for_backlog(self._pause, self._most, waiting, self._checking, self._writing)
+            hold_for_backlog(
+                self._pause, self._most,
+                self._waiting.qsize() if self._flying else 0,  # other frames wait in `put`
+                self._checking, self._writing,
+            )  # fmt: skip
 
     def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...] | None) -> None:
         if flags is None:

@@ -125,8 +125,7 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
 
 def _named(config: Config) -> str:
     """The end of a run folder's name."""
-    energy = config.scan.energy
-    return config.sample.name if energy is None else f"{config.sample.name}_{energy:.7g}keV"
+    return config.sample.name + ("" if config.scan.energy is None else f"_{config.scan.energy:.7g}keV")
 
 
 def _refuse_stop(stop: StopRequest) -> None:
