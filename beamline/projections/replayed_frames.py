@@ -1,7 +1,5 @@
 """Frames of a file, finished or growing, as the monitor gets them from a camera; and what it knows of the scan."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -35,7 +33,7 @@ POLL = 0.1  # s between looks at a growing file
 def frames_of(
     source: ScanSource, *, follow: Clock | None = None, should_stop: Callable[[], bool] = lambda: False
 ) -> Iterator[tuple[Frame, int]]:
-    """Every frame, in the order of the file, and how many the file has so far; arguments and errors as of `replay.replay`.
+    """Every frame, in the order of the file, and how many the file has so far; arguments and errors: see `replay`.
 
     A view that was taken again later has the kind that it had when it came.
     """
