@@ -24,7 +24,8 @@ from beamline.core.stop import StopOnSignal
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
-from beamline.projections.replay import ScanVerdict, awaited, frames_of, replay, verdict
+from beamline.projections.replay import ScanVerdict, replay, verdict
+from beamline.projections.replayed_frames import awaited, frames_of
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file

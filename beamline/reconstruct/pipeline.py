@@ -17,7 +17,7 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections, hold_out
-from beamline.projections.replay import awaited, growing
+from beamline.projections.replayed_frames import awaited, growing
 from beamline.reconstruct.job import (
     Channels,
     Job,

@@ -1,7 +1,5 @@
 """Rules on the order in which frames are stored: bytes of a number, dimensions of a stack, direction of the axis."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
