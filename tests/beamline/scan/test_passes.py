@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,7 +17,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
-from beamline.plan.passes import Choice
+from beamline.plan.passes import Choice, Passes
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, recover_run
@@ -237,6 +238,11 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     assert joined.missing == max(0, missing - 1)
 
 
+def stopped(stop: StopRequest, passes: Passes) -> None:
+    """No choice: the scan is stopped instead."""
+    stop.stop()
+
+
 @pytest.mark.parametrize("mode", ["fly", "step"])
 def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -244,7 +250,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
     words, pass_views, sizes = MODES[mode]
     for folder, ending in (("stopped", nullcontext()), ("died", killed(monkeypatch))):
         stop = StopRequest()
-        with choosing(monkeypatch, lambda passes, stop=stop: stop.stop(), pass_views), ending:  # type: ignore[misc]
+        with choosing(monkeypatch, partial(stopped, stop), pass_views), ending:
             ran = Ran(tmp_path / folder, FakeInstrument(), *WORDS, *words, stop=stop)
         instrument = FakeInstrument()
         instrument.clock.sleep(1e4)
