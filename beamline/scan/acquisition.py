@@ -161,6 +161,8 @@ class Acquisition:
         while True:
             again = passes.done[-1] in passes.done[:-1]
             for block in due:
+                if self._stop.stopping:
+                    return
                 done = RecordedBlock(block, BlockTally(), again)
                 yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(done)
                 self._recover(done.taken.rows)
