@@ -153,6 +153,8 @@ class Acquisition:
         while True:
             again = passes.done[-1] in passes.done[:-1]
             for block in blocks:
+                if self._stop.stopping:
+                    return
                 taken = BlockTally(block, again)
                 yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(taken)
                 self.recovered += recover(self._done, taken.rows)

@@ -170,6 +170,16 @@ def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again
     ran.assert_safe()
 
 
+def test_a_stop_in_the_wide_views_of_one_place_does_not_move_the_sample_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted([Choice.WIDE])):
+        ran = Ran(tmp_path, FakeInstrument(at={FIRST + 3: stop.stop}), *WORDS, *MODES["fly"][0], stop=stop)
+    wide = [frame.trigger for frame in frames_of(ran.folder / "scan.h5") if frame.kind is FrameKind.WIDE_VIEW]
+    assert wide == [VIEWS]
+
+
 CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
 
 
