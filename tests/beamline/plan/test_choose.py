@@ -31,20 +31,20 @@ def seconds_of(block: Block) -> float:
 
 
 def after(timeline: Timeline, n: int, retakes: int = 0) -> Passes:
-    each, wide = pass_blocks(timeline.views, 0), tuple(block for block in timeline.blocks if block.aside)
-    return Passes(each[:n], each[n:], wide, retakes)
+    blocks, wide = pass_blocks(timeline.views, 0), tuple(block for block in timeline.blocks if block.aside)
+    return Passes(blocks[:n], blocks[n:], wide, retakes)
 
 
 def test_options_are_what_is_possible_with_what_each_takes() -> None:
     timeline = scan(wide=5)
-    offered = {one.choice: one for one in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
+    offered = {option.choice: option for option in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
     assert list(offered) == [Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.RETAKE, Choice.ENOUGH]
-    assert [one.frames for one in offered.values()] == [12, 12, 10, 3, 0]
+    assert [option.frames for option in offered.values()] == [12, 12, 10, 3, 0]
     assert offered[Choice.NEXT].dose == pytest.approx(12 / 58) and offered[Choice.WIDE].dose == pytest.approx(10 / 58)
     assert offered[Choice.NEXT].bytes == pytest.approx(12 * timeline.total_bytes / timeline.n_frames, abs=1)
     assert offered[Choice.NEXT].seconds == seconds_of(pass_blocks(timeline.views, 0)[1])
     assert offered[Choice.RETAKE].seconds == pytest.approx(3 / 12 * timeline.retake_seconds)
-    gains = {choice: (one.gain, one.low, one.high) for choice, one in offered.items()}
+    gains = {choice: (option.gain, option.low, option.high) for choice, option in offered.items()}
     assert gains == {
         Choice.NEXT: tuple(vars(LAW.gain(views=12)).values()), Choice.AGAIN: tuple(vars(LAW.gain(again=12)).values()),
         Choice.WIDE: tuple(vars(LAW.gain(wide=True)).values()), Choice.RETAKE: tuple(vars(LAW.gain(views=3)).values()),
@@ -55,14 +55,15 @@ def test_options_are_what_is_possible_with_what_each_takes() -> None:
 def test_what_is_not_possible_is_no_option_and_without_a_law_no_gain_is_known() -> None:
     timeline = scan()
     last = options(after(timeline, 4), LAW, timeline, seconds_of)
-    assert [one.choice for one in last] == [Choice.ENOUGH]
+    assert [option.choice for option in last] == [Choice.ENOUGH]
     unknown = options(after(timeline, 1), None, timeline, seconds_of)
-    assert [one.choice for one in unknown] == [Choice.NEXT, Choice.AGAIN, Choice.ENOUGH]
-    assert [math.isnan(one.gain) for one in unknown] == [True, True, False]
+    assert [option.choice for option in unknown] == [Choice.NEXT, Choice.AGAIN, Choice.ENOUGH]
+    assert [math.isnan(option.gain) for option in unknown] == [True, True, False]
     instrument = FakeInstrument()
     steps = instrument.timeline(10, Mode.STEP)
-    each = pass_blocks(steps.views, 4)  # the last one has two views, so four take too much
-    assert Choice.AGAIN not in {one.choice for one in options(Passes(each[:1], each[1:]), LAW, steps, seconds_of)}
+    blocks = pass_blocks(steps.views, 4)  # the last one has two views, so four take too much
+    offered = options(Passes(blocks[:1], blocks[1:]), LAW, steps, seconds_of)
+    assert Choice.AGAIN not in {option.choice for option in offered}
 
 
 def option(choice: Choice, gain: float, seconds: float = 10.0, off: float = 0.0, dose: float = 0.1) -> PassOption:
@@ -153,9 +154,9 @@ def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
         choices.append(choice)
         if choice is Choice.ENOUGH:
             break
-        one = next(one for one in offered if one.choice is choice)
-        assert one.gain > 0  # nothing that brings nothing is taken before ENOUGH
-        seconds, dose = seconds + one.seconds, dose + one.dose
+        option = next(option for option in offered if option.choice is choice)
+        assert option.gain > 0  # nothing that brings nothing is taken before ENOUGH
+        seconds, dose = seconds + option.seconds, dose + option.dose
         passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
     return choices, passes.n_frames, seconds, dose
 

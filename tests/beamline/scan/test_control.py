@@ -96,9 +96,9 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
-        taken = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
+        event = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
         with (run / "events.jsonl").open("a") as log:
-            log.write(f"{taken.to_json()}\n")
+            log.write(f"{event.to_json()}\n")
         file.put(RunRecord(State.TAXI))
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
@@ -106,8 +106,8 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
         assert list((run / "control").iterdir()) == [] and not chosen
         file.put(RunRecord(State.ASKING))
-        told = CliRunner().invoke(main, ["decide", str(run), "again"])
-        assert (told.exit_code, told.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        taken = CliRunner().invoke(main, ["decide", str(run), "again"])
+        assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
         file.put(RunRecord(State.ASKING))
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr

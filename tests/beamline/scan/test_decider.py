@@ -68,8 +68,8 @@ class Scan:
         """What follows n passes and some that were taken again; the laws come one by one while it waits."""
         self.moments += [partial(self.decide.add_law, each) for each in measured]
         self.waited, self.decide.number = 0, n - 1
-        each = pass_blocks(self.timeline.views, 0)
-        done, to_come = each[: n - again], each[n - again : len(each) - again]
+        blocks = pass_blocks(self.timeline.views, 0)
+        done, to_come = blocks[: n - again], blocks[n - again : len(blocks) - again]
         return self.decide(Passes(done + done[-1:] * again, to_come, (), retakes))
 
     def of(self, name: str) -> list[dict[str, Any]]:
@@ -86,7 +86,7 @@ def test_it_waits_for_the_law_of_these_views_and_says_what_it_chose() -> None:
     (ended,), chosen = scan.of("pass_ended"), scan.chosen
     assert ended["number"] == chosen["number"] == 1 and ended["n_views"] == chosen["n_views"] == 12
     assert ended["recommended"] == chosen["choice"] == "next" and chosen["by"] == "program"
-    assert [one["choice"] for one in ended["options"]] == ["next", "again", "enough"]
+    assert [option["choice"] for option in ended["options"]] == ["next", "again", "enough"]
     assert ended["options"] == chosen["options"] and ended["wait"] == 0 and "remark" not in ended
     assert "dB" in chosen["reason"] and "predicted" not in chosen and scan.waited == 1
     assert json.loads(json.dumps(scan.recorded)) == [chosen | {"predicted": None, "gained": None}]
@@ -148,7 +148,7 @@ def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
     assert scan.after(1) is Choice.NEXT and scan.waited == round(0.5 / PAUSE_POLL)
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no prediction within 0.5 s")
     assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: no prediction within 0.5 s."
-    assert {one["gain"] for one in scan.chosen["options"]} == {None, 0.0}
+    assert {option["gain"] for option in scan.chosen["options"]} == {None, 0.0}
     assert scan.after(3, law(12), law(33, exponent=0.2)) is Choice.ENOUGH  # the first is of an earlier pass, and late
     assert scan.waited == 2
 

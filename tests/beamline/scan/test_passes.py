@@ -82,7 +82,7 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         sets = expected(sizes, chooser.answers)
         frames = frames_of(ran.folder / "scan.h5")
         views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
-        assert [frame.trigger for frame in views] == [trigger for one in sets for trigger in one]
+        assert [frame.trigger for frame in views] == [trigger for triggers in sets for trigger in triggers]
         assert all((frame.trigger >= VIEWS) is (frame.kind is FrameKind.WIDE_VIEW) for frame in views)
         assert len(views) <= VIEWS + WIDE and all(frame.replaces < 0 for frame in frames)
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
@@ -207,7 +207,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
         frames = frames_of(path)
         rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
-        assert [frame.trigger for frame in rows] == [trigger for one in sets for trigger in one]
+        assert [frame.trigger for frame in rows] == [trigger for triggers in sets for trigger in triggers]
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         with h5py.File(path) as file:
             ends, decisions = pass_ends_in(file), decisions_in(file)
@@ -217,7 +217,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         so_far = [sum(frame.index < end for frame in rows) for end in ends]
         assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]
         assert len(ends) in (len(decisions), len(decisions) + 1)
-        assert [one for one in validate(path, lambda done, of: None) if one.severity == "error"] == []
+        assert [finding for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
 
 
 @pytest.mark.parametrize(
@@ -293,13 +293,13 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     assert ran.result.flags == {}
     ingest(path, tmp_path / "copy.h5")
     for file in (path, tmp_path / "copy.h5"):
-        assert [one.message for one in validate(file) if one.severity != "info"] == []
+        assert [finding.message for finding in validate(file) if finding.severity != "info"] == []
         with open_scan(file) as source:
             assert source.pass_ends.tolist() == [13, 21, 25, 33, 41]
             assert [values["choice"] for values in source.decisions] == chooser.answers
             assert usable_views(source, use_flags=True).frames.size == 32
             assert judged_flags(source).flagged.sum() == 0
     out = tmp_path / "volume.h5"
-    said = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])
-    assert said.exit_code == 0, said.output
-    assert [line for line in said.output.splitlines() if "arning" in line or "again" in line] == []
+    made = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])
+    assert made.exit_code == 0, made.output
+    assert [line for line in made.output.splitlines() if "arning" in line or "again" in line] == []
