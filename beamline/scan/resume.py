@@ -87,7 +87,10 @@ class ResumableRun:
         missing = self.planned - len(self.views)
         if self.end_references is not None:
             kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.end_references))
-            return f"Preparing: {self.run} has all {self.planned} views, its missing {kinds} of the end are taken now"
+            all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
+            return f"Preparing: {self.run} has all {all_views}, its missing {kinds} of the end are taken now"
+        if self.choices:  # some views were decided against, or are taken twice
+            return f"Preparing: {self.run} lacks {missing} of the views that it was to take, which are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:

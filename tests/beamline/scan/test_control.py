@@ -2,6 +2,7 @@
 
 import os
 import stat
+import threading
 from pathlib import Path
 
 import pytest
@@ -97,8 +98,12 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     def choose(choice: Choice) -> None:
         chosen.append(choice)
         event = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
-        with (run / "events.jsonl").open("a") as log:
-            log.write(f"{event.to_json()}\n")
+
+        def write() -> None:
+            with (run / "events.jsonl").open("a") as log:
+                log.write(f"{event.to_json()}\n")
+
+        threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
         file.put(RunRecord(State.TAXI))
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
@@ -108,6 +113,8 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         file.put(RunRecord(State.ASKING))
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])
         assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        file.put(RunRecord(State.ASKING))
+        assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
         file.put(RunRecord(State.ASKING))
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr

@@ -243,6 +243,7 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     instrument.clock.sleep(1e4)
     instrument.at = {FIRST: stop.stop}
     with choosing(monkeypatch, Scripted([])), open_for_resume(ran.folder) as series, suppress(ScanStopped):
+        assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
     *_, joined = recover_run(ran.folder)[0]
     assert joined.missing == max(0, missing - 1)
@@ -266,6 +267,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
         instrument.clock.sleep(1e4)
         again = Scripted([Choice.NEXT, Choice.ENOUGH])
         with choosing(monkeypatch, again, pass_views), open_for_resume(ran.folder) as series:
+            assert series.in_words.endswith(f"has {sizes[0]} of 12 views, {12 - sizes[0]} are taken")
             run_scan(series.config, series, instrument=instrument.connected())
         assert [(len(passes.done), len(passes.to_come)) for passes in again.asked] == [
             (1, len(sizes) - 1),
