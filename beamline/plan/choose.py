@@ -105,10 +105,9 @@ def choose(
         return Choice.ENOUGH, next(iter(excesses.values()), "nothing that is left would improve the volume")
     best = max(allowed, key=lambda option: option.gain / option.seconds)
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
-    if best.low / best.seconds <= following.high / following.seconds:
-        best = following
-    return best.choice, (
-        f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f}) in {best.seconds:.0f} s; "
+    taken = following if best.low / best.seconds <= following.high / following.seconds else best
+    return taken.choice, (
+        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; "
         "no other choice is clearly better per second"
     )
 

@@ -48,12 +48,16 @@ class Passes:
 
     def after(self, choice: Choice) -> Passes:
         """The scan at the end of what it chose. Where the last pass cannot be taken again, AGAIN is NEXT."""
-        if choice is Choice.AGAIN and self.may_repeat:
-            return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
-        if choice in (Choice.NEXT, Choice.AGAIN):
-            return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
-        to_come = () if choice is Choice.ENOUGH else self.to_come
-        return self if choice is Choice.RETAKE else replace(self, to_come=to_come, wide=())
+        match choice:
+            case Choice.AGAIN if self.may_repeat:
+                return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
+            case Choice.NEXT | Choice.AGAIN:
+                return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
+            case Choice.WIDE:
+                return replace(self, wide=())
+            case Choice.ENOUGH:
+                return replace(self, to_come=(), wide=())
+        return self  # retakes are of no pass
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:

@@ -126,8 +126,8 @@ class Acquisition:
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            was_taken = any(done.block is block for done in self._done)  # wide views that were chosen
-            if was_taken or (self._stop.stopping and not self._still_needed(block)):
+            # Wide views may be taken already, where they were chosen after a pass.
+            if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
                 continue
             if block.kind is FrameKind.WIDE_VIEW:
                 yield from self._wide(block)

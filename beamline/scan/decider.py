@@ -70,9 +70,8 @@ class Decider:
         """Take a law from the live reconstruction; any thread."""
         self._law = law
         if law.gained is not None:
-            before = law.number - 1
-            predicted = self._chosen.get(before, {}).get("gain")
-            self._outcome = {"predicted": predicted, "gained": law.gained, "judged": before}
+            option = self._chosen.get(law.number - 1, {})
+            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not on offer becomes a warning."""
@@ -95,8 +94,11 @@ class Decider:
             by, (choice, reason) = "program", choose(offered, self.wish, remaining_gain(passes, law), *spent)
         else:
             by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
-            refusal = self._law.reason if self._law.number == self.number else ""
-            reason = self._no_more_laws or refusal or f"no prediction within {self.wait:g} s"
+            reason = (
+                self._no_more_laws
+                or (self._law.reason if self._law.number == self.number else "")
+                or f"no prediction within {self.wait:g} s"
+            )
         asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
         pass_ended = self.number, passes.n_frames // self.timeline.plan.frames_per_view
         rows = [  # an event has None for NaN

@@ -273,9 +273,9 @@ class Measurement:
         if not allowed:
             return (), 0
         recorder.wait()
-        lost, n_planned = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
-        flagged = [view for view in recorder.flagged.views_to_retake if view.trigger < n_planned]  # others: taken again
-        bad = sorted([*flagged, *lost], key=lambda view: view.trigger)
+        flagged = recorder.flagged.views_to_retake
+        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]  # others were taken again
+        bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
 
 

@@ -87,8 +87,8 @@ def measured_law(
         [slab.unseen_power(volume, slab.views, held_out) for volume in volumes],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
-    product = 1.0 if gaps else noise * (1.0 if fall_ratio is None else fall_ratio)
+    # Fewer views than columns leave gaps between them, whose error falls as that by noise does.
+    product = 1.0 if n < geometry.detector_shape[1] else noise * (1.0 if fall_ratio is None else fall_ratio)
     exponent = float(np.interp(product, _NOISE_PRODUCT, (_OTHER_EXPONENT, _NOISE_EXPONENT)))
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0

@@ -129,25 +129,23 @@ class RunServer:
             self._say(f"{verb} from {op.peer()}")
             self._asked.append((pv, op, ask(newest(self._run.runs), verb)))
         except (BeamlineError, OSError) as error:
-            self._refuse(pv, op, error)
+            self._end(pv, op, error)
 
     def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
         """Answer the client of a verb that is done; one that is not yet waits for the next look."""
         try:
             done = asked.state() is not None
         except (BeamlineError, OSError) as error:
-            self._refuse(pv, op, error)
+            self._end(pv, op, error)
             return
         if done:
-            self._end(pv, op, Stamp(self._now()))
+            self._end(pv, op)
         else:
             self._asked.append((pv, op, asked))
 
-    def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
-        self._end(pv, op, Stamp(self._now(), Severity.MAJOR, user_message(error)))
-
-    def _end(self, pv: Any, op: Any, stamp: Stamp) -> None:
-        """Post what a PV held before it was written to, and answer its client."""
+    def _end(self, pv: Any, op: Any, error: Exception | None = None) -> None:
+        """Post what a PV held before it was written to, with the error as its alarm, and answer the client."""
+        stamp = Stamp(self._now(), *(() if error is None else (Severity.MAJOR, user_message(error))))
         pv.post(_posted("" if pv is self._decide else False, stamp))
         op.done(error=stamp.message or None)
 
