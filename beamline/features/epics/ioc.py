@@ -123,7 +123,7 @@ class RunServer:
         self._send(pv, op, lambda: choice_of(self._run.stamped.values, op.value().raw.value))
 
     def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb | Choice]) -> None:
-        """Send a verb to the run at once; `look` answers the client."""
+        """Send a verb, or an answer to what the scan asks, to the run at once; `look` answers the client."""
         try:
             verb = verb_of()
             self._say(f"{verb} from {op.peer()}")
