@@ -12,7 +12,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from beamline.cli.main import main
-from beamline.core.errors import ScanStopped
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
@@ -241,11 +241,12 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     stop, instrument = StopRequest(), FakeInstrument()
     instrument.clock.sleep(1e4)
     instrument.at = {FIRST: stop.stop}
-    with choosing(monkeypatch, Asked([])), open_for_resume(ran.folder) as series, suppress(ScanStopped):
+    going_on = open_for_resume(ran.folder)
+    with choosing(monkeypatch, Asked([])), killed(monkeypatch), going_on as series, suppress(ScanStopped, DataError):
         assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
-    *_, joined = recover_run(ran.folder)[0]
-    assert joined.missing == max(0, missing - 1)
+    _, part, joined = recover_run(ran.folder)[0]
+    assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
