@@ -150,6 +150,16 @@ def test_a_view_without_a_frame_has_one_when_its_pass_is_taken_again(
     assert triggers == [0, 2, 0, 1, *range(3, 9)]
 
 
+def test_the_camera_counts_anew_in_each_pass_also_where_its_first_frame_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 6}")
+    with choosing(monkeypatch, Asked([])):
+        ran = Ran(tmp_path, FakeInstrument(Faults(lost={FIRST + 2})), *WORDS[2:], *words)
+    errors = [one.message for one in validate(ran.folder / "scan.h5") if one.severity == "error"]
+    assert errors == []  # views 1 and 3, of two passes, both are the second frame of their camera's count
+
+
 def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
