@@ -101,7 +101,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     parts = places.data.virtual_sources() if places.data.is_virtual else []
     begin = [part.vspace.get_select_bounds()[0][0] for part in parts]
     new[[row for row in begin if row < new.size]] = True
-    armed = new[1:] & ((steps < 0) | (stamps[1:] == 0))
+    armed = (np.diff(passes) > 0) | (new[1:] & ((steps < 0) | (stamps[1:] == 0)))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))
     if repeated.size:

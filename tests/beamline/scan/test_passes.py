@@ -13,7 +13,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from beamline.cli.main import main
-from beamline.core.errors import ScanStopped
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
@@ -151,6 +151,16 @@ def test_a_view_without_a_frame_has_one_when_its_pass_is_taken_again(
     assert triggers == [0, 2, 0, 1, *range(3, 9)]
 
 
+def test_the_camera_counts_anew_in_each_pass_also_where_its_first_frame_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 6}")
+    with choosing(monkeypatch, Scripted([])):
+        ran = Ran(tmp_path, FakeInstrument(Faults(lost={FIRST + 2})), *WORDS[2:], *words)
+    errors = [one.message for one in validate(ran.folder / "scan.h5") if one.severity == "error"]
+    assert errors == []  # views 1 and 3, of two passes, both are the second frame of their camera's count
+
+
 def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,11 +252,12 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     stop, instrument = StopRequest(), FakeInstrument()
     instrument.clock.sleep(1e4)
     instrument.at = {FIRST: stop.stop}
-    with choosing(monkeypatch, Scripted([])), open_for_resume(ran.folder) as series, suppress(ScanStopped):
+    resumed, chooser = open_for_resume(ran.folder), Scripted([])
+    with choosing(monkeypatch, chooser), killed(monkeypatch), resumed as series, suppress(ScanStopped, DataError):
         assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
-    *_, joined = recover_run(ran.folder)[0]
-    assert joined.missing == max(0, missing - 1)
+    _, part, joined = recover_run(ran.folder)[0]
+    assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))
 
 
 def stopped(stop: StopRequest, passes: Passes) -> None:
