@@ -1,5 +1,7 @@
 """Reads the Gaussians behind a volume from its file."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 

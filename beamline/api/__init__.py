@@ -5,6 +5,8 @@ messages and errors are the same. Importing this package loads neither torch nor
 its modules at its first call.
 """
 
+from __future__ import annotations
+
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -1,5 +1,7 @@
 """The instrument of a script: devices that stay open over many scans, and the results of scans."""
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """Reading, watching and reconstructing a scan file from Python: volumes, figures and verdicts as values."""
 
+from __future__ import annotations
+
 import tempfile
 import time
 from collections.abc import Iterator, Mapping

@@ -5,6 +5,8 @@ angle at which the stage stands. One by a pulse on a cable has none (NaN): only 
 which pulse exposed which frame.
 """
 
+from __future__ import annotations
+
 import asyncio
 import math
 from collections.abc import AsyncIterator

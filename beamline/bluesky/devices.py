@@ -4,6 +4,8 @@ The scan is ours from trigger to file, in a thread: the RunEngine starts it, is 
 waits for its end. So lost frames, a device that fails, and a missing beam are found by the scan, and fail `complete`.
 """
 
+from __future__ import annotations
+
 import asyncio
 import math
 import time

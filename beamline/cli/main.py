@@ -1,5 +1,7 @@
 """The command `beamline`: imports the subcommand in use, maps errors to exit codes, and outlives a closed terminal."""
 
+from __future__ import annotations
+
 import errno
 import os
 import re

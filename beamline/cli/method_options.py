@@ -1,5 +1,7 @@
 """Options of reconstruction methods, and their allowed combinations."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Arguments and options that several commands share: how values are parsed and compared, and what --json prints."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import os

@@ -1,5 +1,7 @@
 """Commands with many options: shown in groups, kept as recipes, and repeated by a command line."""
 
+from __future__ import annotations
+
 import json
 import os
 import re

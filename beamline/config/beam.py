@@ -1,5 +1,7 @@
 """Configuration of what stands in the beam: its monitor, shutters, the monochromator, and devices with named places."""
 
+from __future__ import annotations
+
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,5 +1,7 @@
 """Configuration of the devices: stage, camera, shutter, beam monitor and what moves in the beam, real or simulated."""
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, Union
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator

@@ -1,5 +1,7 @@
 """Configuration: a YAML file, BEAMLINE_* variables and --set overrides make one frozen Config, or a clear refusal."""
 
+from __future__ import annotations
+
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,5 +1,7 @@
 """Configuration models: every key a configuration file may hold, its unit, its legal values and its default."""
 
+from __future__ import annotations
+
 import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 

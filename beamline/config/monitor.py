@@ -4,6 +4,8 @@ The keys of limits are the fields of the checks in the registry, and of `Referen
 registry can be configured without an edit here.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints

@@ -1,5 +1,7 @@
 """Rehearsal: the configuration of a real instrument with the simulated counterpart of each of its devices."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Section: a frozen group of configuration keys, some of them declared by a driver's settings with `key`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from enum import StrEnum

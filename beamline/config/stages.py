@@ -4,6 +4,8 @@ Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with t
 folder says.
 """
 
+from __future__ import annotations
+
 import json
 import re
 from collections.abc import Mapping

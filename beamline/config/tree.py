@@ -3,6 +3,8 @@
 Faults are pydantic's findings with file and line, the key, its value and the legal values.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass

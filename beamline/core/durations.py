@@ -1,5 +1,7 @@
 """Durations: the time that is left, and the phases of a long work."""
 
+from __future__ import annotations
+
 import math
 
 from beamline.core.events import PhaseReached, Sink

@@ -1,5 +1,7 @@
 """Errors with exit codes: each class says which part failed and whether data are safe. A defect leaves a traceback."""
 
+from __future__ import annotations
+
 import errno
 import os
 import sys

@@ -1,5 +1,7 @@
 """Files: only regular ones are read; a file is written whole or not at all, and replaces none unless asked."""
 
+from __future__ import annotations
+
 import codecs
 import errno
 import math

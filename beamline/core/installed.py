@@ -1,5 +1,7 @@
 """What is installed: the version, the configurations and scenes of the package, and modules by the names of ours."""
 
+from __future__ import annotations
+
 import os
 import sys
 from importlib import metadata

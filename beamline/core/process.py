@@ -1,5 +1,7 @@
 """Child processes: each starts in its own process group, is read line by line, and ended in time."""
 
+from __future__ import annotations
+
 import json
 import math
 import os

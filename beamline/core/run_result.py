@@ -1,5 +1,7 @@
 """The result of a scan, for its caller and for the events `scan_done` and `done`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Sinks of events: JSON lines, sentences for people, several sinks as one, warnings, a thread that passes events on."""
 
+from __future__ import annotations
+
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,5 +1,7 @@
 """Text for people: angles, sizes, numbers of things, index ranges."""
 
+from __future__ import annotations
+
 import csv
 import io
 import math

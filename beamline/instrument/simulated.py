@@ -3,6 +3,8 @@
 It is imported where it is needed, so that an instrument loads no simulator.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack

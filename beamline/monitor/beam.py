@@ -6,6 +6,8 @@ each time it has doubled. A dip is judged by the change from view to view
 these would sum up to a dip. A change counts only where the light of the whole view moved with it.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar

@@ -4,6 +4,8 @@ A check is a frozen dataclass whose fields are its limits; `beamline.monitor.che
 frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import Field, dataclass
 from enum import StrEnum

@@ -4,6 +4,8 @@ Adding a check takes its file in this folder and its line in REGISTRY, or in CHE
 the configuration, its bits and the legend in a scan file, and its name in `beamline info` follow.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from importlib import import_module

@@ -4,6 +4,8 @@ The total of a parallel projection is equal from every side, unless matter enter
 the consistency conditions of Helgason (1965) and Ludwig (1966).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -4,6 +4,8 @@ Noise never repeats, so an equal checksum is a frame that was delivered again. O
 default.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Annotated, ClassVar

@@ -5,6 +5,8 @@ degrees; the view half a turn later, mirrored, or a full turn later, is laid on 
 shift since. The remainder is stated as the shift of the whole sample that would leave as much.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar

@@ -3,6 +3,8 @@
 Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple

@@ -1,5 +1,7 @@
 """Monitor: all checks together. It takes frames and returns flags; its state is a value."""
 
+from __future__ import annotations
+
 import math
 import threading
 from collections.abc import Callable, Sequence

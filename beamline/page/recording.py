@@ -1,5 +1,7 @@
 """Recording: the page's data from a scan file, also from a growing one. All calls come from one thread (HDF5)."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """The watched run folder or scan file: its events, and one thread that reads HDF5."""
 
+from __future__ import annotations
+
 import shutil
 import threading
 import time

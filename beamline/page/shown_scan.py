@@ -1,5 +1,7 @@
 """ShownScan: a scan in any format on the page: its views over flats as a stack, means, and one slice for any axis."""
 
+from __future__ import annotations
+
 import math
 from contextlib import suppress
 from dataclasses import replace

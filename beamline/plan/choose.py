@@ -1,5 +1,7 @@
 """Choose: what can be measured after a pass, what each choice costs and would bring, and which one a wish asks for."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """ScanPlan: the planned scan as a value, and its angles by each scheme; its timeline gives times, speeds and bytes."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

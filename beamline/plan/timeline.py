@@ -6,6 +6,8 @@ to reach that speed (`taxi_angle`) and goes as far beyond the last. Several pass
 full speed between them.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

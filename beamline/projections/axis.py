@@ -1,5 +1,7 @@
 """The rotation axis of a scan: given, found by its views, or stated by the file."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """Consistency: laws that hold for all views of a sample at rest, and light that matches its flats."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

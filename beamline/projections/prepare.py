@@ -1,5 +1,7 @@
 """Preparation of a scan: line integrals and their geometry; only the views and rows asked for are ever held."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Statistics of the counts of a scan as they are stored: by kind of frame, before any correction."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """The tilt of the rotation axis that corrected views show, and the warning where nobody stated it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 

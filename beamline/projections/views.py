@@ -1,5 +1,7 @@
 """The views of a scan: which may be used, and their geometry as stated and with what corrections find out."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 

@@ -1,5 +1,7 @@
 """Reconstruction within a time: choose method and settings by what they take on this machine, and end in time."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

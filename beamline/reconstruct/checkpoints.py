@@ -1,5 +1,7 @@
 """Checkpoints of a fit: keeps its state with its origin, and checks the origin before a fit resumes."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,5 +1,7 @@
 """Estimate of a reconstruction before it begins: memory, time, and bytes on disk."""
 
+from __future__ import annotations
+
 import shutil
 import time
 from collections.abc import Sequence

@@ -1,5 +1,7 @@
 """Followed views: which frames of a growing file are views, their geometry, and how far the fit has come with them."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from enum import Enum, auto

@@ -1,5 +1,7 @@
 """Job: views from a source, and the volume that is made of them: at once, in slabs or within a budget."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace

@@ -8,6 +8,8 @@ Each look at the file goes as far as it can: with the first view it may pass two
 how far the fit has come in the file.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

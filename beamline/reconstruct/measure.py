@@ -1,5 +1,7 @@
 """Measures a volume: against a truth if there is one, and always against the data and its own background."""
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence

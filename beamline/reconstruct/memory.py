@@ -1,5 +1,7 @@
 """The memory of a reconstruction, at once and in slabs, what is refused because of it, and workers elsewhere."""
 
+from __future__ import annotations
+
 import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace

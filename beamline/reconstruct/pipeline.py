@@ -1,6 +1,8 @@
 """The pipeline: from options to a volume with its report. What differs is the source of views: a file that is whole, or
 one that grows."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress

@@ -3,6 +3,8 @@
 A run follows the plan that its dry run states.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Delivery: a volume becomes a file, and then a report with its figures of merit."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """The content of the report on a reconstruction: scan, settings, figures of merit, pictures."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
 

@@ -1,5 +1,7 @@
 """Run a method on prepared views, as every command does that makes a volume; its time and its error bars."""
 
+from __future__ import annotations
+
 import math
 import time
 import warnings

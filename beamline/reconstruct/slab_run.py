@@ -1,5 +1,7 @@
 """The slabs of a volume, one after the other, into a partial volume, which a later call may go on with."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait

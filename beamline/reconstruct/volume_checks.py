@@ -1,5 +1,7 @@
 """Checks a volume before its delivery: figures of merit, FBP beside it, and warnings of what it may hide or invent."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

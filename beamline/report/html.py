@@ -1,5 +1,7 @@
 """HTML pages from the templates in this folder. A page is one file and requests nothing from the network."""
 
+from __future__ import annotations
+
 import base64
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

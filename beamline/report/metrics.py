@@ -1,5 +1,7 @@
 """Figures of merit as people read them: label, unit, digits, and which direction is better if any is."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Scene files, shipped or of a user, and the truth of their samples: attenuation and labels on a grid."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

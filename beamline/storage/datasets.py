@@ -1,5 +1,7 @@
 """Text, units, links and frames, in any order, of an open HDF5 file."""
 
+from __future__ import annotations
+
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping

@@ -1,5 +1,7 @@
 """Files on a disk: under HDF5 for its driver `fileobj`, scratch arrays without a name, and fsync in a thread."""
 
+from __future__ import annotations
+
 import errno
 import os
 import shutil

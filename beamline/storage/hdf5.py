@@ -1,5 +1,7 @@
 """Opening and writing HDF5 files that may be growing, locked or damaged, and why one cannot be read."""
 
+from __future__ import annotations
+
 import errno
 import os
 import re

@@ -3,6 +3,8 @@
 Every command that meets such a run says the same, by `next_step`.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress

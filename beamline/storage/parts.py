@@ -5,6 +5,8 @@ holds no frame itself, so it can be made again at any time. The files with the f
 records name and number of frames of each part, so that a reader can check that it has all parts.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress

@@ -1,5 +1,7 @@
 """PoseTable: displacement, roll and tilt of each view, or its vectors, from a CSV, .npz, a volume or an NXtomo file."""
 
+from __future__ import annotations
+
 import csv
 import re
 import zipfile

@@ -1,5 +1,7 @@
 """ReconRecord: the record of a volume, the same in its file, in the event `done` and in scripts."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

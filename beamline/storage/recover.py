@@ -4,6 +4,8 @@ The frames are copied to a new file, which takes the place of the old one once i
 copy leaves the old file as it was.
 """
 
+from __future__ import annotations
+
 import shutil
 import time
 from collections.abc import Callable

@@ -5,6 +5,8 @@ The process of a part holds a lock on the part's configuration as long as it liv
 system drops it with the process. A process that recovers a run or goes on with it holds one on the run's events.
 """
 
+from __future__ import annotations
+
 import json
 import time
 from contextlib import suppress

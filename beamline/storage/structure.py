@@ -6,6 +6,8 @@ Functions on shape, type and place of voxels raise ValueError, which the reader 
 the path.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import re

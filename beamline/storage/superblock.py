@@ -10,6 +10,8 @@ signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of fi
 little-endian.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 

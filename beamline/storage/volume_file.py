@@ -1,5 +1,7 @@
 """Volume file: a volume [z, y, x] read from TIFF (a file, or a folder of slices), NumPy, NIfTI, HDF5 or Zarr."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from types import MappingProxyType

@@ -7,6 +7,8 @@ class TestMine(ReaderConformance):
     def frames(self) -> NDArray[Any]: ...            # its pixels [frame, row, col]
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args

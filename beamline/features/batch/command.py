@@ -1,5 +1,7 @@
 """`beamline batch`: reconstructs many scans by one recipe, and keeps a table of them."""
 
+from __future__ import annotations
+
 import csv
 import itertools
 import os

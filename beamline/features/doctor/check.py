@@ -1,5 +1,7 @@
 """Check: the result of one check of the doctor: verdict, what was observed, what was expected, what to do."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum

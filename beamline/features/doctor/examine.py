@@ -1,5 +1,7 @@
 """Runs all checks of the instrument's computer that a configuration needs, one after the other."""
 
+from __future__ import annotations
+
 import math
 import os
 import shutil

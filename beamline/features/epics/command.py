@@ -1,5 +1,7 @@
 """`beamline ioc`: the running scan as EPICS process variables."""
 
+from __future__ import annotations
+
 import time
 from contextlib import closing, suppress
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Process variables of the newest run of a folder, by PVAccess (p4p); with --control it takes verbs and answers."""
 
+from __future__ import annotations
+
 import math
 import time
 from collections import deque

@@ -5,6 +5,8 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 `splatline_float_projections`, so that they do not count as counts; open_scan reads both.
 """
 
+from __future__ import annotations
+
 import json
 import time
 from collections.abc import Callable, Iterator

@@ -1,5 +1,7 @@
 """How an NXtomo must be written down (NeXus definitions 2026.01 and what its readers need), one function a rule."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from typing import Any
 

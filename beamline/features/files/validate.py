@@ -3,6 +3,8 @@
 The rules of storage.rules look at a scan of any format; the ones of `nexus` at how an NXtomo is written down.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress

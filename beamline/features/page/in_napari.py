@@ -1,5 +1,7 @@
 """Volumes, labels and Gaussians in napari, each in its place and unit."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib import import_module

@@ -3,6 +3,8 @@
 The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
 """
 
+from __future__ import annotations
+
 import asyncio
 import ipaddress
 import secrets

@@ -1,5 +1,7 @@
 """A volume file in; labels, a table of particles and a picture out."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace

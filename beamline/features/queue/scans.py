@@ -1,5 +1,7 @@
 """`beamline scan` of several configurations, or of a table of them."""
 
+from __future__ import annotations
+
 import csv
 import io
 import sys

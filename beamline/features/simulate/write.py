@@ -1,5 +1,7 @@
 """Writes the scan of a scene into a file like an instrument's, frame by frame; the steps of a frame; an overview."""
 
+from __future__ import annotations
+
 import json
 import math
 import shutil

@@ -1,5 +1,7 @@
 """Sweep: the same slice with each value of one or two options, and how well each volume predicts views held out."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce

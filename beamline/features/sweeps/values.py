@@ -1,5 +1,7 @@
 """Swept options: NAME=A:B:STEP or NAME=a,b,c as values, and all their combinations."""
 
+from __future__ import annotations
+
 import itertools
 import re
 from collections.abc import Collection, Mapping, Sequence

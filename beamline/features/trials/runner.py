@@ -1,5 +1,7 @@
 """Runner: reads the scan once, runs each trial in a separate process within the time limit, writes the table."""
 
+from __future__ import annotations
+
 import math
 import sys
 import time

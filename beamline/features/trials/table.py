@@ -1,5 +1,7 @@
 """A table of trials as text, CSV, pictures and a page, and what follows from it in sentences."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise

@@ -3,6 +3,8 @@
 The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain

@@ -1,5 +1,7 @@
 """The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Align: a pair of views half a turn apart before a scan: where the axis is, how it leans, and how sharp views are."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

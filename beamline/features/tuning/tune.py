@@ -5,6 +5,8 @@ ch. 5): variance of the light over its mean. The noise of a line integral p = ln
 sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -8,6 +8,8 @@ nothing on average, however few the photons; edges go on. The light's level and 
 Edges that are sharper than any blur leaves them, with rims brighter than the open beam, are looked for once.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar

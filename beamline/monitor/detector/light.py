@@ -1,5 +1,7 @@
 """Steps of the light, or of the camera's gain, between two views; and bright spots that only one view has."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar

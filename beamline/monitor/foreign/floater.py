@@ -5,6 +5,8 @@ a sinusoid about the axis, no farther from it than the sample reaches. A crumb a
 textures of the sample, which may lie on a line by chance, do not.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar

@@ -5,6 +5,8 @@ mean of all rows on broad columns, for a hump as broad as a part of the field. I
 noise. In the mean of thousands of pixels they are a hundred times its noise.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

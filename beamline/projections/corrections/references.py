@@ -1,5 +1,7 @@
 """References: which darks and flats are used, and the open beam of each view that they give."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """Reads meshes, STL, PLY or OBJ by the suffix, from text or binary."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 from typing import Any

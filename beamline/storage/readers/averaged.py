@@ -1,5 +1,7 @@
 """Scans whose views are means of several frames."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

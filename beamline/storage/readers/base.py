@@ -1,5 +1,7 @@
 """ScanSource: a scan of any file format; a format adds a subclass, and a ScanFormat for the registry."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Scans as Data Exchange: the /exchange group (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224)."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -4,6 +4,8 @@
 and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

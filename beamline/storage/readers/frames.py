@@ -1,5 +1,7 @@
 """Frames: a scan made of the frames of others, such as its parts, or what comes before them; with changed pixels."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any

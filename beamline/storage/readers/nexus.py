@@ -1,6 +1,8 @@
 """What NeXus files state, and where: the detector with frames and image keys, angles, pixels, energy, a cone beam, and
 mirrored frames."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

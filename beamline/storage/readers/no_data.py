@@ -1,5 +1,7 @@
 """Detectors of several modules: pixels in the gaps hold a mark instead of counts, and photon counters have no dark."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """open_scan: a scan in any format of the registry, recognised by what is in it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass

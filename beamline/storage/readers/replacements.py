@@ -3,6 +3,8 @@
 Darks and flats are an array, TIFFs, or an HDF5 file of their own, as httomo, i12 and Savu have.
 """
 
+from __future__ import annotations
+
 import re
 import shlex
 from collections.abc import Iterator

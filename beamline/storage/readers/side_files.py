@@ -4,6 +4,8 @@ Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON a
 public readers use (TIGRE, CIL). A key that is not there is not guessed.
 """
 
+from __future__ import annotations
+
 import configparser
 import json
 import re

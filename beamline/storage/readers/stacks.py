@@ -4,6 +4,8 @@ Such a layout does not say when the references were taken: the frames are number
 projections.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Scans that are read otherwise than they are stored: some columns, other kinds or types, or the frames of several."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

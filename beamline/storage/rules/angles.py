@@ -1,5 +1,7 @@
 """Stated angles: every view has one, they are degrees, and together they go round half a turn."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Angles that views show: views that see the same rays by the stated angles look the same, and no others do."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

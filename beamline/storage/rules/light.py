@@ -1,5 +1,7 @@
 """Light: views and references must be of one light, and each view of one scale; what else explains their counts."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 

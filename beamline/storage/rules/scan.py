@@ -1,5 +1,7 @@
 """Conditions for trust in a scan of any format, one function a rule. Public validators accept NaN angles, not these."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 
 from beamline.core.files import run_of

@@ -1,5 +1,7 @@
 """Treatment: how a reconstruction uses views by their flags, in the words of every command; and flags as a finding."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """The interface of a format of volume files, the conversion of voxels to grey values, and the facts beside them."""
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Iterator, Mapping

@@ -1,5 +1,7 @@
 """The formats of volume files, by the suffix of a name; writing one as a whole, and opening one slice by slice."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 from collections.abc import Iterator

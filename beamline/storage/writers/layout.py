@@ -26,6 +26,8 @@ programs (nabu) take a file for one of another kind, or leave out its darks and 
 data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field

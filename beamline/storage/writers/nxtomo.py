@@ -5,6 +5,8 @@ the death of this process. Every second they are brought to the disk (fsync), wh
 `frames_committed` is advanced last, so that it never counts half a row.
 """
 
+from __future__ import annotations
+
 import errno
 import json
 import os

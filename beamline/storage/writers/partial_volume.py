@@ -5,6 +5,8 @@ its structure changes later. Slices that two slabs share are kept beside while o
 added by half is taken out again when the file is opened.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,6 +3,8 @@
 Checkpoints hold a fit's state and what it was made from; each whole, in place of the one before.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager

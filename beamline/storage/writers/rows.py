@@ -6,6 +6,8 @@ J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, col] and 
 without a copy.
 """
 
+from __future__ import annotations
+
 import math
 import shutil
 import zlib

@@ -4,6 +4,8 @@ Each frame is a chunk, compressed by itself; everything else is copied unchanged
 others (a joined scan) become frames of the archive.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import sys

@@ -1,5 +1,7 @@
 """`beamline archive`: compresses a scan file, and compares the copy with it."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import click

@@ -1,5 +1,7 @@
 """Processes on this machine or on others that reconstruct slabs, by dask.distributed."""
 
+from __future__ import annotations
+
 import logging
 import os
 from collections.abc import Iterator

@@ -1,5 +1,7 @@
 """`beamline emission`: simulates the counts of a sample that emits, and reconstructs its activity."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

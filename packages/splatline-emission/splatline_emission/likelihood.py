@@ -1,5 +1,7 @@
 """MLEM and OSEM: the activity of highest Poisson likelihood."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator
 from itertools import islice

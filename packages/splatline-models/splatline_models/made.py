@@ -1,5 +1,7 @@
 """Voxels of any grid and views of the Gaussians behind a volume, and the surface of a volume."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

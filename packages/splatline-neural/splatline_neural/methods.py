@@ -7,6 +7,8 @@ that has a weight (published: pixels above zero; what only rays through air meet
 The density begins at the mean of the box (published: at half of the highest, where a high rate ends at zero).
 """
 
+from __future__ import annotations
+
 import math
 import warnings
 from abc import ABC, abstractmethod

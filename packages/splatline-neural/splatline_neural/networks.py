@@ -3,6 +3,8 @@
 All take points [line, sample, 3] in 0..1 of the field's box and give density [line, sample] in the field's unit.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Contrast: of a region against its surroundings in a radiograph, its curve over energies, and the edge in it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

@@ -1,5 +1,7 @@
 """`beamline materials`: a volume of each material, from scans at several energies."""
 
+from __future__ import annotations
+
 import csv
 import math
 from collections.abc import Callable, Sequence

@@ -1,5 +1,7 @@
 """Measured: energies with absorption or radiographs, of a text table, an HDF5 file or a series of scans."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -4,6 +4,8 @@ Tabulated edges are those of free atoms in xraylib (Schoonjans et al., Spectroch
 a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 eV above the K edge of nickel.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,5 +1,7 @@
 """`beamline tango`: the running scan as a Tango device."""
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """The Tango device of a run, and what clients may ask the scan for."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
 from contextlib import closing

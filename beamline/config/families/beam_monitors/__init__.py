@@ -1,5 +1,7 @@
 """The section of each kind of beam monitor, and how its driver is connected."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 

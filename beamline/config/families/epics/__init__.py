@@ -1,5 +1,7 @@
 """Configuration of devices behind EPICS process variables, each as pva://NAME or ca://NAME."""
 
+from __future__ import annotations
+
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator

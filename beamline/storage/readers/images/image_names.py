@@ -1,5 +1,7 @@
 """Names of image files: the kind of each frame, and its place by numbers and angles."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

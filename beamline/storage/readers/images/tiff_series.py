@@ -5,6 +5,8 @@ order of the numbers in their names, never of a listing. Files are read one at a
 the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
 """
 
+from __future__ import annotations
+
 import errno
 import io
 import math

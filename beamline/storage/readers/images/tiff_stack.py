@@ -1,5 +1,7 @@
 """TIFF stacks: one file with a page for each frame, read page by page, so that memory does not grow with the scan."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

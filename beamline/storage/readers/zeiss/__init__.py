@@ -5,6 +5,8 @@ with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide
 dark, which the instrument has subtracted. Images are as they are stored.
 """
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import Any

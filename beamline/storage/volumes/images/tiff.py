@@ -1,5 +1,7 @@
 """TIFF: all slices in one file, or a folder with a file for each."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -3,6 +3,8 @@
 The axes and scales are those of ngff.openmicroscopy.org/0.5; zarr, the format's library, writes and reads the arrays.
 """
 
+from __future__ import annotations
+
 import itertools
 import json
 from collections.abc import Iterator
