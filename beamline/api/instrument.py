@@ -13,7 +13,8 @@ from typing import Any, Self
 from beamline.config.beam import NoMonochromator
 from beamline.config.load import NO_DECISIONS, NO_LIVE, Config, changed, load, override_of
 from beamline.core.errors import ConfigError, refuse_wrong_arguments
-from beamline.core.events import Event, ReconDone, RunDone, ScanDone
+from beamline.core.events import Event, RunDone, ScanDone
+from beamline.core.recon_events import ReconDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals

@@ -56,7 +56,7 @@ def _send(run: Path | None, word: str) -> None:
 
 def _require_chosen(run: Path, choice: str) -> None:
     """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
-    from beamline.core.events import event_in
+    from beamline.core.event_lines import event_in
     from beamline.core.files import EVENTS, parts_of
 
     last: Mapping[str, Any] = {}
@@ -67,8 +67,8 @@ def _require_chosen(run: Path, choice: str) -> None:
         if last.get("choice") == choice:
             return
         time.sleep(0.1)
-    taken = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing"
-    raise ConfigError(f"the scan in {run} does not take {choice}, which was not on offer or came too late; {taken}.")
+    instead = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing so far"
+    raise ConfigError(f"the scan in {run} does not take {choice}, which was not on offer or came too late; {instead}.")
 
 
 @click.command()

@@ -134,8 +134,8 @@ class Block:
         return int(self.angles.size)
 
     @property
-    def left(self) -> int:
-        """Number of frames still to take."""
+    def n_to_take(self) -> int:
+        """Frames still to take."""
         return self.n - len(self.stored)
 
 
@@ -154,7 +154,7 @@ class Timeline:
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
-        plan: that it is computed of.
+        plan: that it is computed from.
         retake_seconds: for the most views that may be taken again.
     """
 
@@ -173,12 +173,12 @@ class Timeline:
 
     @property
     def n_frames(self) -> int:
-        return sum(block.left for block in self.blocks)
+        return sum(block.n_to_take for block in self.blocks)
 
     @property
     def first_rows(self) -> list[int]:
         """File row of the first frame of each block."""
-        return [0, *accumulate(block.left for block in self.blocks[:-1])]
+        return [0, *accumulate(block.n_to_take for block in self.blocks[:-1])]
 
     @property
     def views(self) -> Block:

@@ -101,7 +101,7 @@ class DryRun:
             "min_period": self.camera.min_period,
             "energies": [need._asdict() for need in self.energies],
             "blocks": [
-                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.left}
+                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.n_to_take}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
             ],
         }

@@ -202,7 +202,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
         wide, end_references = _wide_stored(each, choices), None if missing else end_references_missing(each)
     if not missing and not end_references:
         _refuse_whole(run, parts, closed)
-    last, seconds = max(float(each.max()) for each in times), sum(float(np.ptp(each)) for each in times)
+    last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
         end_references, wide, choices, due, seconds,

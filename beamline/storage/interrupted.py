@@ -146,24 +146,24 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
         files: all of the scan, in the order that they were taken in, or the one that joins them.
 
     Returns:
-        their triggers, counted from 0, without those that it decided against, and with those of a pass that is there
-        once and was being taken again; what it chose after each pass that ended, where it says nothing the plan; and
-        whether the last one ended without a choice or a view after it.
+        The triggers of these views, counted from 0: not those that the scan decided against, but those of a pass that
+        it was taking again. What it chose after each pass that ended, `Choice.NEXT` where the files do not say. Whether
+        a choice is due: the last pass has ended, and neither a choice nor a view follows.
     """
-    views, since, chosen, ended = set[int](), set[int](), dict[str, str](), 0
+    views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
         ends, taken = pass_ends_in(file), views_in(file)
-        since = {*views_in(file, int(ends[-1]))} if ends.size else since | taken
-        views, ended = views | taken, ended + ends.size
-        chosen |= {str(each.get("number")): each["choice"] for each in decisions_in(file) if "choice" in each}
+        since_pass_end = {*views_in(file, int(ends[-1]))} if ends.size else since_pass_end | taken
+        views, n_ended = views | taken, n_ended + ends.size
+        chosen |= {str(values.get("number")): values["choice"] for values in decisions_in(file) if "choice" in values}
     if layout.PASS_ENDS not in files[0]:
         return frozenset(range(views_planned(files[0]) or 0)) - views, (), False
-    due = str(ended) not in chosen and ended > 0 and not since
-    choices = tuple(chosen.get(str(number), Choice.NEXT) for number in range(1, ended + 1 - due))
+    due = str(n_ended) not in chosen and n_ended > 0 and not since_pass_end
+    choices = tuple(chosen.get(str(number), Choice.NEXT) for number in range(1, n_ended + 1 - due))
     passes = _passes_of(plan_in(files[0]), choices)
     missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
     if choices[-1:] == (Choice.AGAIN,) and not due:
-        missing |= triggers_to_take(passes.done[-1]) - since
+        missing |= triggers_to_take(passes.done[-1]) - since_pass_end
     return missing, choices, due
 
 
@@ -172,6 +172,6 @@ def _passes_of(plan: Mapping[str, Any], choices: Iterable[str]) -> Passes:
     angles = np.radians(plan["angles_deg"])
     steps = np.diff(angles)
     turns = np.flatnonzero(steps * steps[:1] < 0)  # where a fly scan begins its next sweep
-    of_sweep = int(turns[0]) + 1 if turns.size else 0
-    size = plan.get("pass_views", 0) * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else of_sweep
+    sweep = int(turns[0]) + 1 if turns.size else 0
+    size = plan.get("pass_views", 0) * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else sweep
     return passes_at_start(Block(FrameKind.PROJECTION, Mode.STEP, 0, angles, 0.0, 0.0), size, choices)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LARGEST_LOG, LONGEST
+from beamline.core.event_lines import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
@@ -72,7 +72,7 @@ def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass: values of the event `next_chosen`, likewise."""
+    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty likewise."""
     return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
 
 

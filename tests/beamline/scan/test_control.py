@@ -97,11 +97,11 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
-        taken = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
+        event = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
 
         def write() -> None:
             with (run / "events.jsonl").open("a") as log:
-                log.write(f"{taken.to_json()}\n")
+                log.write(f"{event.to_json()}\n")
 
         threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
         file.put(RunRecord(State.TAXI))
@@ -111,8 +111,8 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
         assert list((run / "control").iterdir()) == [] and not chosen
         file.put(RunRecord(State.ASKING))
-        told = CliRunner().invoke(main, ["decide", str(run), "again"])
-        assert (told.exit_code, told.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        taken = CliRunner().invoke(main, ["decide", str(run), "again"])
+        assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
         file.put(RunRecord(State.ASKING))
         assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
         file.put(RunRecord(State.ASKING))
