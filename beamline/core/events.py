@@ -184,10 +184,10 @@ class PassEnded(Event, event="pass_ended"):
     Attributes:
         number: of the pass, from 1; n_views: so far.
         options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
-            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known yet).
+            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known).
         recommended: the choice that the program takes or would take.
         wait: real s for which the operator is asked; 0: nobody is.
-        remark: a sentence, where no prediction is there.
+        remark: a sentence on why no gain is known; "" where they are.
     """
 
     number: int
@@ -206,9 +206,9 @@ class NextChosen(Event, event="next_chosen"):
         choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
         reason: a sentence.
         options: as of `PassEnded`.
-        predicted, gained: dB by an earlier choice, the newest that a law has judged since the last event, as predicted
-            then and as measured now; None: not known.
-        judged: number of the pass after which that choice was made.
+        predicted, gained: dB by an earlier choice, as predicted then and as measured now: the newest choice that a law
+            has judged since the event before; None: not known.
+        judged: number of the pass after which that earlier choice was made.
     """
 
     number: int

@@ -34,14 +34,14 @@ class SlicesDrawn(Event, event="slices"):
 
 
 class LawMeasured(Event, event="error_law"):
-    """How the error of the volume falls with further views, by the live reconstruction at the end of a pass.
+    """The law of the error (`recon.base.error_law`) as the live reconstruction measured it at the end of a pass.
 
     Attributes:
         number: of the pass, from 1.
-        n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`, of the views that the
-            live reconstruction uses.
-        gained: dB by the last pass, as views held out measure it; None: not known.
-        reason: why these views have no law; then the other numbers are NaN.
+        n_views: those that the live reconstruction used.
+        exponent, exponent_error, noise, offset: as of `ErrorLaw`.
+        gained: dB that the volume gained by this pass, as views held out measure it; None: not known.
+        reason: why these views have no law; then the numbers of the law are NaN.
     """
 
     number: int

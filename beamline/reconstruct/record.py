@@ -296,7 +296,7 @@ def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
 
 
 def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
-    """How the axis was checked, from the parameters of a reconstruction; None if the user gave it."""
+    """How the axis was found, from the parameters of a reconstruction; None if the user gave it."""
     if "axis_curve" not in parameters:
         return None
     return AxisEstimate(

@@ -122,7 +122,7 @@ class LiveReconstruction:
         low_priority: a scan beside it takes precedence.
 
     Attributes:
-        ended: it could not be started, or has ended in the scan and is not started again.
+        ended: no law will come: it could not be started, or has ended in the scan and is not started again.
     """
 
     def __init__(

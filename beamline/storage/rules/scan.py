@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
+from beamline.plan.passes import Choice
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource
@@ -31,6 +32,8 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
     elif ending.status in ("stopped", "failed"):
         planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
+        if any(each.get("choice") == Choice.ENOUGH for each in source.decisions):
+            of_plan += "; it had decided against the others"
         sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         return
