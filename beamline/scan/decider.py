@@ -167,11 +167,12 @@ class Decider:
 
     def _ask(self, recommended: Choice, offered: Sequence[PassOption]) -> tuple[str, Choice, str]:
         """Who chose, what, and why: the operator, or the plan where there is no answer in time."""
+        messages = iter([""])  # none when it asks for the first time
 
         def answered() -> bool:
             if self.states.state is not State.ASKING:  # at first, and after a pause
                 self.close_shutter()
-                self.states.enter(State.ASKING)
+                self.states.enter(State.ASKING, next(messages, "The scan asks again what to measure next"))
             return self._answer is not None
 
         self.wait_a_moment()  # earlier input does not count
