@@ -3,6 +3,8 @@
 One index is one row of the file, darks and flats included. A trigger without a frame is no index.
 """
 
+from __future__ import annotations
+
 import json
 import socket
 import time

@@ -1,5 +1,7 @@
 """Lines of events from another process, or of a log: the event, or its values alone."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from contextlib import suppress

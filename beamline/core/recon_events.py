@@ -1,5 +1,7 @@
 """Events of a reconstruction, of one that follows a scan, and of trials of reconstructions."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

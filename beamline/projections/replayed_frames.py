@@ -1,5 +1,7 @@
 """Frames of a file, finished or growing, as the monitor gets them from a camera; and what it knows of the scan."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """Warnings of a scan while it is prepared: odd units, joined views, another axis, matter beyond the field, repairs."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

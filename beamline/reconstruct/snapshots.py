@@ -1,5 +1,7 @@
 """Snapshots of a growing volume, and slices of its views: a file and a picture, each replacing the last in one step."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

@@ -1,5 +1,7 @@
 """Placement of views: where the rotation axis falls on the detector and how each view stands, checked as stated."""
 
+from __future__ import annotations
+
 import operator
 from typing import Any, TypedDict, Unpack
 

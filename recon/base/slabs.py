@@ -1,5 +1,7 @@
 """Slabs: consecutive slices of a volume, and the rows and angles of the views that show them."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,5 +1,7 @@
 """ViewRays: where the rays of each view run and the field that they see, by the convention of `recon.base.geometry`."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field
 

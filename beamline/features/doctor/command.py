@@ -1,5 +1,7 @@
 """`beamline doctor`: checks this computer: camera, ports, disk and memory; nothing moves."""
 
+from __future__ import annotations
+
 import sys
 from collections import Counter
 from collections.abc import Sequence

@@ -3,6 +3,8 @@
 What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path

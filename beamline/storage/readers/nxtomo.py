@@ -1,5 +1,7 @@
 """Scans as NXtomo lays them out: ours, also while they grow, and those of other programs (`nexus_source`)."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """Rules on what the values of pixels are: counts, transmission or line integrals, as the scan says, and measured."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Rules on the order in which frames are stored: bytes of a number, dimensions of a stack, direction of the axis."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import Any
 

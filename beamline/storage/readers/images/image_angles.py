@@ -1,5 +1,7 @@
 """Angles in the names of image files, and why they may be none."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
