@@ -104,8 +104,7 @@ def plain(value: Any) -> Any:
 
 def is_of_type(value: Any, kind: Any) -> bool:
     """Whether a value is of a declared type."""
-    alternatives = _alternatives(kind)
-    return any(_fits(plain(value), each) for each in alternatives)
+    return any(_fits(plain(value), each) for each in _alternatives(kind))
 
 
 def _alternatives(kind: Any) -> list[Any]:

@@ -235,8 +235,7 @@ def _by_operations(
         state.residual = _running(state.residual, backend.misfit(seen.image, target, weights))
         if share > 1:
             slope /= share
-        centres = seen.backward(slope)
-        backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
+        backend.add_lengths(seen.backward(slope), share * geometry.detector_shape[1] / 2, state.statistic)
         loss = loss + value / share  # type: ignore[operator]
     if box is not None:
         loss = loss + _smooth(problem, settings, weight, run, box.grid(problem.grid))
@@ -323,8 +322,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     fresh = change.keep.size
     if origin.size == 0:
         return  # all Gaussians are faint, as in empty views: later views may need them
-    parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
-    grown = dict(zip(NAMES, parts, strict=True))
+    grown = dict(zip(NAMES, (change.means, change.log_scales, p["quaternions"][origin], change.raw), strict=True))
     order = _order(grown)
     if state.mean is not None:
         for name, new in grown.items():

@@ -143,8 +143,7 @@ class R2(Checked):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         preset = PRESETS[quality]
-        count = max(1, round(preset.share * default_count))
-        return replace(self, steps=preset.steps, gaussians=count)
+        return replace(self, steps=preset.steps, gaussians=max(1, round(preset.share * default_count)))
 
     def toy(self) -> Self:
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)

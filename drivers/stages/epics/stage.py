@@ -179,8 +179,7 @@ class EpicsStage(LineStage):
         arrived = target is None or self._is_at_target(status)
         if status.done and not (arrived or self._stops.came_since):
             # It says that it is done, and is not there: look whether it stands.
-            longest = max(timeout, CREEP)
-            until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, longest)
+            until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, max(timeout, CREEP))
             status = self._status()
             arrived = self._is_at_target(status)
         counts, aim = self._counts_of(status), self._aim

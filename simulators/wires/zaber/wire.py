@@ -80,8 +80,7 @@ class PacketReader:
         body, colon, checksum = line[1:].partition(b":")
         if colon and checksum.decode("ascii").upper() != lrc(body):
             return None
-        text = body.decode("ascii")
-        command = _command(text)
+        command = _command(body.decode("ascii"))
         if command.id and not (command.id == "--" or int(command.id) <= 99):
             return Malformed(Command(command.address, command.axis, "", command.words), "BADMESSAGEID")
         if any(len(word) > LONGEST_WORD for word in command.words):
