@@ -41,12 +41,10 @@ _NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something e
 _SPREAD = 0.25  # half of the range of a gain, as a share of it: a convention, see docs/performance.md
 _SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles: median of 14
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
-_USUAL_FALL = 0.6  # the fall of the error of a scan over that in its copy, where it is not measured
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
 _LEAST_FRAMES = 3  # of the open beam, at least
 _TINY = 1e-30
-_BY_VIEWS = 0.6  # the weight of total variation grows with the views to this power
 _CIRCLE = 0.95  # of the field's radius, where errors count
 
 
@@ -89,7 +87,7 @@ def measured_law(
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
     gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
-    by_noise = 1.0 if gaps else noise * (_USUAL_FALL if fall is None else fall)
+    by_noise = 1.0 if gaps else noise * (1.0 if fall is None else fall)
     exponent = float(np.interp(by_noise, _NOISY, (_BY_OTHERS, _BY_NOISE)))
     beside = offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
     offset = beside / (errors[1] + beside) if beside else 0.0
@@ -157,10 +155,13 @@ class _Slab:
         return cls(views, geometry, box.reaching(width * geometry.reach, geometry) if width > 1 else box, noise)
 
     def volume(self, views: F32, some: NDArray[np.intp], weight: float | None) -> F32:
-        """[z, y, x] of some of the views; `weight` of total variation: for one view, as of `_TotalVariation`."""
+        """[z, y, x] of some of the views; `weight` of total variation: for one view, as of `_TotalVariation`.
+
+        It grows as the noise in the gradient of the sum over the views does: with the root of their number.
+        """
         geometry, images = self.geometry.select(some), np.ascontiguousarray(views[some])
         start = Volume(np.maximum(fbp(images, geometry, self.box, filter="hann"), 0), self.box)
-        method, decide = _TotalVariation(weight and weight * len(some) ** _BY_VIEWS), Decisions(0, self.made)
+        method, decide = _TotalVariation(weight and weight * math.sqrt(len(some))), Decisions(0, self.made)
         volume = solve(method, Projector(geometry, self.box), images, start=start, decide=decide)
         self.made.update(decide.made)
         return np.maximum(volume.data, 0)
@@ -170,7 +171,7 @@ class _Slab:
         in_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
         some = np.sort(in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
         self.volume(self.views, some, None)
-        by_noise = float(self.made["weight"][0] / len(some) ** _BY_VIEWS)
+        by_noise = float(self.made["weight"][0] / math.sqrt(len(some)))
         seen, unseen = (some[part] for part in split_views(self.geometry.select(some)))
         projector, judges = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
 
