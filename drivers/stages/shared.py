@@ -10,6 +10,7 @@ import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -189,6 +190,15 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
         advice="Wait for the move to end, or stop it",
         state=f"The move under way goes on; it is at {counts} counts",
     )
+
+
+@dataclass
+class StageOutput:
+    """Implements `drivers.base.protocols.DigitalOutput` by what an open stage's controller is told and asked."""
+
+    name: str
+    set: Callable[[bool], None]
+    get: Callable[[], bool | None]
 
 
 class LineStage(RotationStage):
