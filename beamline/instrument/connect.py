@@ -223,6 +223,17 @@ def connect(
         return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory, watch)
 
 
+def clock_after(config: Config, time: float) -> Clock | None:
+    """The simulated clock, which starts anew in each process, from `time` (s since the Unix epoch) on; None: there is
+    none.
+    """
+    if config.simulation is None:
+        return None
+    from beamline.instrument.simulated import clock_of
+
+    return clock_of(config.simulation.clock, not_before=time)
+
+
 @contextmanager
 def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
     """Connect the configured stage without the rest of the instrument. Nothing moves. Raises DeviceError if it does not

@@ -4,17 +4,20 @@ Noise on the trigger line exposes frames too, and times of triggers are no longe
 frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
 begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
 the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
-Frames that neither confirms belong to no trigger. All functions are pure.
+Frames that neither confirms belong to no trigger. All functions are pure. A Flight keeps the frames of a train that
+wait for their trigger.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
-from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
+from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, enter, start_known
+from beamline.scan.tally import Exposed
+from drivers.base.protocols import CameraFrame, TriggerTrain
 
 EARLY, LATE = 0.02, 0.5  # s: braking begins at most so long before, and so long after, the stop was sent
 MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
@@ -27,11 +30,12 @@ BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not
 class Braking:
     """A stage that was stopped during a train of triggers, and stands."""
 
-    told: float  # time at which it was told, in s
+    stop_sent: float  # time at which it was told to stop, in s
     stood: float  # where it stands, in intervals beyond trigger 0
     deceleration: float  # intervals/s²
 
 
+NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 """Gives a frame the time at which its trigger would have come at constant speed; NaN if unknown."""
 
@@ -66,7 +70,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
         return unassigned(ledger, braking, frame)
     seconds = 1 / (period * braking.deceleration)
     began = phase + (braking.stood - last) * period - seconds / 2
-    if not -EARLY <= began - braking.told <= LATE:
+    if not -EARLY <= began - braking.stop_sent <= LATE:
         return unassigned(ledger, braking, frame)
     if frame.time <= began:
         return frame
@@ -76,7 +80,7 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign the frame by the number of exposures since the last one at constant speed."""
-    if frame.time < braking.told or ledger.last < 0:
+    if frame.time < braking.stop_sent or ledger.last < 0:
         return unassigned(ledger, braking, frame)
     exposures = ledger.unmatched + frame.framestamp - ledger.exposed
     return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
@@ -84,7 +88,7 @@ def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     """Assign no frame after the stop to a trigger."""
-    return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
+    return frame if frame.time < braking.stop_sent else replace(frame, time=math.nan, steady=False)
 
 
 def _matched(ledger: Ledger) -> int:
@@ -93,8 +97,70 @@ def _matched(ledger: Ledger) -> int:
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
     """Whether the intervals between exposures grow from the last steady one on."""
-    steady = [DeliveredFrame(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
-    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
+    steady = [
+        DeliveredFrame(ledger.exposed, ledger.phase),
+        *(frame for frame in frames if frame.time < braking.stop_sent),
+    ]
+    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.stop_sent)]
     intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
     period = ledger.train.period
     return all(later > before - SHRINKS * period for before, later in pairwise([period, *intervals]))
+
+
+@dataclass
+class Flight:
+    """A pulse train under way.
+
+    Attributes:
+        first: its first trigger within the block.
+        seconds: that its move takes.
+        stop_sent: time at which the stage was told to stop during the pass.
+        paused: for a pause, after which the triggers that come after the last frame stored are exposed anew.
+        braking: for a stop, once the stage stands.
+        waiting: frames whose trigger those that follow show.
+    """
+
+    ledger: Ledger
+    train: TriggerTrain
+    first: int
+    seconds: float
+    stop_sent: float = math.inf
+    paused: bool = False
+    braking: Braking = NOT_BRAKING
+    waiting: list[CameraFrame] = field(default_factory=list)
+
+    @property
+    def so_far(self) -> Ledger:
+        """The ledger so far, settled as if no further frame came."""
+        return assigned(self.ledger, self.braking, self._exposed, unassigned)
+
+    @property
+    def last_due(self) -> float:
+        """When the last trigger of the pass is due, in s since the Unix epoch; inf where that is not known."""
+        ledger, train = self.so_far, self.ledger.train
+        if ledger.last >= 0:
+            return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
+        return math.inf if train.first is None else train.first + (train.n - 1) * train.period
+
+    def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[Exposed]:
+        """Enter frames; yield those whose trigger is now known (or EXTRA), with trigger in the block and angle.
+
+        Args:
+            last: no further frame will come, so none waits.
+        """
+        self.waiting += frames
+        brakes = self.braking is not NOT_BRAKING
+        if brakes and not last:
+            return
+        way = placing(self.ledger, self.braking, self._exposed) if brakes else unassigned
+        while self.waiting:
+            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
+            if (entered := enter(self.ledger, exposed, last)) is None:
+                return
+            self.ledger, entry = entered
+            trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
+            yield self.waiting.pop(0), trigger, entry.angle, True
+
+    @property
+    def _exposed(self) -> list[DeliveredFrame]:
+        return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]

@@ -15,9 +15,9 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
 from beamline.core.files import CONFIG, SCAN, create_run_folder, write_whole
 from beamline.core.run_result import RunResult
-from beamline.core.sinks import Warn
+from beamline.core.sinks import Warn, fan_out
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import connect
+from beamline.instrument.connect import clock_after, connect
 from beamline.scan.control import State
 from beamline.scan.live_process import Commands
 from beamline.scan.preflight import dry_run, refuse_violations
@@ -107,7 +107,7 @@ def run_energies(
         ConfigError: a limit is violated at one of the energies; nothing has moved. What `run_scan` raises: the scans
             before it are complete, and a warning names the folder that can go on.
     """
-    each = at_energies(config)
+    each, send = at_energies(config), fan_out(*sinks)
     with ExitStack() as held:
         jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
         complete = [(one.scan.energy or 0.0, job) for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)]
@@ -115,11 +115,7 @@ def run_energies(
             return SeriesRun(series, tuple(complete), ())
         refuse_violations(dry_run(config, series or place, whole=[energy for energy, _ in complete]).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
-        clock = None
-        if config.simulation is not None:
-            from beamline.instrument.simulated import clock_of
-
-            clock = clock_of(config.simulation.clock, not_before=last)
+        clock = clock_after(config, last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
         folder = series or _new_folder(config, place or Path(config.storage.folder))
         scans, results = list[tuple[float, Path]](), list[RunResult]()
@@ -136,8 +132,9 @@ def run_energies(
                 if how.remark:
                     _tell(StateEntered("energies", how.remark), sinks)
                 taken = run_scan(
-                    one, job or folder, [_but_done(sinks)], stop,
-                    live=how.live, afterwards=how.afterwards, instrument=instrument,
+                    one, job or folder,
+                    [lambda event: None if isinstance(event, RunDone) else send(event)],  # more scans follow
+                    stop, live=how.live, afterwards=how.afterwards, instrument=instrument,
                 )  # fmt: skip
             except BaseException:
                 _after_failure(folder, n, len(each), sinks)
@@ -178,20 +175,8 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
     return scan_file(run)
 
 
-def _but_done(sinks: Sequence[Sink]) -> Sink:
-    """A scan of the series is not the end of the command."""
-
-    def pass_on(event: Event) -> None:
-        if not isinstance(event, RunDone):
-            for sink in sinks:
-                sink(event)
-
-    return pass_on
-
-
 def _tell(event: Event, sinks: Sequence[Sink]) -> None:
-    for sink in sinks:
-        sink(replace(event, time=SystemClock().now()))
+    fan_out(*sinks)(replace(event, time=SystemClock().now()))
 
 
 def _after_failure(folder: Path, n: int, of: int, sinks: Sequence[Sink]) -> None:

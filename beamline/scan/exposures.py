@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Generator, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,125 +14,23 @@ from beamline.core.events import Sink, Warned
 from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
-from beamline.scan.braking import Braking, assigned, placing, unassigned
+from beamline.scan.braking import Braking, Flight
 from beamline.scan.control import State
-from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, enter, settle
+from beamline.scan.ledger import EXTRA, Ledger, Train, settle
+from beamline.scan.moves import POLL, arrive, go, looked_again, stand
 from beamline.scan.supervision import Supervision
+from beamline.scan.tally import TRIES, BlockTally, Exposed
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
 SLICE = 0.5  # s: the longest wait for a frame between two checks of the stop request
-POLL = 0.02  # s between status queries of a moving stage
 PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
 PATIENCE_PERIODS = 10  # so many trigger periods
 RAMP_TOLERANCE = 0.1  # share of the time that acceleration adds before the first pulse
 SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera counts as silent
-TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
 STANDS_WITHIN = 10.0  # s that a stage which somebody else moves may take to stand, before it is sent to a view again
-ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
-    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
-    "that a move is done"
-)
-NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
-
-
-@dataclass
-class BlockTally:
-    """Frames and missing triggers of a block; filled while the block is recorded.
-
-    Attributes:
-        frames: delivered, with and without a trigger.
-        rows: by trigger, counted within the block, the row and the time of its last frame.
-        missing: triggers, counted within the block, whose expected frame did not come.
-        lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
-        extra: frames that no trigger exposed.
-        unconfirmed: of the extra ones, those exposed while the stage braked.
-        shift, off: the largest of the passes, see `Ledger`.
-        astray: by trigger, of the frames exposed while the stage was not at its angle, the row and where it was, rad.
-    """
-
-    frames: int = 0
-    rows: dict[int, tuple[int, float]] = field(default_factory=dict)
-    missing: list[int] = field(default_factory=list)
-    lost: int = 0
-    ignored: int = 0
-    extra: int = 0
-    unconfirmed: int = 0
-    shift: int = 0
-    off: float = 0.0
-    astray: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
-
-    def miss(self, triggers: Iterable[int]) -> None:
-        """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
-        self.missing += [trigger for trigger in triggers if trigger not in self.rows]
-
-    def enter(self, settled: Ledger, first: int) -> None:
-        """Add a pass whose first trigger is `first`."""
-        self.miss(first + i for i in settled.missing)
-        self.lost += settled.lost
-        self.ignored += settled.ignored
-        self.extra += len(settled.extra)
-        self.unconfirmed += settled.unconfirmed
-        self.shift = max(self.shift, settled.shift)
-        self.off = max(self.off, settled.off)
-
-
-@dataclass
-class _Pass:
-    """A pulse train under way: its ledger, its counts, its first trigger within the block, the seconds its move takes.
-
-    `told`: time at which the stage was told to stop during the pass. `paused`: for a pause, after which the triggers
-    that come after the last frame stored are exposed anew. `braking`: for a stop, once the stage stands. `waiting`:
-    frames whose trigger is told by those that follow.
-    """
-
-    ledger: Ledger
-    train: TriggerTrain
-    first: int
-    seconds: float
-    told: float = math.inf
-    paused: bool = False
-    braking: Braking = NOT_BRAKING
-    waiting: list[CameraFrame] = field(default_factory=list)
-
-    @property
-    def so_far(self) -> Ledger:
-        """The ledger so far, settled as if no further frame came."""
-        return assigned(self.ledger, self.braking, self._exposed, unassigned)
-
-    @property
-    def last_due(self) -> float:
-        """When the last trigger of the pass is due, in s since the Unix epoch; inf where that is not known."""
-        ledger, train = self.so_far, self.ledger.train
-        if ledger.last >= 0:
-            return ledger.phase + (train.n - 1 - ledger.last) * ledger.period
-        return math.inf if train.first is None else train.first + (train.n - 1) * train.period
-
-    def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Enter frames; yield those whose trigger is now known (or EXTRA), with trigger in the block and angle.
-
-        Args:
-            last: no further frame will come, so none waits.
-        """
-        self.waiting += frames
-        brakes = self.braking is not NOT_BRAKING
-        if brakes and not last:
-            return
-        way = placing(self.ledger, self.braking, self._exposed) if brakes else unassigned
-        while self.waiting:
-            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
-            if (entered := enter(self.ledger, exposed, last)) is None:
-                return
-            self.ledger, entry = entered
-            trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
-            yield self.waiting.pop(0), trigger, entry.angle
-
-    @property
-    def _exposed(self) -> list[DeliveredFrame]:
-        return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
 
 
 class Exposures:
@@ -163,7 +60,7 @@ class Exposures:
         self._clock, self._stop, self._sink = clock, stop, sink
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
-    def take(self, block: Block, first_row: int, taken: BlockTally) -> Iterator[Frame]:
+    def take(self, taken: BlockTally, first_row: int) -> Iterator[Frame]:
         """Record the block's frames, numbered from `first_row`; `taken` lists what is missing.
 
         A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
@@ -173,55 +70,44 @@ class Exposures:
             InstrumentError: the camera is silent.
             DeviceError: a device failed.
         """
+        block = taken.block
         source = TriggerSource.EXTERNAL if block.trains else TriggerSource.SOFTWARE
         accepted = self._camera.configure(
             CameraSettings(block.exposure, source, self._settings.roi, self._settings.binning, self._settings.readout)
         )
-        frames: Iterator[tuple[CameraFrame, int, float, bool]]
-        if block.trains:
-            frames = ((frame, trigger, angle, True) for frame, trigger, angle in self._fly(block, taken))
-        else:
-            frames = self._one_by_one(block, taken)
+        frames = self._fly(taken) if block.trains else self._one_by_one(taken)
         for row, (frame, trigger, angle, in_place) in enumerate(frames, first_row):
             taken.frames += 1
-            kind, replaces = block.kind, -1
-            if trigger == EXTRA:
-                kind = FrameKind.INVALID
-            elif not in_place:
-                kind = FrameKind.INVALID
-                taken.astray.setdefault(trigger, []).append((row, angle))
-            else:
+            good = in_place and trigger != EXTRA
+            kind, replaces = block.kind if good else FrameKind.INVALID, -1
+            if good:
                 before = taken.astray.get(trigger, [(-1, 0.0)])[-1]
                 replaces, _ = taken.rows.get(trigger, before)
                 taken.rows[trigger] = row, frame.time
+            elif trigger != EXTRA:
+                taken.astray.setdefault(trigger, []).append((row, angle))
             yield Frame(
                 frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces,
                 block.aside,
             )  # fmt: skip
 
-    def go(self, angle: float, *, until_stop: bool = True) -> bool:
-        """Move to `angle` at full speed and wait; returns False if a stop (or only an abort) interrupted the move."""
-        limits = self._stage.limits
-        distance = angle - self._stage.position()
-        self._stage.start_move(angle, limits.max_speed)
-        return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration), until_stop)
-
-    def _fly(self, block: Block, taken: BlockTally) -> Iterator[tuple[CameraFrame, int, float]]:
-        ahead, i = passes(block), 0
+    def _fly(self, taken: BlockTally) -> Iterator[Exposed]:
+        block, ahead, i = taken.block, passes(taken.block), 0
         # It begins within a pass only after a pause.
-        while (i := self._after_pause(i, block, taken)) < block.n and not self._stop.stopping:
+        while (i := self._after_pause(i, taken)) < block.n and not self._stop.stopping:
             flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
             train, done = flown.train, i - flown.first
             self._supervision.states.enter(State.TAXI)
             begin = flown.start + float(block.angles[i] - block.angles[flown.first])
-            if not self.go(begin):
+            if not go(self._stage, begin, self._clock, self._stop):
                 return
             rest = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-            i += yield from self._pass(block, taken, rest, i, (begin, flown.end))
+            i += yield from self._pass(taken, rest, i, (begin, flown.end))
 
-    def _after_pause(self, i: int, block: Block, taken: BlockTally) -> int:
+    def _after_pause(self, i: int, taken: BlockTally) -> int:
         """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a
         lost beam it is the first trigger that may lack beam; it and later ones are repeated."""
+        block = taken.block
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()
@@ -235,11 +121,11 @@ class Exposures:
         return first
 
     def _pass(
-        self, block: Block, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
-    ) -> Generator[tuple[CameraFrame, int, float], None, int]:
+        self, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
+    ) -> Generator[Exposed, None, int]:
         """Fly once over a train whose first trigger within the block is `first`; the stage stands at the first of the
         ends. Returns how many of its triggers are done with: all, or those up to the last frame before a pause."""
-        start, end = ends
+        block, (start, end) = taken.block, ends
         self._camera.arm(train.n)
         self._stage.arm(train)
         before = self._clock.now()
@@ -247,7 +133,7 @@ class Exposures:
         self._supervision.states.enter(State.ACQUIRING)
         seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
         angles = block.angles[first : first + train.n]
-        flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), train, first, seconds)
+        flight = Flight(Ledger(self._expected(block, angles, before, self._clock.now())), train, first, seconds)
         cut_short = True
         try:
             try:
@@ -279,7 +165,7 @@ class Exposures:
         first = (before + after) / 2 + block.taxi / block.speed + ramp
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
-    def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
+    def _until_standing(self, block: Block, flight: Flight) -> Iterator[Exposed]:
         """Frames while the stage turns; after a stop, all frames until the stage stands. After a pause only the frames
         exposed before the stop was sent: they equal those of a scan without a pause.
 
@@ -297,7 +183,7 @@ class Exposures:
             frame = self._next_frame(tail if stands else wait, until_stop=not stands)
             if frame is not None:
                 wait, silent_at = patience, self._clock.now() + patience
-                if not flight.paused or frame.time + tail <= flight.told:
+                if not flight.paused or frame.time + tail <= flight.stop_sent:
                     yield from flight.enter(frame)
             elif stands:
                 break
@@ -313,30 +199,31 @@ class Exposures:
         if flight.paused:
             return
         if not stands:
-            self._wait(flight.seconds)
+            arrive(self._stage, flight.seconds, self._clock, self._stop)
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
-    def _brake(self, flight: _Pass) -> None:
+    def _brake(self, flight: Flight) -> None:
         """Slow down within a train, wait until the stage stands, and ask where."""
         train, limits = flight.train, self._stage.limits
-        flight.told, flight.paused = self._clock.now(), not self._stop.stopping
-        self.stand()
+        flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping
+        stand(self._stage, self._clock, self._stop)
         if not flight.paused:
             stood = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
-            flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
+            flight.braking = Braking(flight.stop_sent, stood, counts / abs(train.interval))
 
-    def _one_by_one(self, block: Block, taken: BlockTally) -> Iterator[tuple[CameraFrame, int, float, bool]]:
+    def _one_by_one(self, taken: BlockTally) -> Iterator[Exposed]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each
         frame its trigger, where the stage was, and whether that was its angle."""
+        block = taken.block
         self._camera.arm(block.n)
         period = max(block.period, self._camera.timing.min_period)
         patience = PATIENCE + block.exposure + self._camera.timing.readout
         position = self._stage.position()
         triggered, silent = -math.inf, 0
         owed, i, tried, stands_at = self._stop.stopping, -1, Counter[int](), math.nan
-        while (after := self._after_pause(i + 1, block, taken)) < block.n:
+        while (after := self._after_pause(i + 1, taken)) < block.n:
             if after <= i or tried[after]:
                 self._arm_anew(block.n - after)
             i, angle = after, float(block.angles[after])
@@ -344,7 +231,9 @@ class Exposures:
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
-                if angle != stands_at and not (self.go(angle) and self._rest(self._settle, owed)):
+                if angle != stands_at and not (
+                    go(self._stage, angle, self._clock, self._stop) and self._rest(self._settle, owed)
+                ):
                     break
                 stands_at = angle
                 position = self._stage.position()
@@ -356,7 +245,7 @@ class Exposures:
             if frame is not None:
                 silent, wrong = 0, ""
                 if math.isfinite(angle):
-                    position, wrong = self._looked_again(angle, position)
+                    position, wrong = looked_again(self._stage, angle, position)
                 yield frame, i, position, not wrong
                 if wrong:
                     tried[i] += 1
@@ -379,19 +268,6 @@ class Exposures:
                 )
             self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()
-
-    def _looked_again(self, angle: float, before: float) -> tuple[float, str]:
-        """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
-        anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
-        moving, after = self._stage.moving(), self._stage.position()
-        wanted, most = self._stage.to_counts(angle), self._stage.limits.tolerance
-        if not moving and all(abs(self._stage.to_counts(place) - wanted) <= most for place in (before, after)):
-            return (before + after) / 2, ""
-        return after, (
-            f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
-            f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
-            f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
-        )
 
     def _until_nobody_moves_it(self) -> None:
         deadline = self._clock.now() + STANDS_WITHIN
@@ -435,31 +311,6 @@ class Exposures:
                     raise
                 failed = True
                 self._sink(Warned(str(error)))
-
-    def _wait(self, seconds: float, until_stop: bool = True) -> bool:
-        """Wait for a move that should take `seconds`; False if a stop cut it short."""
-        deadline = self._clock.now() + 2 * seconds + 5.0
-        while self._stage.moving():
-            self._stop.refuse_abort()
-            if until_stop and self._stop.stopping:
-                self.stand()
-                return False
-            if self._clock.now() > deadline:
-                break
-            self._clock.sleep(POLL)
-        self._stage.wait(timeout=POLL)  # raises if the stage still moves or stopped short
-        return True
-
-    def stand(self) -> None:
-        """Decelerate and wait until the stage stands. Raises InstrumentError if it does not."""
-        limits = self._stage.limits
-        deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
-        self._stage.stop()
-        while self._stage.moving():
-            self._stop.refuse_abort()
-            if self._clock.now() > deadline:
-                raise InstrumentError(f"{self._stage.name}: it is still moving after a stop. Use its emergency stop.")
-            self._clock.sleep(POLL)
 
     @property
     def _interrupted(self) -> bool:

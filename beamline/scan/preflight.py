@@ -155,13 +155,12 @@ def _of_energies(each: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the violations of all of them."""
     needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
     total = replace(each[0], energies=tuple(needs))
-    violations = dict.fromkeys(said for one in each for said in one.timeline.violations)
+    violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
     if total.total_bytes * ROOM > total.free_bytes:
-        said = (
+        violations[
             f"{len(each)} energies need {size(total.total_bytes)} and a tenth more, the disk has "
             f"{size(total.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
-        )
-        violations[said] = None
+        ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
 
@@ -249,9 +248,9 @@ def preflight(
     stage, camera = instrument.devices.stage, instrument.devices.camera
     plan = remaining(plan_of(config))
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
-    timing, free = camera.timing, shutil.disk_usage(disk_of(runs)).free
-    timeline = _worked(config, plan, stage.limits, stage.to_counts, timing, free)
-    timeline = _lockable(timeline, disk_of(runs))
+    timing, disk = camera.timing, disk_of(runs)
+    free = shutil.disk_usage(disk).free
+    timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), disk)
     refuse_violations(timeline)
     info = _info(config, instrument, plan, timeline)
     monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))

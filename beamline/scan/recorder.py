@@ -12,31 +12,25 @@ import math
 import shutil
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from queue import Empty, Full, Queue
 
-import numpy as np
-
 from beamline.core.errors import BeamlineError, DataError, user_message
-from beamline.core.events import FrameFlagged, FrameStored, Sink, Warned
+from beamline.core.events import Sink, Warned
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.core.text import count, spans
-from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import flagged_frames
+from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import Monitor, look_past_failures
-from beamline.plan.plan import Retake, Timeline
+from beamline.plan.plan import Timeline
+from beamline.scan.backlog import CHECKED_FRAMES, Progress, hold_for_backlog, hold_for_space, room
+from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.references import ReferenceLog
-from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 
-WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
-WAITING_FRAMES = (4, 128)  # least and most frames
-CHECKED_FRAMES = 2  # most frames that wait between the threads
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
 STALL = 60.0  # real s that a write may take, after which the disk counts as dead
@@ -44,42 +38,12 @@ CHECKS = 60.0  # real s that the checks of a frame may take, after which they ha
 COMPILES = 300.0  # the same of the first frame of a kind, whose checks may compile
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
-EVENT_INTERVAL = 0.1  # real s between `frame` events
-RATE_FRAMES = 20  # the rate is that of the last so many frames
-
-
-def room(timeline: Timeline) -> int:
-    """Number of frames that can wait to be written."""
-    low, high = WAITING_FRAMES
-    return min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
-
-
-def frames_in_memory(timeline: Timeline) -> int:
-    """Largest number of frames in memory at a time: waiting, being written, and coming from the camera."""
-    return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
-
 
 _Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
 """A frame, its digests for the checks and for the file, and the flags; None: no check has looked at it."""
 _Call = Callable[[], object]
 _Item = _Checked | BaseException | _Call | None
 """What comes to the second thread. An exception: the frame could not be digested. A call: made when its turn comes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Consequences:
-    """What flags do to a running scan.
-
-    Attributes:
-        react: told the flags of each frame.
-        retaken_warnings: checks whose warnings have views taken again.
-    """
-
-    react: Callable[[tuple[Flag, ...]], None] = lambda flags: None
-    retaken_warnings: frozenset[str] = frozenset()
-
-
-_NONE = Consequences()
 
 
 class Recorder:
@@ -93,14 +57,15 @@ class Recorder:
     monitor off. A stop or an abort waits for neither: what the camera still owes is kept in memory.
 
     Args:
+        flagged: told the flags of each frame.
         pause: a request that pauses the scan.
         stop: the scan's.
 
     Attributes:
         n_frames: written so far.
-        retaken: views that were taken again.
         announced: frames beyond the timeline, by `expect_more`.
         references: the darks and flats so far.
+        flagged: the flags so far.
     """
 
     def __init__(
@@ -111,15 +76,14 @@ class Recorder:
         *,
         preview_bin: int,
         sink: Sink,
-        consequences: Consequences = _NONE,
+        flagged: FlaggedFrames | None = None,
         pause: PauseRequest | None = None,
         stop: StopRequest | None = None,
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
-        self._sink, self._consequences = sink, consequences
-        self._progress = _Progress(timeline)
-        self._stop = stop or StopRequest()
-        self._active: set[tuple[str, Level]] = set()
+        self._sink, self.flagged = sink, flagged or FlaggedFrames(sink)
+        self._progress = Progress(timeline)
+        self._stop, self._pause = stop or StopRequest(), pause or PauseRequest()
         self._monitor_off = False
         self._unjudged: list[int] = []  # frames that the monitor did not look at
         self._check_name = ""  # that looks, or looked last
@@ -128,24 +92,19 @@ class Recorder:
         self._alone = False  # the second thread goes on without the first
         self._compiled: set[FrameKind] = set()  # kinds of frames that were checked
         self.n_frames = 0
-        self._found: list[Flag] = []
-        self._triggers: dict[int, int] = {}  # of the views, by row
-        self._replaced: set[int] = set()
         self._invalid: set[int] = set()  # rows that never were anything else
-        self.retaken, self.announced, self._retaking = 0, 0, False
+        self.announced, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: BaseException | None = None
-        self._work = Workload()
-        most = room(timeline)
-        self._waiting: Queue[Frame | _Call | None] = Queue(most)
+        self._checking = self._writing = 0.0  # busy s of the threads
+        self._most, views = room(timeline), timeline.views
+        self._waiting: Queue[Frame | _Call | None] = Queue(self._most)
         self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
-        pause, views = pause or PauseRequest(), timeline.views
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
-        self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
-        self._backlog = BacklogGuard(most, pause, self._work) if views.trains else None
-        self._flying = False
+        self._reserve = self._row_bytes * (self._most + in_work + on_the_way)
+        self._flies, self._flying = bool(views.trains), False  # in its views; now
         self._looked_at, self._writing_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
         self._thread.start()
@@ -198,40 +157,6 @@ class Recorder:
             return ""
         frames = f"{count(len(self._unjudged), 'frame')} ({spans(self._unjudged)})"
         return f"The monitor did not look at {frames}: they have no flags. `beamline monitor {self._writer.path}` does."
-
-    @property
-    def flags(self) -> dict[str, dict[str, int]]:
-        """Frames flagged so far: their number by check, then by level."""
-        flagged: dict[str, dict[str, int]] = {}
-        for (check, level), frames in sorted(flagged_frames(self._found).items()):
-            flagged.setdefault(check, {})[str(level)] = len(frames)
-        return flagged
-
-    @property
-    def alarmed_frames(self) -> int:
-        """Frames so far with an alarm of any check, except those that were repeated."""
-        return len(self._alarmed)
-
-    @property
-    def alarmed_views(self) -> int:
-        """Number of views among the frames with an alarm."""
-        return len(self._alarmed & self._triggers.keys())
-
-    @property
-    def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
-        warned = self._frames(
-            lambda flag: flag.level is Level.WARN and flag.check in self._consequences.retaken_warnings
-        )
-        return [Retake(row, self._triggers[row]) for row in sorted((self._alarmed | warned) & self._triggers.keys())]
-
-    @property
-    def _alarmed(self) -> set[int]:
-        return self._frames(lambda flag: flag.level is Level.ALARM)
-
-    def _frames(self, which: Callable[[Flag], bool]) -> set[int]:
-        """Frames with such a flag, without those that were taken again."""
-        return {frame for flag in self._found if which(flag) for frame in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Announce frames beyond the timeline; may be called while no frame waits."""
@@ -299,7 +224,7 @@ class Recorder:
         except BaseException as error:
             return error
         finally:
-            self._work.checking += time.monotonic() - begun
+            self._checking += time.monotonic() - begun
 
     def _next_checked(self) -> _Item:
         """The next item of the second thread, which digests frames itself once the checks hang."""
@@ -353,7 +278,7 @@ class Recorder:
                 with suppress(BaseException):  # the first one counts
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
-            self._work.writing += time.monotonic() - begun
+            self._writing += time.monotonic() - begun
             self._writing_since = math.inf
             if item is None:
                 return
@@ -367,13 +292,17 @@ class Recorder:
                 self._looked_at = time.monotonic()
                 with suppress(OSError):  # a failing disk ends the scan where it takes no frame
                     left = max(0, self._progress.total - self.n_frames) * self._row_bytes
-                    self._space(shutil.disk_usage(self._writer.path.parent).free, left)
+                    hold_for_space(self._pause, self._reserve, shutil.disk_usage(self._writer.path.parent).free, left)
             with suppress(Empty):
                 return self._waiting.get(timeout=LOOK)
 
     def _look_at_backlog(self) -> None:
-        if self._backlog is not None:
-            self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames wait in `put`
+        if self._flies:
+            hold_for_backlog(
+                self._pause, self._most,
+                self._waiting.qsize() if self._flying else 0,  # other frames wait in `put`
+                self._checking, self._writing,
+            )  # fmt: skip
 
     def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...] | None) -> None:
         if flags is None:
@@ -387,7 +316,7 @@ class Recorder:
             self._invalid.add(frame.index)
         if frame.kind is FrameKind.INVALID or beside:
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
-        self._report(frame, flags)
+        self.flagged.add(frame, flags)
         if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
             self._sink(event)
 
@@ -406,53 +335,8 @@ class Recorder:
             self._sink(Warned(failure))
         return flags
 
-    def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:
-        """Count flags; say so where a check begins to flag or its level changes, not for every frame."""
-        self._found += [replace(flag, advice="") for flag in flags]
-        if frame.kind is FrameKind.PROJECTION:
-            self._triggers[frame.index] = frame.trigger
-        if frame.replaces >= 0:
-            self._replaced.add(frame.replaces)
-            self.retaken += frame.kind is FrameKind.PROJECTION
-        active = {(flag.check, flag.level) for flag in flags}
-        for flag in flags:
-            if (flag.check, flag.level) not in self._active:
-                self._sink(FrameFlagged(flag))
-        self._active = active
-        self._consequences.react(flags)
-
 
 def _as_stored(frame: Frame) -> Frame:
     """The frame as a reader gives it: a file holds degrees, whose radians differ in the last bit. A check that keeps
     "a view every 5°" must choose the same views now and later."""
     return replace(frame, angle=math.radians(math.degrees(frame.angle)))
-
-
-class _Progress:
-    """Data of the `frame` event: frames written, rate, time left."""
-
-    def __init__(self, timeline: Timeline) -> None:
-        self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
-        # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
-        periods = np.concatenate([np.full(block.left, block.period) for block in timeline.blocks])
-        self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
-        self._times: deque[float] = deque(maxlen=RATE_FRAMES)
-        self._last_event = -EVENT_INTERVAL
-
-    def expect_more(self, done: int, n: int, seconds: float) -> None:
-        """Count `n` frames that were not planned; they come after `done` frames and take `seconds`."""
-        before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
-        self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
-        self.total += n
-
-    def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
-        """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
-        self._times.append(frame.time)
-        now = time.monotonic()
-        if now - self._last_event < EVENT_INTERVAL and n < self.total:
-            return None
-        self._last_event = now
-        span = self._times[-1] - self._times[0]
-        rate = (len(self._times) - 1) / span if span > 0 else 0.0
-        left = float(self._ahead[min(n, self.total)])
-        return FrameStored(n, self.total, frame.kind.name.lower(), rate, rate * self._bytes / 1e6, left, mean)

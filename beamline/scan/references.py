@@ -76,14 +76,14 @@ class ReferenceReport:
 
     def __init__(self, section: ReferencesSection, exposure: float, sink: Sink) -> None:
         self._limits, self._exposure, self._sink = reference_limits(section), exposure, sink
-        self._told: set[str] = set()
+        self._warned_of: set[str] = set()
 
     def faults(self, log: ReferenceLog, planned: Sequence[Block] = ()) -> Mapping[str, str]:
         """The faults of the darks and flats so far, as `ReferenceLog.faults`."""
         faults = log.faults(self._limits, planned)
         little_light = log.too_little_light(self._limits, self._exposure)
         statements = faults if little_light is None else {"little light": little_light, **faults}
-        for group in [group for group in statements if group not in self._told]:
-            self._told.add(group)
+        for group in [group for group in statements if group not in self._warned_of]:
+            self._warned_of.add(group)
             self._sink(Warned(statements[group]))
         return faults

@@ -1,28 +1,25 @@
-"""Supervision: causes that pause or end a scan: beam monitor, as its log reads it, and alarms of frames."""
+"""Supervision: what an acquisition asks of the scan around it, and the beam monitor, whose log may pause it."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
 from beamline.config.beam import NoBeamMonitor
 from beamline.config.devices import BeamMonitorConfig
 from beamline.core.events import BeamRead, Sink, Warned
-from beamline.core.stop import Cause, PauseRequest, StopRequest
-from beamline.core.text import count, size
-from beamline.monitor.check import Flag, Level, Policy
+from beamline.core.stop import Cause, PauseRequest
+from beamline.core.text import count
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Retake
 from beamline.scan.control import State, StateMachine
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading
 
-CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
 PAUSE_POLL = 0.05  # real s between checks of a paused scan
 
 
@@ -60,20 +57,17 @@ class Supervision:
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 
-@dataclass(frozen=True)
-class BeamLimits:
-    """Beam intensities at which a scan pauses and resumes, in the beam monitor's unit."""
-
-    pause_below: float  # a reading below it pauses the scan
-    resume_above: float  # readings of at least so much mean that the beam is back
-    settle: float  # s for which they must be so, before the scan goes on
-
-
 class BeamGuard:
-    """Pauses a scan while the beam monitor reads too little beam."""
+    """Pauses a scan while the beam monitor reads too little beam.
 
-    def __init__(self, limits: BeamLimits, pause: PauseRequest) -> None:
-        self._limits, self._pause = limits, pause
+    Args:
+        pause_below: a reading below it pauses the scan, in the monitor's unit.
+        resume_above: readings of at least so much mean that the beam is back.
+        settle: s for which they must be so, before the scan goes on.
+    """
+
+    def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
+        self._pause_below, self._resume_above, self._settle, self._pause = pause_below, resume_above, settle, pause
         self._good = -math.inf
         """Time of the last reading with beam."""
         self._back: float | None = None
@@ -82,122 +76,23 @@ class BeamGuard:
 
     def __call__(self, reading: BeamReading) -> None:
         """Record the next reading, and act."""
-        limits = self._limits
         if not self._paused:
-            if reading.value >= limits.pause_below:
+            if reading.value >= self._pause_below:
                 self._good = reading.time
                 return
             self._paused = True
             self._pause.no_beam(
-                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {limits.pause_below:.4g}. The "
-                f"scan goes on by itself when it has read {limits.resume_above:.4g} again for {limits.settle:g} s",
+                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {self._pause_below:.4g}. The "
+                f"scan goes on by itself when it has read {self._resume_above:.4g} again for {self._settle:g} s",
                 self._good,
             )
-        if reading.value < limits.resume_above:
+        if reading.value < self._resume_above:
             self._back = None
             return
         self._back = reading.time if self._back is None else self._back
-        if reading.time - self._back >= limits.settle:
+        if reading.time - self._back >= self._settle:
             self._paused, self._back, self._good = False, None, reading.time
             self._pause.release(Cause.BEAM)
-
-
-class SpaceGuard:
-    """Pauses a scan before its disk is full, until twice the limit is free.
-
-    Args:
-        reserve: bytes that must stay free for the frames that still come when the scan is to pause.
-    """
-
-    def __init__(self, reserve: int, pause: PauseRequest) -> None:
-        self._reserve, self._pause = reserve, pause
-
-    def __call__(self, free: int, left: int) -> None:
-        """Record the free bytes and the bytes that are still to be written."""
-        again = min(2 * self._reserve, left) + CLOSING
-        if left and free < min(self._reserve, left) + CLOSING:
-            self._pause.hold(
-                Cause.SPACE,
-                f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
-                f"{size(again)} the scan goes on by itself",
-            )
-        elif not left or free >= again:
-            self._pause.release(Cause.SPACE)
-
-
-@dataclass
-class Workload:
-    """Busy seconds of a recorder's threads: checking frames, and writing them."""
-
-    checking: float = 0.0
-    writing: float = 0.0
-
-    @property
-    def behind(self) -> tuple[str, str]:
-        """The cause of the backlog, and a remedy: the disk if writing took longer than the checks."""
-        if self.writing > self.checking:
-            return "the disk is behind", "a longer period_s or a faster disk"
-        return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
-
-
-class BacklogGuard:
-    """Pauses a fly scan before the queue is full, until few frames wait to be written.
-
-    Args:
-        room: frames that may wait.
-        work: the time that earlier frames took.
-    """
-
-    def __init__(self, room: int, pause: PauseRequest, work: Workload) -> None:
-        self._room, self._pause, self._work = room, pause, work
-
-    def __call__(self, waiting: int) -> None:
-        """Record the number of waiting frames."""
-        if 4 * waiting >= 3 * self._room:
-            what, advice = self._work.behind
-            self._pause.hold(
-                Cause.BACKLOG,
-                f"{what}, {waiting} of at most {self._room} frames wait in memory. The scan goes on by "
-                f"itself when most of them are written; {advice} spares the pauses",
-            )
-        elif 4 * waiting <= self._room:
-            self._pause.release(Cause.BACKLOG)
-
-
-class AlarmReaction:
-    """What the monitor's alarms do to a scan.
-
-    Args:
-        act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
-        policies: by the name of the check.
-    """
-
-    def __init__(
-        self, act_after: int, policies: Mapping[str, Policy], stop: StopRequest, pause: PauseRequest, sink: Sink
-    ) -> None:
-        self._act_after, self._policies = act_after, policies
-        self._stop, self._pause, self._sink = stop, pause, sink
-        self._in_a_row: Counter[str] = Counter()
-
-    def __call__(self, flags: tuple[Flag, ...]) -> None:
-        """Record the flags of the next frame, and act."""
-        alarms = [flag for flag in flags if flag.level is Level.ALARM]
-        self._in_a_row = Counter({flag.check: self._in_a_row[flag.check] + 1 for flag in alarms})
-        for flag in alarms:
-            if self._in_a_row[flag.check] % self._act_after == 0:
-                self._act(flag)
-
-    def _act(self, flag: Flag) -> None:
-        n = self._in_a_row[flag.check]
-        frames = f"{n} frames in a row have" if n > 1 else "1 frame has"
-        reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
-        match self._policies.get(flag.check, Policy.LOG):
-            case Policy.WARN:
-                self._sink(Warned(f"{reason}."))
-            case Policy.PAUSE:
-                self._pause.pause(reason)
-            case Policy.STOP if not self._stop.stopping:
-                self._stop.stop(reason, by_itself=True)
 
 
 LAST_WAIT = 3.0  # Longest wait in s for a reading in progress at the end of a scan
@@ -288,5 +183,5 @@ def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink,
         return BeamLog(None, math.inf, sink)
     guard = None
     if config.pause_below is not None:
-        guard = BeamGuard(BeamLimits(config.pause_below, config.resumes_at, config.settle_s), pause)
+        guard = BeamGuard(config.pause_below, config.resumes_at, config.settle_s, pause)
     return BeamLog(monitor, config.period_s, sink, guard)

@@ -100,7 +100,7 @@ class _Keeper:
         while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
             self._process.beat()
         if not self._ready.is_set() or not self._process.running:
-            self._warn("The watchdog is not running: if the scan is killed, the shutter stays open.")
+            self._sink(Warned("The watchdog is not running: if the scan is killed, the shutter stays open."))
         self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
         self._thread.start()
 
@@ -119,25 +119,24 @@ class _Keeper:
             code = self._process.code
             if code == ACTED:
                 why = f"the process did nothing for {FROZEN:.0f} s, and the watchdog made the instrument safe"
-                self._warn(f"Failed: {why}. The scan ends.")
+                self._sink(Warned(f"Failed: {why}. The scan ends."))
                 stop.abort(why)
                 return
             self._process.end()
             if not left:
-                self._warn(f"The watchdog has ended (code {code}), too: a scan that is killed leaves the shutter open.")
+                self._sink(
+                    Warned(f"The watchdog has ended (code {code}), too: a scan that is killed leaves the shutter open.")
+                )
                 if pause is not None:
                     pause.pause("no watchdog runs")
                 return
             left -= 1
             with suppress(OSError):
                 self._process = self._started()
-            self._warn(f"The watchdog has ended (code {code}); another one is started.")
+            self._sink(Warned(f"The watchdog has ended (code {code}); another one is started."))
 
     def _started(self) -> ChildProcess:
         return self._start(self._command, lambda line: self._ready.set())
-
-    def _warn(self, message: str) -> None:
-        self._sink(Warned(message))
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:

@@ -49,8 +49,8 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
         for module in ("preflight", "resume"):
             within.setattr(f"beamline.scan.{module}.plan_of", in_passes)
         within.setattr("beamline.scan.run.preflight", ready)
-        within.setattr("beamline.scan.run.Recorder", recorder)
-        within.setattr("beamline.scan.run.Supervision", supervised)
+        within.setattr("beamline.scan.measurement.Recorder", recorder)
+        within.setattr("beamline.scan.measurement.Supervision", supervised)
         yield
 
 

@@ -27,7 +27,8 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import look, start
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.scan.recorder import Recorder, frames_in_memory
+from beamline.scan.backlog import frames_in_memory
+from beamline.scan.recorder import Recorder
 from beamline.storage.disk_file import ToDisk
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo

@@ -26,8 +26,8 @@ from beamline.features.doctor.check import Diagnosis, Grade, of_error
 from beamline.features.doctor.devices import port, ports
 from beamline.instrument.connect import make_beam_monitor
 from beamline.plan.limits import ROOM as MARGIN
+from beamline.scan.backlog import room as waiting_room
 from beamline.scan.preflight import DryRun, disk_of, dry_run
-from beamline.scan.recorder import room as waiting_room
 from beamline.storage.writer_lock import no_locks
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError

@@ -26,8 +26,8 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ask_operator
 from beamline.plan.limits import ROOM
 from beamline.plan.timeline import duration_text
+from beamline.scan.moves import UNSAFE
 from beamline.scan.preflight import DryRun, dry_run
-from beamline.scan.run import UNSAFE
 from drivers.base.clock import SystemClock
 
 _CONFIG = "config"  # the column with the configuration's file

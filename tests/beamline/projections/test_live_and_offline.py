@@ -21,7 +21,8 @@ from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
 from beamline.projections.replay import context_of, replay
-from beamline.scan.recorder import Consequences, Recorder
+from beamline.scan.flagged import FlaggedFrames
+from beamline.scan.recorder import Recorder
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -108,7 +109,7 @@ def record(scan: Troubled, path: Path, preview_bin: int, pauses: tuple[float, ..
         writer.pauses = pauses
         recorder = Recorder(
             writer, start(scan.context()), FakeInstrument().timeline(), preview_bin=preview_bin, sink=events.append,
-            consequences=Consequences(found.extend),
+            flagged=FlaggedFrames(events.append, found.extend),
         )  # fmt: skip
         for frame in scan.frames():
             recorder.put(frame)

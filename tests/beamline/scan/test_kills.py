@@ -44,7 +44,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process that 
 @pytest.fixture(autouse=True)
 def _no_pause_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a virtual clock frames come faster than any disk takes them; a pause for it exposes frames not kept."""
-    monkeypatch.setattr(recorder, "BacklogGuard", lambda *_: lambda waiting: None)
+    monkeypatch.setattr(recorder, "hold_for_backlog", lambda *_: None)
 
 
 def _scan(runs: Path, step: bool, taken: Connection, choose: Chooser | None = None) -> None:

@@ -13,7 +13,7 @@ from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import live_process
-from beamline.scan import run as module
+from beamline.scan import measurement as module
 from beamline.scan.live_plan import LivePlan
 from beamline.scan.live_process import LiveReconstruction, follow_command
 from beamline.scan.run import run_scan

@@ -19,9 +19,10 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start
+from beamline.scan import backlog, measurement
 from beamline.scan import recorder as module
-from beamline.scan import run as run_module
-from beamline.scan.recorder import Consequences, Recorder
+from beamline.scan.flagged import FlaggedFrames
+from beamline.scan.recorder import Recorder
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -66,7 +67,7 @@ def frame(row: int) -> Frame:
 @given(n=st.integers(0, 60), room=st.integers(1, 4))
 def test_every_frame_is_written_in_order_however_little_room_there_is(n: int, room: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "WAITING_FRAMES", (room, room))
+        patch.setattr(backlog, "WAITING_FRAMES", (room, room))
         recorder = record(writer := Writer())
         for row in range(n):
             recorder.put(frame(row))
@@ -80,7 +81,7 @@ def test_every_frame_is_written_in_order_however_little_room_there_is(n: int, ro
 def test_a_failure_reaches_whoever_waits_for_room_and_nothing_is_written_after_it(
     monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    monkeypatch.setattr(module, "WAITING_FRAMES", (1, 1))
+    monkeypatch.setattr(backlog, "WAITING_FRAMES", (1, 1))
     go = threading.Event()
 
     def fail(row: int) -> None:
@@ -136,14 +137,14 @@ def hanging(monkeypatch: pytest.MonkeyPatch, hang: Callable[[], object]) -> None
                 hang()
             super().append(frame, digest, flags)
 
-    monkeypatch.setattr(run_module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(measurement, "NXtomoWriter", Hanging)
 
 
 def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = threading.Event()
     hanging(monkeypatch, lambda: free.wait(60))
     monkeypatch.setattr(module, "STALL", 0.05)
-    monkeypatch.setattr(module, "WAITING_FRAMES", (2, 2))
+    monkeypatch.setattr(backlog, "WAITING_FRAMES", (2, 2))
     try:
         ran = Ran(tmp_path, FakeInstrument())
     finally:
@@ -168,7 +169,7 @@ def test_an_abort_does_not_wait_for_a_disk_that_hangs_and_no_frame_is_lost(
             free.set()
 
     hanging(monkeypatch, hang)
-    monkeypatch.setattr(module, "WAITING_FRAMES", (2, 2))
+    monkeypatch.setattr(backlog, "WAITING_FRAMES", (2, 2))
     instrument = FakeInstrument()
     monkeypatch.setattr(instrument.devices.shutter, "close", safe)
     ran = Ran(tmp_path, instrument, "scan.mode=step", stop=stop)
@@ -202,10 +203,11 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("checks", [(), ("timing",), ("blur",)])
 def test_views_with_a_warning_are_to_be_taken_again_where_the_check_is_named(checks: tuple[str, ...]) -> None:
-    recorder = record(Writer(), consequences=Consequences(retaken_warnings=frozenset(checks)))
+    flagged = FlaggedFrames(lambda event: None, retaken_warnings=frozenset(checks))
+    recorder = record(Writer(), flagged=flagged)
     for row in range(9):
         recorder.put(replace(frame(row), time=1.8e9 + row + (0.4 if row == 5 else 0.0)))
     recorder.finish()
-    late = [view.row for view in recorder.views_to_retake]
+    late = [view.row for view in flagged.views_to_retake]
     assert late == ([5, 6] if checks == ("timing",) else [])  # late, and the next one early after it
-    assert recorder.alarmed_views == 0
+    assert len(flagged.alarmed_views) == 0

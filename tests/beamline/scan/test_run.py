@@ -17,6 +17,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
+from beamline.scan import measurement
 from beamline.scan import run as run_module
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
@@ -111,7 +112,7 @@ def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
 def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
-    monkeypatch.setattr(run_module, "NXtomoWriter", failing_writer(8, failure))
+    monkeypatch.setattr(measurement, "NXtomoWriter", failing_writer(8, failure))
     ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=200", "scan.period_s=0.05")
     assert isinstance(ran.error, DataError)
     assert re.search(r"first 8 frames are safe in .*scan\.h5", str(ran.error))
@@ -137,7 +138,7 @@ def test_logs_on_a_full_disk_do_not_hide_why_the_run_ended(tmp_path: Path, monke
         return FullLog() if path.suffix in (".jsonl", ".log") else usual(path, mode, *args, **kwargs)  # type: ignore[call-overload]
 
     monkeypatch.setattr(Path, "open", opened)
-    monkeypatch.setattr(run_module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
+    monkeypatch.setattr(measurement, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
     ran = Ran(tmp_path, FakeInstrument())
     assert str(ran.error) == "the first 8 frames are safe."
     ran.assert_good_file(8, "failed")

@@ -156,7 +156,7 @@ def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(
 ) -> None:
     views = 3000
     # On a virtual clock frames come faster than any disk takes them: they would be flown in pieces.
-    monkeypatch.setattr(recorder, "BacklogGuard", lambda *_: lambda waiting: None)
+    monkeypatch.setattr(recorder, "hold_for_backlog", lambda *_: None)
     with FlyRig(world) as rig:
         scanned = Scanned(rig, small(views), tmp_path)
         assert scanned.error is None

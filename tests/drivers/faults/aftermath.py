@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from beamline.scan.control import State
-from beamline.scan.run import SAFE, UNSAFE
+from beamline.scan.moves import SAFE, UNSAFE
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned

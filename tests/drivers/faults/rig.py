@@ -27,6 +27,7 @@ from beamline.core.events import Event
 from beamline.core.run_result import RunResult
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
+from beamline.scan import measurement
 from beamline.scan import run as run_module
 from beamline.scan.control import verbs_taken
 from beamline.scan.recorder import Recorder
@@ -358,9 +359,9 @@ class Rig:
         )
         monkeypatch.setattr(run_module, "connect", self._connect)
         monkeypatch.setattr(run_module, "verbs_taken", self._verbs_taken)
-        monkeypatch.setattr(run_module, "wait_in_pause", self._wait_in_pause)
+        monkeypatch.setattr(measurement, "wait_in_pause", self._wait_in_pause)
         monkeypatch.setattr(run_module, "watched", lambda *how: nullcontext())  # a process a scan
-        monkeypatch.setattr(run_module, "Recorder", partial(_Recorder, self.at_frame))
+        monkeypatch.setattr(measurement, "Recorder", partial(_Recorder, self.at_frame))
 
     def config(self, *overrides: str) -> Config:
         stage = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from beamline.scan.run import SAFE, UNSAFE
+from beamline.scan.moves import SAFE, UNSAFE
 from tests.drivers.faults.table import WORDS
 
 ROOT = Path(__file__).parents[3]

@@ -18,7 +18,7 @@ from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
 from beamline.features.files.validate import validate
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
-from beamline.scan.run import SAFE, UNSAFE
+from beamline.scan.moves import SAFE, UNSAFE
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind

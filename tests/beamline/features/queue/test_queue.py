@@ -22,7 +22,7 @@ from beamline.features.queue.scans import (
     run_queue,
     summary,
 )
-from beamline.scan.run import UNSAFE
+from beamline.scan.moves import UNSAFE
 
 SIMULATED = config_folder() / "simulated.yaml"
 

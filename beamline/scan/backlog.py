@@ -1,0 +1,122 @@
+"""Backlog: how many frames may wait for the disk, what pauses a scan before memory or disk is full, time left."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+
+from beamline.core.events import FrameStored
+from beamline.core.machine import free_memory
+from beamline.core.stop import Cause, PauseRequest
+from beamline.core.text import count, size
+from beamline.plan.plan import Timeline
+from drivers.base.frame import Frame
+from drivers.frame_memory import FrameMemory
+
+WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
+WAITING_FRAMES = (4, 128)  # least and most frames
+CHECKED_FRAMES = 2  # most frames that wait between the recorder's threads
+CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
+EVENT_INTERVAL = 0.1  # real s between `frame` events
+RATE_FRAMES = 20  # the rate is that of the last so many frames
+
+
+def room(timeline: Timeline) -> int:
+    """Number of frames that can wait to be written."""
+    low, high = WAITING_FRAMES
+    return min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
+
+
+def frames_in_memory(timeline: Timeline) -> int:
+    """Largest number of frames in memory at a time: waiting, being written, and coming from the camera."""
+    return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
+
+
+def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[int, int]) -> str:
+    """Memory for the frames that may wait for the disk, before the first comes; a sentence on it, or "" without any.
+
+    At most a quarter of the free memory, as a live volume takes half.
+    """
+    n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
+    if memory is None or n == 0:
+        return ""
+    frames = f"Memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
+    try:
+        memory.prepare(n, shape)
+    except MemoryError:
+        return f"{frames}, cannot be had before they come"
+    return f"{frames}, is ready"
+
+
+def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> None:
+    """Pause a scan before its disk is full, until twice the limit is free.
+
+    Args:
+        reserve: bytes that must stay free for the frames that still come when the scan is to pause.
+        free: bytes of the disk.
+        left: bytes that are still to be written.
+    """
+    again = min(2 * reserve, left) + CLOSING
+    if left and free < min(reserve, left) + CLOSING:
+        pause.hold(
+            Cause.SPACE,
+            f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
+            f"{size(again)} the scan goes on by itself",
+        )
+    elif not left or free >= again:
+        pause.release(Cause.SPACE)
+
+
+def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
+    """Pause a fly scan before the queue is full, until few frames wait to be written.
+
+    Args:
+        most: frames that may wait.
+        waiting: frames that do.
+        checking, writing: busy s of the recorder's threads; the disk is behind if writing took longer.
+    """
+    if 4 * waiting >= 3 * most:
+        what, advice = (
+            ("the disk is behind", "a longer period_s or a faster disk")
+            if writing > checking
+            else ("the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it")
+        )
+        pause.hold(
+            Cause.BACKLOG,
+            f"{what}, {waiting} of at most {most} frames wait in memory. The scan goes on by "
+            f"itself when most of them are written; {advice} spares the pauses",
+        )
+    elif 4 * waiting <= most:
+        pause.release(Cause.BACKLOG)
+
+
+class Progress:
+    """Data of the `frame` event: frames written, rate, time left."""
+
+    def __init__(self, timeline: Timeline) -> None:
+        self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
+        # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
+        periods = np.concatenate([np.full(block.left, block.period) for block in timeline.blocks])
+        self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
+        self._times: deque[float] = deque(maxlen=RATE_FRAMES)
+        self._last_event = -EVENT_INTERVAL
+
+    def expect_more(self, done: int, n: int, seconds: float) -> None:
+        """Count `n` frames that were not planned; they come after `done` frames and take `seconds`."""
+        before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
+        self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
+        self.total += n
+
+    def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
+        """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
+        self._times.append(frame.time)
+        now = time.monotonic()
+        if now - self._last_event < EVENT_INTERVAL and n < self.total:
+            return None
+        self._last_event = now
+        span = self._times[-1] - self._times[0]
+        rate = (len(self._times) - 1) / span if span > 0 else 0.0
+        seconds = float(self._ahead[min(n, self.total)])
+        return FrameStored(n, self.total, frame.kind.name.lower(), rate, rate * self._bytes / 1e6, seconds, mean)

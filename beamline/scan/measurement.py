@@ -1,0 +1,307 @@
+"""Measurement: acquisition, decider, recorder and live reconstruction of one scan, until its file is closed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+from beamline.config.load import Config
+from beamline.config.monitor import policies
+from beamline.core.errors import ReferencesError, ScanStopped, user_message
+from beamline.core.events import ScanDone, Sink, StateEntered, Warned
+from beamline.core.files import RECON_LOG, SCAN
+from beamline.core.run_result import RunResult
+from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.text import count
+from beamline.instrument.connect import ConnectedDevices, enter_pressed
+from beamline.plan.choose import Wish
+from beamline.plan.plan import Block, Retake, spread_retakes
+from beamline.plan.timeline import block_seconds
+from beamline.scan.acquisition import Acquisition
+from beamline.scan.backlog import prepare_memory
+from beamline.scan.control import State, StateMachine
+from beamline.scan.decider import Decider
+from beamline.scan.flagged import AlarmReaction, FlaggedFrames
+from beamline.scan.ledger import LedgerError
+from beamline.scan.live_process import LiveReconstruction, live_should_end
+from beamline.scan.moves import SAFE, UNSAFE
+from beamline.scan.preflight import ReadyScan
+from beamline.scan.recorder import Recorder
+from beamline.scan.references import REFERENCES, ReferenceReport
+from beamline.scan.resume import ResumableRun
+from beamline.scan.supervision import PAUSE_POLL, BeamLog, Supervision, beam_log
+from beamline.simulate import LabelLog, labels_path, write_labels
+from beamline.storage.writers.nxtomo import NXtomoWriter
+
+READY_WITHIN = 300.0
+"""Real s that a scan waits for its live reconstruction, which compiles once on a machine: before its first frame. A
+simulated one, whose references do not age, waits before its first view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """The frames of a scan on connected devices, from the first one to the closed file.
+
+    Attributes:
+        began: when the run did, on the monotonic clock.
+        series: the run that goes on, if one does.
+    """
+
+    config: Config
+    instrument: ConnectedDevices
+    ready: ReadyScan
+    folder: Path
+    stop: StopRequest
+    sink: Sink
+    began: float
+    series: ResumableRun | None
+    pause: PauseRequest = field(default_factory=PauseRequest)
+
+    @cached_property
+    def states(self) -> StateMachine:
+        return StateMachine(self.sink)
+
+    @cached_property
+    def references(self) -> ReferenceReport:
+        return ReferenceReport(self.config.references, self.ready.plan.exposure, self.sink)
+
+    @cached_property
+    def decider(self) -> Decider:
+        scan, timeline, devices = self.config.scan, self.ready.timeline, self.instrument.devices
+
+        def seconds_of(block: Block) -> float:
+            return block_seconds(
+                block, devices.stage.limits, self.ready.timing, self.ready.plan.settle, devices.stage.position()
+            )
+
+        after = timeline.blocks[timeline.blocks.index(timeline.views) :]
+        return Decider(
+            asks=scan.decide == "ask",
+            wish=Wish(**dict(scan.wish)),
+            wait=scan.wait_s,
+            timeline=timeline,
+            seconds_of=seconds_of,
+            now=self.instrument.clock.now,
+            states=self.states,
+            stop=self.stop,
+            sink=self.sink,
+            seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
+            + (self.series.seconds if self.series else 0.0),
+            number=len(timeline.plan.choices),
+            close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
+        )
+
+    def take(self, command: Sequence[str] | None, release: Callable[[], None]) -> RunResult:
+        """Take the scan, and close its file.
+
+        Args:
+            command: of the live reconstruction.
+            release: called when the instrument is free for another scan.
+        """
+        storage, shape = self.config.storage, self.ready.timing.shape
+        if sentence := prepare_memory(self.instrument.frame_memory, self.ready.timeline, shape):
+            self.sink(StateEntered(self.states.state, sentence))
+        writer = NXtomoWriter(
+            self.folder / SCAN,
+            self.ready.info,
+            shape,
+            clock=self.instrument.clock,
+            preview_bin=storage.preview_bin,
+            flush_every=storage.flush_every,
+        )
+        with ExitStack() as ending:
+            follower = None
+            if command is not None:
+                log, on_law = self.folder / RECON_LOG, self.decider.add_law
+                follower = LiveReconstruction(command, log, self.sink, on_law)
+                ending.callback(follower.close)
+            return self._acquire_and_follow(writer, follower, release)
+
+    def _acquire_and_follow(
+        self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
+    ) -> RunResult:
+        recorder = self._recorder(writer)
+        beam = beam_log(self.config.devices.beam_monitor, self.instrument.beam_monitor, self.sink, self.pause)
+        acquisition = self._acquisition(recorder, beam, follower)
+        labels = LabelLog()
+        ended = _Ending(self.sink)
+        with ended.kept(), beam:
+            self._acquire(acquisition, recorder, labels, follower)
+        self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
+        with ended.kept():
+            recorder.finish()
+        faults = self.references.faults(recorder.references)
+        missing, closed = acquisition.missing, False
+        early = "stopped" if isinstance(ended.error, ScanStopped) else "failed"
+        status, reason = ("complete", "") if ended.error is None else (early, user_message(ended.error))
+        with ended.kept():
+            if not recorder.hangs:  # a write that does not return holds HDF5's lock: closing would wait for it
+                writer.close(status, missing, beam.readings, reason)
+                closed = True
+        with ended.kept():
+            if self.instrument.simulated is not None and not recorder.hangs:
+                write_labels(labels_path(writer.path), labels.runs(writer.committed), writer.committed)
+        for remark in filter(None, (*writer.remarks, recorder.unjudged)):
+            self.sink(Warned(remark))
+        with ended.kept():
+            release()
+        path, n_frames = writer.path, writer.committed
+        with ended.kept():
+            if self.series is not None and n_frames and closed:
+                path, n_frames = self.series.join(path)
+        result = RunResult(
+            path=path,
+            n_frames=n_frames,
+            missing=tuple(missing),
+            flags=recorder.flagged.counts,
+            alarmed_frames=len(recorder.flagged.alarmed),
+            alarmed_views=len(recorder.flagged.alarmed_views),
+            retaken=recorder.flagged.retaken + acquisition.recovered,
+            reference_faults=tuple(faults.values()),
+            seconds=time.monotonic() - self.began,
+            bytes=writer.path.stat().st_size,
+            recon=None,
+            status=status,
+            sample=self.config.sample.name,
+        )
+        self.sink(ScanDone(result))
+        if follower is not None:
+            useless = not closed or isinstance(ended.error, ReferencesError)
+            recon = follower.finish(live_should_end(self.stop, useless), lambda: self.stop.aborting)
+            result = replace(result, recon=recon)
+        if ended.error is not None:
+            raise ended.error
+        return replace(result, seconds=time.monotonic() - self.began)
+
+    def _acquire(
+        self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
+    ) -> None:
+        if self.config.simulation is None and follower is not None:
+            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+        # Closing the iterator is what makes the instrument safe when the recorder fails.
+        with closing(acquisition.frames()) as frames:
+            for frame in frames:
+                self.decider.began = min(self.decider.began, frame.time)
+                if self.instrument.simulated is not None:
+                    labels.add(frame.index, self.instrument.simulated.labels(frame.time))
+                recorder.put(frame)
+
+    def _recorder(self, writer: NXtomoWriter) -> Recorder:
+        monitor = self.config.monitor
+        return Recorder(
+            writer,
+            self.ready.monitor,
+            self.ready.timeline,
+            preview_bin=self.config.storage.preview_bin,
+            sink=self.sink,
+            flagged=FlaggedFrames(
+                self.sink,
+                AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
+                monitor.retaken_warnings,
+            ),
+            pause=self.pause,
+            stop=self.stop,
+        )
+
+    def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:
+        ready, instrument, decider = self.ready, self.instrument, self.decider
+        acquisition = Acquisition(
+            instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
+            self.sink,
+            Supervision(
+                lambda: self._refusal(recorder, follower), self.pause, lambda: wait_in_pause(recorder), self.states,
+                lambda missing: self._retakes(recorder, missing),
+                lambda: beam.wait_for_reading(lambda: self.stop.stopping),
+                next_pass=None if self.config.scan.decide == "off" else decider,
+                pass_ended=recorder.end_pass,
+                n_retakable=lambda missing: len(self._to_retake(recorder, missing)[0]),
+            ),
+        )  # fmt: skip
+
+        def wait_a_moment() -> bool:
+            acquisition.wait_while_paused(reopen=False)
+            return wait_in_pause(recorder)
+
+        cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
+        ended = "no live reconstruction is running"
+        decider.unable = lambda: cone or (ended if follower is None or follower.ended else "")
+        decider.record, decider.wait_a_moment = recorder.add_decision, wait_a_moment
+        return acquisition
+
+    def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
+        """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
+        recorder.wait()
+        if self.config.simulation is not None and follower is not None:
+            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+        if self.stop.stopping:
+            return None
+        blocks = self.ready.timeline.blocks
+        faults = self.references.faults(recorder.references, blocks[: blocks.index(self.ready.timeline.views)])
+        if not faults or self.config.references.on_fault == "log":
+            return None
+        return (
+            f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
+            f"The shutter was asked to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
+            "at a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the "
+            "scan as it is."
+        )
+
+    def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
+        """Views that were flagged for it or gave no frame, which are announced."""
+        chosen, n = self._to_retake(recorder, missing)
+        if not chosen:
+            return ()
+        if len(chosen) < n:
+            self.sink(
+                Warned(
+                    f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
+                    f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
+                )
+            )
+        recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
+        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
+        return chosen
+
+    def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
+        """Views that were flagged or gave no frame, and their number; of more than the plan allows, an even spread."""
+        most = self.ready.plan.retakes - recorder.announced
+        if not most:
+            return (), 0
+        recorder.wait()
+        lost, n = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
+        once = [view for view in recorder.flagged.views_to_retake if view.trigger < n]  # others were taken again
+        bad = sorted([*once, *lost], key=lambda view: view.trigger)
+        return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
+
+
+def wait_in_pause(recorder: Recorder) -> bool:
+    """Wait a moment during a pause, and check the disk; returns whether Enter was pressed at the terminal."""
+    time.sleep(PAUSE_POLL)
+    recorder.check()
+    return enter_pressed()
+
+
+class _Ending:
+    """The error that ends a run, raised after everything is closed: any other one before a stop or lost frames, which
+    become a warning."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self.error: BaseException | None = None
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """A step whose failure does not keep the next ones from being taken."""
+        try:
+            yield
+        except BaseException as after:
+            if self.error is None or after is self.error:
+                self.error = after
+                return
+            if isinstance(self.error, ScanStopped | LedgerError):
+                self.error, after = after, self.error
+            self._sink(Warned(str(after)))

@@ -1,0 +1,174 @@
+"""Moves: stage, shutter and sample come to where a block needs them, are looked at again, and are left safe."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from beamline.core.errors import BeamlineError, InstrumentError
+from beamline.core.events import Sink, Warned
+from beamline.core.stop import ScanAborted, StopRequest
+from beamline.core.text import count, spans
+from beamline.plan.plan import Block
+from beamline.plan.timeline import move_seconds
+from beamline.scan.tally import ASTRAY_ADVICE
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import Devices, Rechecked, RotationStage
+
+SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
+UNSAFE = (
+    "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
+    "the last frames are being written"
+)
+"""The same where a device failed while the instrument was made safe; warnings name it."""
+POLL = 0.02  # s between status queries of a moving stage
+
+
+def go(stage: RotationStage, angle: float, clock: Clock, stop: StopRequest, *, until_stop: bool = True) -> bool:
+    """Move to `angle` at full speed and wait; returns False if a stop (or only an abort) interrupted the move."""
+    limits = stage.limits
+    distance = angle - stage.position()
+    stage.start_move(angle, limits.max_speed)
+    return arrive(stage, move_seconds(distance, limits.max_speed, limits.acceleration), clock, stop, until_stop)
+
+
+def arrive(stage: RotationStage, seconds: float, clock: Clock, stop: StopRequest, until_stop: bool = True) -> bool:
+    """Wait for a move that should take `seconds`; False if a stop cut it short."""
+    deadline = clock.now() + 2 * seconds + 5.0
+    while stage.moving():
+        stop.refuse_abort()
+        if until_stop and stop.stopping:
+            stand(stage, clock, stop)
+            return False
+        if clock.now() > deadline:
+            break
+        clock.sleep(POLL)
+    stage.wait(timeout=POLL)  # raises if the stage still moves or stopped short
+    return True
+
+
+def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
+    """Decelerate and wait until the stage stands. Raises InstrumentError if it does not."""
+    limits = stage.limits
+    deadline = clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
+    stage.stop()
+    while stage.moving():
+        stop.refuse_abort()
+        if clock.now() > deadline:
+            raise InstrumentError(f"{stage.name}: it is still moving after a stop. Use its emergency stop.")
+        clock.sleep(POLL)
+
+
+def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
+    """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
+    anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
+    moving, after = stage.moving(), stage.position()
+    wanted, most = stage.to_counts(angle), stage.limits.tolerance
+    if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
+        return (before + after) / 2, ""
+    return after, (
+        f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
+        f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
+        f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
+    )
+
+
+def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[], None]) -> None:
+    """Bring shutter and sample where the block needs them; a shutter that does not move ends the scan.
+
+    Args:
+        warm_up: called once a closed shutter has opened.
+    """
+    shutter, sample, kind = devices.shutter, devices.sample, block.kind
+    if kind is FrameKind.DARK:
+        shutter.close()
+    else:
+        sample.out() if kind is FrameKind.FLAT else sample.back(block.aside)
+        cold = not shutter.is_open()
+        shutter.open()
+        if cold:
+            warm_up()
+    if wrong := _wrong_shutter(kind, shutter.is_open()):
+        raise InstrumentError(f"{shutter.name}: {wrong}. Check its interlock. Earlier frames are in the file.")
+
+
+def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
+    """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
+    shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
+    if not shutter.by_hand:
+        # A scan that is stopped in a pause ends with a closed one.
+        remembered[shutter.name] = lambda: "" if stop.stopping else _wrong_shutter(kind, shutter.is_open())
+    for device in (devices.sample, devices.filter, devices.monochromator):
+        if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
+            remembered[device.name] = device.remember_place()
+    return remembered
+
+
+def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range, stop: StopRequest) -> None:
+    """InstrumentError if a device that was moved and then believed is no longer where it stood before a block."""
+    moved = {name: problem for name, look in looks.items() if (problem := look())}
+    if moved and rows and not stop.aborting:
+        raise InstrumentError(
+            f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. It was moved while "
+            f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken: which of "
+            "them show it elsewhere is not known, so none should be used. Look who or what moved it, bring it "
+            "back, and take the scan again. What was taken before is good."
+        )
+
+
+def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
+    """What is wrong with a shutter for this kind of frame; "" if it is as it must be."""
+    if is_open is not (kind is FrameKind.DARK):
+        return ""
+    wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
+    return f"it is {actual}, {kind.name.lower()}s need it {wanted}"
+
+
+def make_safe(
+    devices: Devices, home: float | None, clock: Clock, stop: StopRequest, sink: Sink
+) -> tuple[list[BaseException], bool]:
+    """Stop the stage, disarm, close the shutter; all steps are tried.
+
+    Args:
+        home: where the stage goes then, after the sample is back, rad; None: both stay.
+
+    Returns:
+        the first error of each step, and whether stage, camera or shutter may be as during the scan.
+    """
+    stage, camera, shutter = devices.stage, devices.camera, devices.shutter
+    failed: list[BaseException] = []
+
+    def attempt(*ways: Callable[[], object]) -> bool:
+        """Try the actions in turn until one works: a serial line that failed once often works again."""
+        failures: list[BaseException] = []
+        for way in ways:
+            try:
+                way()
+            except ScanAborted:  # requested while the stage was moving here
+                return attempt(stage.abort, stage.abort)
+            except BaseException as error:  # a failure of one device must not leave the others unsafe
+                failures.append(error)
+            else:
+                for failure in failures:
+                    sink(Warned(in_words(failure)))
+                return True
+        failed.append(failures[0])
+        return False
+
+    halts = (*[lambda: stand(stage, clock, stop)] * 2, stage.abort)
+    attempt(*((stage.abort, stage.abort) if stop.aborting else halts))
+    attempt(camera.disarm, camera.disarm)
+    attempt(shutter.close, shutter.close)
+    attempt(stage.disarm, stage.disarm)
+    if home is None or failed or stop.aborting:
+        return failed, bool(failed)
+    attempt(devices.sample.back)
+    went_home = attempt(lambda: go(stage, home, clock, stop, until_stop=False))
+    return failed, not (went_home or attempt(*halts))
+
+
+def in_words(error: BaseException) -> str:
+    """The message of an error; with its type if it is not ours."""
+    return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"

@@ -1,0 +1,146 @@
+"""Tally: what came of each block of a scan, in numbers and in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from beamline.core.text import spans
+from beamline.plan.plan import Block
+from beamline.scan.ledger import Ledger
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraFrame
+
+NAMED = 5  # views that a sentence names
+DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
+TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
+ASTRAY_ADVICE = (
+    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
+    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
+    "that a move is done"
+)
+
+Exposed = tuple[CameraFrame, int, float, bool]
+"""A frame, its trigger within the block or EXTRA, where the stage was (rad), and whether that was its angle."""
+
+
+@dataclass
+class BlockTally:
+    """A block with its frames and missing triggers; filled while the block is recorded.
+
+    Attributes:
+        again: the block repeats views, so losing them is no failure.
+        frames: delivered, with and without a trigger.
+        rows: by trigger, counted within the block, the row and the time of its last frame.
+        missing: triggers, counted within the block, whose expected frame did not come.
+        lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
+        extra: frames that no trigger exposed.
+        unconfirmed: of the extra ones, those exposed while the stage braked.
+        shift, off: the largest of the passes, see `Ledger`.
+        astray: by trigger, of the frames exposed while the stage was not at its angle, the row and where it was, rad.
+    """
+
+    block: Block
+    again: bool = False
+    frames: int = 0
+    rows: dict[int, tuple[int, float]] = field(default_factory=dict)
+    missing: list[int] = field(default_factory=list)
+    lost: int = 0
+    ignored: int = 0
+    extra: int = 0
+    unconfirmed: int = 0
+    shift: int = 0
+    off: float = 0.0
+    astray: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
+
+    def miss(self, triggers: Iterable[int]) -> None:
+        """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
+        self.missing += [trigger for trigger in triggers if trigger not in self.rows]
+
+    def enter(self, settled: Ledger, first: int) -> None:
+        """Add a pass whose first trigger is `first`."""
+        self.miss(first + i for i in settled.missing)
+        self.lost += settled.lost
+        self.ignored += settled.ignored
+        self.extra += len(settled.extra)
+        self.unconfirmed += settled.unconfirmed
+        self.shift = max(self.shift, settled.shift)
+        self.off = max(self.off, settled.off)
+
+
+def first_taken(done: Iterable[BlockTally]) -> list[BlockTally]:
+    """Tallies of the views, without those that repeat views."""
+    return [taken for taken in done if taken.block.kind is FrameKind.PROJECTION and not taken.again]
+
+
+def missing_views(done: Iterable[BlockTally]) -> tuple[int, ...]:
+    """Triggers of the views that gave no frame, in ascending order."""
+    return tuple(sorted(i for taken in first_taken(done) for i in taken.missing))
+
+
+def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
+    """These views have a frame: they are not missing, if they were. Returns how many were."""
+    came = [(taken, i) for taken in first_taken(done) for i in {*taken.missing}.intersection(triggers)]
+    for taken, trigger in came:
+        taken.missing.remove(trigger)
+    return len(came)
+
+
+def astray_views(taken: BlockTally) -> str:
+    """A sentence on frames exposed while the stage was not at its angle, and where it was."""
+    where = [
+        f"view {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: {math.degrees(places[-1][1]):.4f}°"
+        for trigger, places in list(taken.astray.items())[:NAMED]
+    ]
+    more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
+    return (
+        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of {len(taken.astray)} "
+        f"views ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+    )
+
+
+def discrepancies(done: Sequence[BlockTally]) -> str:
+    """Sentences on missing, extra and doubtful frames of these blocks, each after a space."""
+    return "".join(f" {text}" for taken in done if (text := _of_block(taken)))
+
+
+def _of_block(taken: BlockTally) -> str:
+    """Sentences on missing, extra and doubtful frames of a block; a view that was repeated misses none."""
+    block, noun = taken.block, taken.block.kind.name.lower()
+    text = ""
+    if taken.missing and not taken.again:
+        n = len(taken.missing)
+        angles = np.degrees(block.angles[taken.missing])
+        at = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
+        text = f"{n} of {block.n} {noun}s are missing: {spans(taken.missing)}{at}."
+        if taken.lost:
+            text += (
+                f" {taken.lost} were exposed but never delivered by the camera: `beamline doctor` looks at its link "
+                "and at the disk."
+            )
+        if astray := sum(trigger in taken.astray for trigger in taken.missing):
+            text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
+        if taken.ignored:
+            text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
+    if untriggered := taken.extra - taken.unconfirmed:
+        text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
+    if taken.unconfirmed:
+        text += (
+            f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
+            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
+            "stage's. They are kept as invalid rows."
+        )
+    if taken.shift:
+        text += (
+            f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "
+            "ends frames are missing or too many."
+        )
+    if text and taken.off > DOUBTFUL:
+        text += (
+            f" A frame came {taken.off:.2f} periods off its trigger: its angle may be wrong by as much of a step "
+            "(warnings of `timing` name such frames)."
+        )
+    return text.strip()
