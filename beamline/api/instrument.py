@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from beamline.config.beam import NoMonochromator
-from beamline.config.load import NO_LIVE, Config, changed, load, override_of
+from beamline.config.load import NO_DECISIONS, NO_LIVE, Config, changed, load, override_of
 from beamline.core.errors import ConfigError, refuse_wrong_arguments
-from beamline.core.events import Event, ReconDone, RunDone, ScanDone
+from beamline.core.events import Event, RunDone, ScanDone
+from beamline.core.recon_events import ReconDone
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals
@@ -136,6 +137,8 @@ class Instrument:
             if self._say is not None and not isinstance(event, RunDone) and (text := sentence(event)):
                 self._say(text)
 
+        if not live and config.scan.decide != "off" and self._say is not None:
+            self._say(NO_DECISIONS.format(config.scan.decide))
         config = config if live else changed(config, NO_LIVE)
         how = commands_of(config) if live else Commands()
         if how.remark and self._say is not None:

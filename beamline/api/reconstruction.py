@@ -16,14 +16,16 @@ from beamline.api.instrument import Say, to_stderr
 from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
-from beamline.core.events import Event, VolumeDone
+from beamline.core.events import Event
 from beamline.core.files import JOINED, SCAN, parts_of
+from beamline.core.recon_events import VolumeDone
 from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
-from beamline.projections.replay import ScanVerdict, awaited, frames_of, replay, verdict
+from beamline.projections.replay import ScanVerdict, replay, verdict
+from beamline.projections.replayed_frames import awaited, frames_of
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file

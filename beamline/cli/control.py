@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,13 +16,15 @@ from beamline.cli.options import POSITIVE, config_argument, json_events, json_op
 from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.events import Done, Sink
 from beamline.core.stop import terminated_like_interrupted
+from beamline.plan.passes import Choice
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
-CHOICES = ("next", "again", "wide", "retake", "enough")  # those of `beamline.plan.passes`, which help does not load
+CHOICES = tuple(Choice)
+_LOOKS = 10  # a tenth of a second apart: the log of events may be written a moment after the state
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
@@ -39,7 +42,6 @@ def _command(verb: str, help_text: str) -> click.Command:
 def _send(run: Path | None, word: str) -> None:
     """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # here: help does not need it
-    from beamline.plan.passes import Choice
     from beamline.scan.control import Verb, tell
 
     runs = Path(StorageSection.model_fields["folder"].default)
@@ -54,17 +56,19 @@ def _send(run: Path | None, word: str) -> None:
 
 def _require_chosen(run: Path, choice: str) -> None:
     """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
-    from beamline.core.events import event_in
+    from beamline.core.event_lines import event_in
     from beamline.core.files import EVENTS, parts_of
 
-    with (parts_of(run)[-1] / EVENTS).open("rb") as log:
-        decisions = [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
-    last = decisions[-1] if decisions else {}
-    if last.get("choice") != choice:
-        taken = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing"
-        raise ConfigError(
-            f"the scan in {run} does not take {choice}, which was not on offer or came too late; {taken}."
-        )
+    last: Mapping[str, Any] = {}
+    for _ in range(_LOOKS):
+        with (parts_of(run)[-1] / EVENTS).open("rb") as log:
+            decisions = [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
+        last = decisions[-1] if decisions else {}
+        if last.get("choice") == choice:
+            return
+        time.sleep(0.1)
+    instead = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing so far"
+    raise ConfigError(f"the scan in {run} does not take {choice}, which was not on offer or came too late; {instead}.")
 
 
 @click.command()

@@ -23,9 +23,10 @@ from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Event, FitReached, StateEntered
+from beamline.core.events import Done, Event, StateEntered
 from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
+from beamline.core.recon_events import FitReached
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import safe_name

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,11 +94,9 @@ class ScanRequest:
         return self.files[0] if self.files else None
 
     @property
-    def settings(self) -> tuple[str, ...]:
-        """The overrides, with those of --no-live, which a resumed run keeps."""
-        from beamline.config.load import NO_LIVE
-
-        return *self.overrides, *(NO_LIVE if self.no_live else ())
+    def unless_live(self) -> Callable[[str], None] | None:
+        """With --no-live, which a resumed run keeps: prints what the run then does not do."""
+        return partial(click.echo, err=True) if self.no_live else None
 
 
 @click.command(cls=Repeatable)
@@ -130,7 +129,9 @@ def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> N
     from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
     file, run = request.file, request.run
-    config = None if file is None else load(file, request.settings, rehearse=request.rehearse)
+    config = (
+        None if file is None else load(file, request.overrides, rehearse=request.rehearse, no_live=request.unless_live)
+    )
     frames_by_energy = _config_of_energies(config, run, request.documents)
     if frames_by_energy is not None and not request.dry:
         _show_energies(take_energies(frames_by_energy, request, [json_sink], StopRequest()), request, json_sink)

@@ -24,7 +24,6 @@ from beamline.core.events import (
     Done,
     Event,
     Failed,
-    FitReached,
     FrameStored,
     KernelsCompiled,
     PhaseReached,
@@ -32,9 +31,9 @@ from beamline.core.events import (
     RunStarted,
     Sink,
     TrialReached,
-    VolumeDone,
 )
 from beamline.core.process import ChildProcess
+from beamline.core.recon_events import FitReached, VolumeDone
 from beamline.core.sinks import Narration, Warnings, lines
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import SENTENCE, one_line, printable

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,9 @@ from drivers.base.protocols import CameraSettings, TriggerSource
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
+NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none: its plan is taken as it is."
+"""For the operator of such a run, where it would decide otherwise."""
+
 
 def load(
     path: str | Path,
@@ -47,6 +50,7 @@ def load(
     environment: Mapping[str, str] | None = None,
     *,
     rehearse: bool = False,
+    no_live: Callable[[str], None] | None = None,
 ) -> Config:
     """Read and validate a configuration file.
 
@@ -56,6 +60,8 @@ def load(
     Args:
         environment: os.environ unless given.
         rehearse: with the simulated counterpart of each device of a real instrument; see `rehearsal`.
+        no_live: given for a run without a reconstruction, whatever the file says; takes a sentence on what it then
+            does not do.
 
     Raises:
         ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
@@ -77,6 +83,11 @@ def load(
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment, takes_text)
+    if no_live is not None:
+        scan = tree.data.get("scan")
+        if isinstance(scan, dict) and scan.get("decide") in ("ask", "do"):
+            no_live(f"{path}: {NO_DECISIONS.format(scan['decide'])}")
+        tree = override(tree, NO_LIVE, {}, takes_text)
     config = _validated(tree, str(path))
     return _validated(Tree(rehearsal(config), tree.origins), str(path)) if rehearse else config
 

@@ -107,12 +107,14 @@ class Fields(Section):
 
 
 class WishSection(Section):
-    """Limits of a scan that decides: it keeps all that are given; null is no limit."""
+    """What ends a scan that decides, whichever comes first; null: that does not end it."""
 
     quality_db: Annotated[float, Field(gt=0, le=100)] | None = Field(
-        default=None, description="dB of PSNR that the volume may stay below that of the whole plan."
+        default=None, description="dB of PSNR by which the volume may stay below that of the whole plan."
     )
-    seconds: Seconds | None = Field(default=None, description="Of the scan from its first frame, at most.")
+    seconds: Seconds | None = Field(
+        default=None, description="From the first frame to the last flats and darks, at most."
+    )
     dose: Annotated[float, Field(gt=0, le=1)] | None = Field(
         default=None, description="Share of the plan's exposures with light on the sample, at most."
     )
@@ -229,7 +231,7 @@ class ReconSection(Section):
         if isinstance(data, dict) and "stop_when" in data:
             raise ValueError(
                 "stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db: 0.5} ends a "
-                "scan when the views to come would add so few dB"
+                "scan when all views to come would add 0.5 dB at most"
             )
         return data
 
@@ -326,7 +328,7 @@ class Config(Section):
             "as 60": 0 < scan.pass_views < getattr(angles, "views", math.inf) if scan.mode is Mode.STEP else interlaced,
         }
         if scan.decide != "off" and not all(needs.values()):
-            lacking = next(what for what, there in needs.items() if not there)
+            lacking = next(need for need, met in needs.items() if not met)
             raise ValueError(f"scan.decide {scan.decide} needs {lacking}; off takes the plan as it is")
         return self
 

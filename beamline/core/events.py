@@ -1,11 +1,13 @@
-"""Events: everything that happens in a run, one class a kind. Terminal, events.jsonl and log are sinks of them."""
+"""Events: everything that happens in a run, one class a kind. Terminal, events.jsonl and log are sinks of them.
+
+Here are the kinds of a scan and of any command; `recon_events` has those of reconstructions.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, dataclass_transform
@@ -13,24 +15,24 @@ from typing import Any, ClassVar, dataclass_transform
 import numpy as np
 
 from beamline.core.flag import Flag
-from beamline.core.process import json_object
 from beamline.core.run_result import RunResult
 
 KINDS: dict[str, list[type[Event]]] = {}
 """The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
-_SPREAD = "spread"
+SPREAD = "spread"
+"""Key of a field's metadata, see `spread`."""
 
 
-def _spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **of_field: Any) -> Any:
+def spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **of_field: Any) -> Any:
     """A field whose own values stand in the line: a mapping, or what `of` makes of another value, here its attributes.
 
     Args:
         made: of the values in a line of another process.
     """
-    return field(metadata={_SPREAD: (of, made)}, **of_field)
+    return field(metadata={SPREAD: (of, made)}, **of_field)
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(field, _spread))
+@dataclass_transform(frozen_default=True, field_specifiers=(field, spread))
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """Something that happened; each kind is a frozen dataclass. Fields with their default value are not written.
@@ -60,8 +62,8 @@ class Event:
         own_fields = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
         for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):
             value = getattr(self, each.name)
-            if _SPREAD in each.metadata:
-                values |= value if isinstance(value, Mapping) else each.metadata[_SPREAD][0](value)
+            if SPREAD in each.metadata:
+                values |= value if isinstance(value, Mapping) else each.metadata[SPREAD][0](value)
             elif value is not each.default:
                 values[each.name] = value
         return values
@@ -76,42 +78,6 @@ class Event:
 
 
 Sink = Callable[[Event], None]  # Takes events
-
-
-def event_of(values: Mapping[str, Any]) -> Event:
-    """The event in a JSON line of another process. Raises ValueError if no kind of event has these values."""
-    given = {name: value for name, value in values.items() if name != "event"}
-    for each in KINDS.get(str(values.get("event")), ()):
-        spread = {item.name: item.metadata[_SPREAD][1] for item in fields(each) if _SPREAD in item.metadata}
-        own = {item.name for item in fields(each) if item.name not in spread}
-        rest = {name: value for name, value in given.items() if name not in own}
-        with suppress(TypeError):  # other fields, or the values are not those of the dataclass that is spread
-            taken = {name: made(**rest) for name, made in spread.items()} or rest
-            return each(**{name: value for name, value in given.items() if name in own}, **taken)
-    raise ValueError(f"no kind of event has the values {dict(values)}")
-
-
-LONGEST = 2**20
-"""Most bytes of a line of a log: a scan with 100,000 missing triggers takes 700 kB to say so."""
-LARGEST_LOG = 2**30
-"""Bytes of a log that are read: those of a week with ten lines a second."""
-
-
-def event_in(line: str | bytes) -> dict[str, Any] | None:
-    """The values of an event in a line of a log; None if the line is no event.
-
-    Only its kind and its time are looked at: fields may lack, be unknown, or have other types, as of another version.
-    """
-    with suppress(UnicodeDecodeError):
-        text = line.decode() if isinstance(line, bytes) else line
-        values = json_object(text) if len(text) <= LONGEST else None
-        if values is not None and isinstance(values.get("event"), str) and _is_time(values.get("time", 0.0)):
-            return values
-    return None
-
-
-def _is_time(value: Any) -> bool:
-    return isinstance(value, int | float) and abs(value) < math.inf
 
 
 def _of_no_json_type(value: Any) -> Any:
@@ -143,7 +109,7 @@ class StateEntered(Event, event="state"):
 
     state: str
     message: str
-    more: Any = _spread(default_factory=dict)
+    more: Any = spread(default_factory=dict)
 
 
 class BlockStarted(Event, event="block_started"):
@@ -194,7 +160,7 @@ class BeamRead(Event, event="beam"):
 class FrameFlagged(Event, event="flag"):
     """A check of the monitor begins to flag, or flags at another level."""
 
-    flag: Flag = _spread(Flag.event_values, Flag)
+    flag: Flag = spread(Flag.event_values, Flag)
 
 
 class RuleBroken(Event, event="flag"):
@@ -212,63 +178,16 @@ class Warned(Event, event="warning"):
     state: str | None = None
 
 
-class SnapshotWritten(Event, event="snapshot"):
-    """The volume so far is in a file.
-
-    Attributes:
-        unlearnt: relative residual of new views before the fit has learnt them.
-        method: whose volume it is, the one that predicts views held out better.
-        errors: of each method in these views, in the measure of the volume.
-    """
-
-    path: Path
-    picture: Path
-    n_views: int
-    seconds: float
-    unlearnt: float | None
-    method: str = ""
-    errors: Mapping[str, float] | None = None
-
-
-class SlicesDrawn(Event, event="slices"):
-    """A picture has FBP slices of the views so far. degrees: angle of the half turn that the views cover."""
-
-    picture: Path
-    n_views: int
-    degrees: float
-
-
-class LawMeasured(Event, event="error_law"):
-    """How the error of the volume falls with further views, by the live reconstruction at the end of a pass.
-
-    Attributes:
-        number: of the pass, from 1.
-        n_views, exponent, exponent_error, noise, offset: as of `recon.base.error_law.ErrorLaw`, of the views that the
-            live reconstruction uses.
-        gained: dB by the last pass, as views held out measure it; None: not known.
-        reason: why these views have no law; then the other numbers are NaN.
-    """
-
-    number: int
-    n_views: int
-    exponent: float
-    exponent_error: float
-    noise: float
-    offset: float
-    gained: float | None = None
-    reason: str = ""
-
-
 class PassEnded(Event, event="pass_ended"):
     """A pass of views is over. What is next is being chosen, or the operator is asked.
 
     Attributes:
         number: of the pass, from 1; n_views: so far.
         options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
-            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known yet).
+            dose (share of the plan's), bytes, and gain, low, high in dB (None: not known).
         recommended: the choice that the program takes or would take.
         wait: real s for which the operator is asked; 0: nobody is.
-        remark: a sentence, where no prediction is there.
+        remark: a sentence on why no gain is known; "" where they are.
     """
 
     number: int
@@ -287,9 +206,9 @@ class NextChosen(Event, event="next_chosen"):
         choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
         reason: a sentence.
         options: as of `PassEnded`.
-        predicted, gained: dB by an earlier choice, the newest that a law has judged since the last event, as predicted
-            then and as measured now; None: not known.
-        judged: number of the pass after which that choice was made.
+        predicted, gained: dB by an earlier choice, as predicted then and as measured now: the newest choice that a law
+            has judged since the event before; None: not known.
+        judged: number of the pass after which that earlier choice was made.
     """
 
     number: int
@@ -344,88 +263,16 @@ class KernelsCompiled(Event, event="progress"):
     seconds: float
 
 
-class FitReached(Event, event="progress"):
-    """Progress of a fit or of iterations: the fields of `recon.base.method.Progress`, a rate and the time left.
-
-    waiting: views of a growing scan that are in the file, and that no step has learnt yet.
-
-    Numbers of another process are None where they are not finite.
-    """
-
-    stage: str
-    step: int
-    steps: int
-    seconds: float
-    loss: float | None
-    residual: float | None
-    n_gaussians: int
-    n_views: int
-    held_out: float | None
-    unit: str
-    per_s: float | None
-    eta_s: float | None
-    waiting: int = 0
-
-
 class ScanDone(Event, event="scan_done"):
     """The scan file is closed."""
 
-    result: RunResult = _spread(RunResult.file_values, RunResult)
-
-
-class ReconStarted(Event, event="recon_started"):
-    """Line integrals are ready, and the method begins. again: a live fit restarts because its axis has moved.
-
-    more: of a finished scan, values by name; `axis_confident` is None where the axis was given.
-    """
-
-    file: Path | str
-    method: str
-    n_views: int
-    axis_col: float
-    again: bool | None = None
-    more: Mapping[str, Any] = _spread(default_factory=dict)
+    result: RunResult = spread(RunResult.file_values, RunResult)
 
 
 class Listed(Event):
     """An event that is printed as it is. values: by name, a mapping or a dataclass."""
 
-    values: Any = _spread()
-
-
-class ReconDone(Listed, event="recon_done"):
-    """The live reconstruction wrote its volume; the values are those of its event `done`, see `VolumeDone`."""
-
-
-class TradeoffStarted(Event, event="tradeoff_started"):
-    """Trials begin. by: the metric that they are compared by."""
-
-    file: Path | str
-    trials: int
-    by: str
-
-
-class StudyStarted(Event, event="study_started"):
-    """The rows of a study begin."""
-
-    file: Path | str
-    rows: int
-    left_out: int
-    study: str
-
-
-class TrialDone(Event, event="trial"):
-    """One trial or row has ended. figures: its settings and metrics, by name."""
-
-    n: int
-    of: int
-    label: str
-    status: str
-    seconds: float
-    message: str
-    quality_db: float
-    peak_bytes: int | None
-    figures: Mapping[str, Any] = _spread()
+    values: Any = spread()
 
 
 class StepsListed(Listed, event="explain"):
@@ -441,20 +288,11 @@ class RunDone(Event, event="done"):
     name."""
 
     folder: Path
-    result: Any = _spread(RunResult.run_values)
+    result: Any = spread(RunResult.run_values)
 
 
 class Done(Listed, event="done"):
     """A command has ended successfully. values: what it found or wrote."""
-
-
-class VolumeDone(Event, event="done"):
-    """A reconstruction of this process has ended successfully; the event of another process is read as `Done`.
-
-    record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
-    """
-
-    record: Any = _spread(lambda record: record.event_values())
 
 
 class Failed(Event, event="failed"):

@@ -20,20 +20,22 @@ from beamline.core.events import (
     FrameStored,
     NextChosen,
     PassEnded,
-    ReconDone,
-    ReconStarted,
     RunDone,
     RunStarted,
     ScanDone,
     Sink,
-    SnapshotWritten,
     StateEntered,
-    StudyStarted,
-    TradeoffStarted,
-    TrialDone,
     Warned,
 )
 from beamline.core.flag import Level
+from beamline.core.recon_events import (
+    ReconDone,
+    ReconStarted,
+    SnapshotWritten,
+    StudyStarted,
+    TradeoffStarted,
+    TrialDone,
+)
 from beamline.core.text import SENTENCE, count, one_line, size, spans
 from drivers.base.clock import Clock
 
@@ -66,7 +68,7 @@ def sentence(event: Event) -> str | None:
         case SnapshotWritten(path, n_views=n_views):
             return f"Volume from {n_views} views so far: {path}"
         case PassEnded():
-            return "\n".join(_options(event))
+            return "\n".join(lines(event))
         case NextChosen():
             return _decision(event)
         case ScanDone(scan):
@@ -84,11 +86,11 @@ def sentence(event: Event) -> str | None:
 
 
 def lines(event: Event) -> list[str]:
-    """The event as lines for people, a table where a pass has ended; [] where it has no sentence."""
+    """The event as lines for people: a table where a pass has ended, else its sentence; [] where it has none."""
+    if isinstance(event, PassEnded):
+        return [*_table_of_options(event)]
     text = sentence(event)
-    if text is None:
-        return []
-    return text.split("\n") if isinstance(event, PassEnded) else [one_line(text, SENTENCE)]
+    return [] if text is None else [one_line(text, SENTENCE)]
 
 
 _OVER = 32  # frames after the last one of a finding that takes several: more come every 8 views at most
@@ -148,14 +150,14 @@ def _trial(trial: TrialDone) -> str:
     return begin + f"{trial.seconds:.2f} s{quality}{memory}"
 
 
-def _options(ended: PassEnded) -> Iterator[str]:
+def _table_of_options(ended: PassEnded) -> Iterator[str]:
     """Lines of at most 80 characters: what can be measured next, side by side, and how the operator answers."""
     yield f"Pass {ended.number} is over, {count(ended.n_views, 'view')} so far. What can be measured next:"
     yield f"  {'choice':<7}{'gain, dB':<22}{'dB/min':>8}{'s':>9}{'dose':>9}{'data':>10}"
-    for each in ended.options:
-        mark, choice = "> " if each["choice"] == ended.recommended else "  ", one_line(str(each["choice"]))
-        cost = f"{each['seconds']:>9.0f}{100 * each['dose']:>7.1f} %{size(each['bytes']):>10}"
-        yield "{}{:<7}{:<22}{:>8}{}".format(mark, choice, *_gain(each), cost)
+    for option in ended.options:
+        mark, choice = "> " if option["choice"] == ended.recommended else "  ", one_line(str(option["choice"]))
+        cost = f"{option['seconds']:>9.0f}{100 * option['dose']:>7.1f} %{size(option['bytes']):>10}"
+        yield "{}{:<7}{:<22}{:>8}{}".format(mark, choice, *_gain(option), cost)
     if ended.remark:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
@@ -164,27 +166,23 @@ def _options(ended: PassEnded) -> Iterator[str]:
 
 
 def _gain(option: Mapping[str, Any]) -> tuple[str, str]:
-    """The gain of an option, and by the minute."""
+    """The gain of an option with its range, and dB a minute."""
     gain, low, high, seconds = (option[name] for name in ("gain", "low", "high", "seconds"))
     if gain is None:
         return "not known", "-"
-    likely = "" if low == high else f" ({low:.2f} to {high:.2f})"
-    return f"{gain:+.2f}{likely}", f"{60 * gain / seconds:+.2f}" if seconds else "-"
+    ends = "" if low == high else f" ({low:.2f} to {high:.2f})"
+    return f"{gain:+.2f}{ends}", f"{60 * gain / seconds:+.2f}" if seconds else "-"
 
 
-_DECIDED = {
-    "program": "chosen by the program: ",
-    "operator": "",
-    "plan": "as planned: ",
-}  # the operator's reason says so
+_BY = {"program": "chosen by the program: ", "plan": "as planned: "}  # the operator's reason says who chose
 
 
 def _decision(chosen: NextChosen) -> str:
-    said = f"After pass {chosen.number}: {chosen.choice}, {_DECIDED.get(chosen.by, '')}{chosen.reason}"
+    decision = f"After pass {chosen.number}: {chosen.choice}, {_BY.get(chosen.by, '')}{chosen.reason}"
     if chosen.gained is None:
-        return said
+        return decision
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
-    return f"{said.rstrip('.')}. The choice after pass {chosen.judged}: {predicted}measured {chosen.gained:+.2f} dB"
+    return f"{decision.rstrip('.')}. The choice after pass {chosen.judged}: {predicted}measured {chosen.gained:+.2f} dB"
 
 
 def _missing(block: BlockDone) -> str | None:

@@ -17,7 +17,7 @@ from recon.base.noise import deviation_between_frames, deviation_between_neighbo
 
 LEAST_NOISE = 0.5  # counts: what rounding hides
 BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
-DRIFT = 0.02  # of the light: so much a beam may drift within a scan (as in the check `beam`)
+DRIFT = 0.02  # share of the light by which a beam may drift within a scan (as in the check `beam`)
 UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
 LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
 ZINGER = 12.0  # times the median change: more is not noise

@@ -107,11 +107,12 @@ class StuckCheck(Logged):
 
 @dataclass(frozen=True)
 class TimingState:
-    """Trigger, framestamp and time of the projection before; -1 before the first."""
+    """Trigger, framestamp and time of the projection before; -1 before the first. gaps: triggers without a frame."""
 
     trigger: int = -1
     framestamp: int = -1
     time: float = 0.0
+    gaps: tuple[range, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,17 +132,19 @@ class TimingCheck(Logged):
     start = TimingState
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
-        again = frame.replaces >= 0 or frame.trigger <= state.trigger  # a repeated view has its old trigger
-        if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
-            return Look(state)
-        after = TimingState(frame.trigger, frame.framestamp, frame.time)
         steps = frame.trigger - state.trigger
+        # A view that is repeated alone replaces a frame or fills a gap; the stage stands for it.
+        alone = frame.replaces >= 0 or (steps < 1 and any(frame.trigger in gap for gap in state.gaps))
+        if frame.kind is not FrameKind.PROJECTION or context.period is None or alone:
+            return Look(state)
+        after = TimingState(frame.trigger, frame.framestamp, frame.time, state.gaps)
         lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
         if lost > 0:
+            after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
             advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
             return Look(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
-        if state.trigger < 0 or 0 <= frame.framestamp <= state.framestamp:
-            return Look(after)  # armed anew, for another pass or after a pause
+        if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
+            return Look(after)  # armed anew, for another pass, or the same one again, or after a pause
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
             return Look(after)

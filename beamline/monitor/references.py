@@ -304,4 +304,4 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("views_alike", FLAT, views_show_nothing),
     ("views_brighter", FLAT, views_brighter),
 )
-"""Each rule: its name, the kind of frames that it judges, and the predicate; in the order in which they are asked."""
+"""Each rule: its name, the kind of frames that it judges, and what yields those that it finds; in their order."""

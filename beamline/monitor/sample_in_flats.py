@@ -74,7 +74,7 @@ class ViewsAboveFlats(NamedTuple):
 
     Attributes:
         brightest: in the places where views are brightest; an open beam: 0.
-        at_edges: the lesser of both edges of the field.
+        at_edges: at that edge of the field, left or right, where it is less.
         mismatch: by how much each group differs in places from the group with the least `brightest`, factors aside.
         limit: what noise does not reach.
     """
@@ -85,7 +85,7 @@ class ViewsAboveFlats(NamedTuple):
     limit: float
 
 
-def _emptiest(evidence: Evidence) -> ViewsAboveFlats | None:
+def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
     views = [evidence.light(view) for view in evidence.lit_views]
     light = [
         np.asarray(np.mean([evidence.light(flat) for flat in group], axis=0), np.float32)
@@ -112,13 +112,13 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
     """
     groups = evidence.of_kind(FrameKind.FLAT)
-    if len(groups) < 2 or (seen := _emptiest(evidence)) is None:
+    if len(groups) < 2 or (above := _views_above_flats(evidence)) is None:
         return
-    least = float(seen.brightest.min())
-    for group, top, mismatch in zip(groups, seen.brightest.tolist(), seen.mismatch.tolist(), strict=True):
-        if min(top, top - least, mismatch) > seen.limit:
-            yield BadFrames(group, top, seen.limit, (
-                f"in places the views are brighter than they by {top:.3g} of line integral (limit {seen.limit:.2g}), "
+    least = float(above.brightest.min())
+    for group, top, mismatch in zip(groups, above.brightest.tolist(), above.mismatch.tolist(), strict=True):
+        if min(top, top - least, mismatch) > above.limit:
+            yield BadFrames(group, top, above.limit, (
+                f"in places the views are brighter than they by {top:.3g} of line integral (limit {above.limit:.2g}), "
                 f"and than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
                 "something else, was in the beam."
             ))  # fmt: skip
@@ -126,11 +126,11 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """Views are brighter than flats in places, and less at the edges."""
-    if (seen := _emptiest(evidence)) is not None:
-        most = int(np.argmax(seen.brightest))
-        top = float(seen.brightest[most])
-        if min(top, top - float(seen.at_edges[most])) > seen.limit:
-            yield BadFrames((), top, seen.limit, (
+    if (above := _views_above_flats(evidence)) is not None:
+        most = int(np.argmax(above.brightest))
+        top = float(above.brightest[most])
+        if min(top, top - float(above.at_edges[most])) > above.limit:
+            yield BadFrames((), top, above.limit, (
                 f"In places the views are brighter than the flats by {top:.2g} of line integral, though a sample only "
                 "takes light. Was the sample, or something else, in the beam for the flats, or did the beam change its "
                 "shape?"

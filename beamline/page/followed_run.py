@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import ConfigError, DataError, user_message
-from beamline.core.events import event_in
+from beamline.core.event_lines import event_in
 from beamline.core.text import one_line
 from beamline.page.recording import Recording
 from beamline.page.run_files import Reader, watched
@@ -83,11 +83,10 @@ class RunValues:
 
 def choice_of(values: RunValues, word: str) -> Choice:
     """The choice that an operator's word names. Raises ConfigError if it is not on offer."""
-    for choice in Choice:
-        if choice == word and word in values.options:
-            return choice
-    options = ", ".join(values.options) or "no pass has ended yet"
-    raise ConfigError(f"{one_line(word)!r} cannot be chosen now; on offer: {options}. Nothing was changed.")
+    if word in values.options and word in [*Choice]:  # a log of another version may have others
+        return Choice(word)
+    offer = f"on offer: {', '.join(values.options)}" if values.options else "no pass has ended yet"
+    raise ConfigError(f"{one_line(word)!r} cannot be chosen now; {offer}. Nothing was changed.")
 
 
 class Severity(IntEnum):
@@ -271,8 +270,8 @@ def _run(before: RunValues, event: Event) -> dict[str, Any]:
 def _state(before: RunValues, event: Event) -> dict[str, Any]:
     if event.get("source") == "recon":  # of the live volume
         return {}
-    over = {"wait": 0.0} if event["state"] == State.FINISHING else {}
-    return {"state": str(event["state"]), "message": str(event.get("message", "")), **over}
+    nobody_is_asked = {"wait": 0.0} if event["state"] == State.FINISHING else {}
+    return {"state": str(event["state"]), "message": str(event.get("message", "")), **nobody_is_asked}
 
 
 def _frame(before: RunValues, event: Event) -> dict[str, Any]:
@@ -294,15 +293,15 @@ def _flag(before: RunValues, event: Event) -> dict[str, Any]:
 
 
 def _pass(before: RunValues, event: Event) -> dict[str, Any]:
-    def of_each(name: str, factor: float = 1.0) -> tuple[float, ...]:
+    def of_options(name: str, factor: float = 1.0) -> tuple[float, ...]:
         return tuple(factor * _number(option[name]) for option in event["options"])
 
     return {
         "pass_number": int(event["number"]), "wait": _number(event.get("wait", 0.0)),
         "options": tuple(one_line(str(option["choice"])) for option in event["options"]),
-        "option_gains": of_each("gain"), "option_lows": of_each("low"), "option_highs": of_each("high"),
-        "option_times": of_each("seconds"), "option_doses": of_each("dose", 100.0),
-        "option_sizes": of_each("bytes", 1e-9), "recommended": str(event["recommended"]),
+        "option_gains": of_options("gain"), "option_lows": of_options("low"), "option_highs": of_options("high"),
+        "option_times": of_options("seconds"), "option_doses": of_options("dose", 100.0),
+        "option_sizes": of_options("bytes", 1e-9), "recommended": str(event["recommended"]),
     }  # fmt: skip
 
 

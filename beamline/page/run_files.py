@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
-from beamline.core.events import LARGEST_LOG, event_in
+from beamline.core.event_lines import LARGEST_LOG, event_in
 from beamline.core.files import EVENTS, JOINED, RECON, SCAN, is_below, open_below, parts_of, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest

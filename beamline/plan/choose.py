@@ -19,8 +19,8 @@ class PassOption:
 
     Attributes:
         frames, seconds, bytes: that it takes.
-        dose: share of the exposures of the whole plan with light on the sample.
-        low, high: ends of what is likely.
+        dose: its share of the exposures of the whole plan with light on the sample.
+        low, high: ends of the range of the gain, as of `recon.base.error_law.Gain`.
     """
 
     choice: Choice
@@ -38,7 +38,7 @@ class Wish:
     """What a scan is to reach; None: no such wish.
 
     Attributes:
-        quality_db: dB of PSNR that the volume may stay below that of the whole plan.
+        quality_db: dB of PSNR by which the volume may stay below that of the whole plan.
         seconds: of the scan, at most.
         dose: share of the plan's, at most.
     """
@@ -59,78 +59,83 @@ def options(
     """What is possible now; ENOUGH, which always is, comes last.
 
     Args:
-        law: of the frames so far, as many as its `n_views`.
+        law: with `passes.n_frames` as its `n_views`; None: not known.
         seconds_of: duration of a block, from where the stage stands.
     """
 
-    def option(choice: Choice, frames: int, seconds: float, **measured: Any) -> PassOption:
-        gain = Gain(math.nan, math.nan, math.nan) if law is None else law.gain(**measured)
+    def option(choice: Choice, frames: int, seconds: float, **added: Any) -> PassOption:
+        gain = Gain(math.nan, math.nan, math.nan) if law is None else law.gain(**added)
         cost = frames, seconds, frames * frame_dose(timeline), frames * timeline.total_bytes // timeline.n_frames
         return PassOption(choice, *cost, gain.mean, gain.low, gain.high)
 
     offered, n = [], passes.retakes
     if passes.to_come:
         following, last = passes.to_come[0], passes.done[-1]
-        offered.append(option(Choice.NEXT, following.left, seconds_of(following), views=following.left))
+        offered.append(option(Choice.NEXT, following.n_to_take, seconds_of(following), views=following.n_to_take))
         if passes.may_repeat:
-            offered.append(option(Choice.AGAIN, last.left, seconds_of(last), again=last.left))
+            offered.append(option(Choice.AGAIN, last.n_to_take, seconds_of(last), again=last.n_to_take))
     if passes.wide:
-        frames, seconds = sum(block.left for block in passes.wide), sum(map(seconds_of, passes.wide))
+        frames, seconds = sum(block.n_to_take for block in passes.wide), sum(map(seconds_of, passes.wide))
         offered.append(option(Choice.WIDE, frames, seconds, wide=True))
     if n:
         offered.append(option(Choice.RETAKE, n, n * timeline.retake_seconds / timeline.plan.retakes, views=n))
     return (*offered, PassOption(Choice.ENOUGH, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0))
 
 
-def choose(offered: Sequence[PassOption], wish: Wish, rest: Gain, seconds: float, dose: float) -> tuple[Choice, str]:
+def choose(
+    offered: Sequence[PassOption], wish: Wish, remaining: Gain, seconds: float, dose: float
+) -> tuple[Choice, str]:
     """The choice with the best gain a second until the wish is met, and why.
 
     The next pass of the plan keeps its place unless another choice is better beyond the uncertainty of both.
 
     Args:
         offered: with known gains.
-        rest: by all that the plan still has.
+        remaining: by all that the plan still has, as of `remaining_gain`.
         seconds, dose: that the scan has taken; the seconds include what must follow the views.
     """
-    if wish.quality_db is not None and rest.mean <= wish.quality_db:
+    if wish.quality_db is not None and remaining.mean <= wish.quality_db:
         return Choice.ENOUGH, (
-            f"all that the plan still has would add {rest.mean:.2f} dB ({rest.low:.2f} to {rest.high:.2f}); "
-            f"{wish.quality_db:g} dB less is accepted"
+            f"all that the plan still has would add {remaining.mean:.2f} dB ({remaining.low:.2f} to "
+            f"{remaining.high:.2f}); {wish.quality_db:g} dB less is accepted"
         )
-    useful = {one: _beyond(one, wish, seconds, dose) for one in offered if one.gain > 0}
-    within = [one for one, why in useful.items() if not why]
-    if not within:
-        return Choice.ENOUGH, next(iter(useful.values()), "nothing that is left would improve the volume")
-    best = max(within, key=lambda one: one.gain / one.seconds)
-    following = next((one for one in within if one.choice is Choice.NEXT), best)
-    if best.low / best.seconds <= following.high / following.seconds:
-        best = following
-    return best.choice, (
-        f"{best.gain:.2f} dB ({best.low:.2f} to {best.high:.2f}) in {best.seconds:.0f} s; "
+    excesses = {option: _excess(option, wish, seconds, dose) for option in offered if option.gain > 0}
+    allowed = [option for option, excess in excesses.items() if not excess]
+    if not allowed:
+        return Choice.ENOUGH, next(iter(excesses.values()), "nothing that is left would improve the volume")
+    best = max(allowed, key=lambda option: option.gain / option.seconds)
+    following = next((option for option in allowed if option.choice is Choice.NEXT), best)
+    taken = following if best.low / best.seconds <= following.high / following.seconds else best
+    return taken.choice, (
+        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; "
         "no other choice is clearly better per second"
     )
 
 
-def rest_gain(passes: Passes, law: ErrorLaw) -> Gain:
+def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
     """The gain by all that the plan still has."""
-    views = sum(block.left for block in passes.to_come) + passes.retakes
-    return replace(law, n_views=passes.n_views).gain(views=views, wide=bool(passes.wide))
+    views = sum(block.n_to_take for block in passes.to_come) + passes.retakes
+    return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.wide))
 
 
 def next_is_sure(
     passes: Passes, offered: Sequence[PassOption], wish: Wish, law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
-    """Whether a law of fewer views suffices: by it the next pass is chosen, and surely does not meet the wish."""
-    choice, _ = choose(offered, wish, rest_gain(passes, law), seconds, dose)
-    later = rest_gain(passes.after(Choice.NEXT), law)
+    """Whether the law of an earlier pass suffices: by it the next pass is chosen, and after that pass the plan surely
+    still has more to gain than the wish accepts to lose."""
+    choice, _ = choose(offered, wish, remaining_gain(passes, law), seconds, dose)
+    later = remaining_gain(passes.after(Choice.NEXT), law)
     return choice is Choice.NEXT and (wish.quality_db is None or later.low > wish.quality_db)
 
 
-def _beyond(one: PassOption, wish: Wish, seconds: float, dose: float) -> str:
-    """What of the wish an option would exceed, in words; "" if nothing."""
-    seconds, percent = seconds + one.seconds, 100 * (dose + one.dose)
+def _excess(option: PassOption, wish: Wish, seconds: float, dose: float) -> str:
+    """Which limit of the wish an option would exceed, in words; "" if none."""
+    seconds, percent = seconds + option.seconds, 100 * (dose + option.dose)
     if wish.seconds is not None and seconds > wish.seconds:
-        return f"{one.choice} would end the scan after {seconds:.0f} s; the wish allows {wish.seconds:g} s"
-    if wish.dose is not None and percent > 100.0000001 * wish.dose:
-        return f"{one.choice} would make it {percent:.3g} % of the plan's dose; the wish allows {100 * wish.dose:g} %"
+        return f"{option.choice} would end the scan after {seconds:.0f} s; the wish allows {wish.seconds:g} s"
+    if wish.dose is not None and percent > 100.0000001 * wish.dose:  # beyond rounding of the sum
+        return (
+            f"with {option.choice} the scan would take {percent:.3g} % of the plan's dose; the wish allows "
+            f"{100 * wish.dose:g} %"
+        )
     return ""

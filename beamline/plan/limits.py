@@ -121,7 +121,7 @@ def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
 
 
 MOST_PASSES = 100
-"""Most passes of a step scan: a pass holds which of all views it takes."""
+"""Most passes of a step scan: each holds the numbers of all views that it does not take."""
 ROOM = 1.1
 """Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
 MARGIN = 1.01

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import accumulate, pairwise
 
-from beamline.plan.plan import Block, ScanPlan
+from beamline.plan.plan import Block
 
 
 class Choice(StrEnum):
@@ -25,8 +25,8 @@ class Passes:
     """A scan at the end of a pass.
 
     Attributes:
-        done: passes of views so far, oldest first; those taken again count once more.
-        to_come: passes of the plan that are left.
+        done: passes of views so far, oldest first; one that was taken again stands there twice.
+        to_come: passes of the plan that are still to be taken.
         wide: blocks of wide views that were not taken yet.
         retakes: views that can be taken again now.
     """
@@ -37,49 +37,55 @@ class Passes:
     retakes: int = 0
 
     @property
-    def n_views(self) -> int:
-        """Views so far."""
-        return sum(block.left for block in self.done)
+    def n_frames(self) -> int:
+        """Frames of views so far: of each view `ScanPlan.frames_per_view`."""
+        return sum(block.n_to_take for block in self.done)
 
     @property
     def may_repeat(self) -> bool:
         """Whether the last pass can be taken again: a pass is still to come, with at least as many views."""
-        return bool(self.to_come) and self.done[-1].left <= self.to_come[-1].left
+        return bool(self.to_come) and self.done[-1].n_to_take <= self.to_come[-1].n_to_take
 
     def after(self, choice: Choice) -> Passes:
-        """The scan at the end of what it chose. A pass that cannot be taken again is the next one instead."""
-        if choice is Choice.AGAIN and self.may_repeat:
-            return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
-        if choice in (Choice.NEXT, Choice.AGAIN):
-            return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
-        to_come = () if choice is Choice.ENOUGH else self.to_come
-        return self if choice is Choice.RETAKE else replace(self, to_come=to_come, wide=())
+        """The scan at the end of what it chose. Where the last pass cannot be taken again, AGAIN is NEXT."""
+        match choice:
+            case Choice.AGAIN if self.may_repeat:
+                return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
+            case Choice.NEXT | Choice.AGAIN:
+                return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
+            case Choice.WIDE:
+                return replace(self, wide=())
+            case Choice.ENOUGH:
+                return replace(self, to_come=(), wide=())
+        return self  # retakes are of no pass
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:
-    """Frames, counted within their block, that are taken in one of these parts of a block."""
+    """Triggers, counted within a block, of the frames that one of these parts of it takes."""
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def passes_at_start(views: Block, plan: ScanPlan, wide: Iterable[Block] = ()) -> Passes:
-    """A scan at the end of the pass that it begins with; one that goes on is in that pass.
+def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Iterable[Block] = ()) -> Passes:
+    """A scan at the end of the pass that it begins with, or, after these choices, of the one that it goes on with.
 
-    Passes are those of the whole plan, whatever is stored.
+    Its passes are those of the whole plan, also where earlier files have some of their views.
+
+    Args:
+        size: frames of a pass, as of `pass_blocks`.
     """
-    blocks = pass_blocks(replace(views, stored=frozenset()), plan.pass_views * plan.frames_per_view)
-    passes = Passes((), blocks, (*wide,))
-    for choice in (Choice.NEXT, *plan.choices):
+    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), size), (*wide,))
+    for choice in (Choice.NEXT, *choices):
         passes = passes.after(Choice(choice))
     return passes
 
 
-def pass_blocks(views: Block, step_views: int) -> tuple[Block, ...]:
-    """The passes of a block of views: its trains, or, of a step scan, so many views each.
+def pass_blocks(views: Block, size: int) -> tuple[Block, ...]:
+    """The passes of a block of views: its trains, or, of a step scan, so many frames each (0: all).
 
     Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
     """
-    most = step_views or views.n
-    sizes = [train.n for train in views.trains] or [most] * -(-views.n // most)
+    size = size or views.n
+    sizes = [train.n for train in views.trains] or [size] * -(-views.n // size)
     spans = pairwise(accumulate(sizes, initial=0))
-    others = (views.stored.union(range(first), range(end, views.n)) for first, end in spans)
-    return tuple(block for other in others if (block := replace(views, stored=other)).left)
+    blocks = (replace(views, stored=views.stored.union(range(first), range(end, views.n))) for first, end in spans)
+    return tuple(block for block in blocks if block.n_to_take)

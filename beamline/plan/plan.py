@@ -56,6 +56,7 @@ class ScanPlan:
             have them, or the scan decided against them.
         choices: what earlier files of the same scan chose after each pass that ended in them (`passes.Choice`), oldest
             first. A scan that goes on is in the pass that the last one began.
+        choice_due: that pass has ended, and nothing was chosen yet.
         pass_views: views of a pass of a step scan; 0: all. The passes of a fly scan are its trains.
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
         end_references: kinds of references that are still to be taken after the views, where all else but wide views
@@ -77,6 +78,7 @@ class ScanPlan:
     retake_share: float = 0.0
     stored: frozenset[int] = frozenset()
     choices: tuple[str, ...] = ()
+    choice_due: bool = False
     pass_views: int = 0
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
@@ -132,8 +134,8 @@ class Block:
         return int(self.angles.size)
 
     @property
-    def left(self) -> int:
-        """Number of frames still to take."""
+    def n_to_take(self) -> int:
+        """Frames still to take."""
         return self.n - len(self.stored)
 
 
@@ -152,7 +154,7 @@ class Timeline:
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
-        plan: that it is computed of.
+        plan: that it is computed from.
         retake_seconds: for the most views that may be taken again.
     """
 
@@ -171,12 +173,12 @@ class Timeline:
 
     @property
     def n_frames(self) -> int:
-        return sum(block.left for block in self.blocks)
+        return sum(block.n_to_take for block in self.blocks)
 
     @property
     def first_rows(self) -> list[int]:
         """File row of the first frame of each block."""
-        return [0, *accumulate(block.left for block in self.blocks[:-1])]
+        return [0, *accumulate(block.n_to_take for block in self.blocks[:-1])]
 
     @property
     def views(self) -> Block:

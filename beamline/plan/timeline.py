@@ -76,7 +76,7 @@ def work_out(
         reach=_reach(views),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
-        total_bytes=row_bytes * sum(block.left for block in blocks),
+        total_bytes=row_bytes * sum(block.n_to_take for block in blocks),
         retake_bytes=row_bytes * plan.retakes,
         retake_seconds=_retake_seconds(plan, views, stage, camera),
         free_bytes=free_bytes,
@@ -116,7 +116,7 @@ def _duration(plan: ScanPlan, blocks: Sequence[Block], stage: StageLimits, camer
 
 def _openings(blocks: Iterable[Block]) -> int:
     """How often the shutter opens, which is closed at first."""
-    lit = [False, *(block.kind is not FrameKind.DARK for block in blocks if block.left)]
+    lit = [False, *(block.kind is not FrameKind.DARK for block in blocks if block.n_to_take)]
     return sum(after and not before for before, after in pairwise(lit))
 
 
@@ -174,7 +174,7 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float, start: float = 0.0) -> float:
     """Duration of a block with its moves; `start`: the angle of the stage before it."""
-    if not block.left:
+    if not block.n_to_take:
         return 0.0
     tail = block.exposure + camera.readout
     if block.mode is Mode.STATIC or (block.mode is Mode.FLY and not block.trains):
@@ -264,14 +264,14 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
 
 def _end(block: Block) -> float:
     """Where the stage stands after a block of views; at its zero where it takes none."""
-    if not block.left:
+    if not block.n_to_take:
         return 0.0
     return passes(block)[-1].end if block.trains else float(block.angles[-1])
 
 
 def _stands(blocks: Iterable[Block]) -> list[float]:
     """Angles at which the stage stands before each block, and after the last one."""
-    moving = (block if block.left and block.mode is not Mode.STATIC else None for block in blocks)
+    moving = (block if block.n_to_take and block.mode is not Mode.STATIC else None for block in blocks)
     return [*accumulate(moving, lambda at, block: at if block is None else _end(block), initial=0.0)]
 
 
@@ -283,12 +283,13 @@ def describe(
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]
     for block, row, at in zip(timeline.blocks, timeline.first_rows, _stands(timeline.blocks), strict=False):
-        if not block.left:
+        if not block.n_to_take:
             continue
         seconds = block_seconds(block, stage, camera, plan.settle, at)
         lines.append(
-            f"{row:>6}-{row + block.left - 1:<6}  {block.kind.name.lower():<10}  {block.left:>6}  {block.mode:<6}  "
-            f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"
+            f"{row:>6}-{row + block.n_to_take - 1:<6}  {block.kind.name.lower():<10}  {block.n_to_take:>6}  "
+            f"{block.mode:<6}  {block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  "
+            f"{_angles(block.angles)}"
         )
     views = timeline.views
     rows, cols = camera.shape

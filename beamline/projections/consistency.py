@@ -1,8 +1,8 @@
-"""Consistency: laws that hold for all views of a sample at rest, and the warning of one wider than the field."""
+"""Consistency: laws that hold for all views of a sample at rest, and light that matches its flats."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
-from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
@@ -315,25 +314,3 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 "for a part of the scan."
             )
     return Law("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
-
-
-def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
-    """A warning for `FieldEdges.passing`."""
-    words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
-    return (
-        f"Matter leaves the field {words} of {n_views}, and all of it is inside in others: the sample, or a part of "
-        "it, stands beside the rotation axis. What lies farther from the axis than the edge is not reconstructed, and "
-        "the rim is uncertain. Centre the sample on the axis, or move the camera until the axis is near its edge and "
-        "take a full turn."
-    )
-
-
-def cut_sentence(sides: dict[str, float], continued: bool) -> str:
-    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
-    fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
-    return (
-        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
-        "(scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice the views) "
-        "show the rest. The edge columns are not used as air. If they are air, and the beam is weaker than its flats, "
-        "give --air columns."
-    )

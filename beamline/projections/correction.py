@@ -184,9 +184,8 @@ class ScanCorrection:
     def open_beam(self, most: int) -> NDArray[np.float32]:
         """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
 
-        Their noise is that of the exposure of a view.
-
-        None where the scan has line integrals already.
+        They are scaled so that their noise is that of the exposure of a view. No frame where the scan has line
+        integrals already.
 
         Raises:
             DataError: as `at_once`.
@@ -194,8 +193,8 @@ class ScanCorrection:
         if self._beam is None:
             return np.zeros((0, 0, 0), np.float32)
         flats = self._beam.used.flats[-1][:most]
-        light = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
-        return self.quiet().at_once(flats).data * np.float32(math.sqrt(light) if light > 0 else 1.0)
+        exposures = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
+        return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
     def done(self) -> dict[str, StepDone]:

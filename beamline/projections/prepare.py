@@ -11,25 +11,27 @@ from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.quantities import doubt
-from beamline.core.sinks import Note, Warn
+from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.consistency import compare_with_flats, cut_sentence, passing_sentence, warn_of_inconsistency
+from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
-from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
-from beamline.projections.corrections.references import uncorrected_current
+from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import EstimatedStep, ScanStep
 from beamline.projections.registry import geometry_steps, in_order
+from beamline.projections.scan_warnings import (
+    report_defects,
+    warn_of_joined_views,
+    warn_of_other_axis,
+    warn_of_the_field,
+    warn_of_units,
+)
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views
-from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.light import without_air
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
@@ -38,13 +40,9 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.voxels.direct import has_direct_method
-from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
-_SAME_AXIS = 0.05  # columns
 _HELD_OUT_VIEWS = 16
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,17 +56,6 @@ class DiskBuffer:
 
     views: NDArray[np.float32]
     batch: int
-
-
-def _warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
-    degrees = float(source.attributes.get(JOINED_DEG, 0.0))
-    blur = np.radians(degrees) * source.shape[1] / 2
-    if blur > _JOINED_BLUR:
-        warn(
-            f"--frames-per-view {source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
-            f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
-            "as the scan took at each angle, or leave it out."
-        )
 
 
 def prepare_projections(
@@ -105,7 +92,7 @@ def prepare_projections(
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
-    _warn_of_other_axis(source, selection, axis_col, warn)
+    warn_of_other_axis(source, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
     view_geometry = ViewGeometry(source, selection, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
@@ -163,9 +150,9 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
-    _warn_of_joined_views(source, warn)
+    warn_of_joined_views(source, warn)
     usable = checked_views(source, selection, warn)
-    _warn_of_units(source, selection, warn)
+    warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
     for step in geometry_steps(selection):
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
@@ -175,17 +162,6 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
     return usable, poses, np.flatnonzero(source.image_key == FrameKind.WIDE_VIEW)
-
-
-def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
-    """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
-    size_mm = pixel_size(source, selection)
-    stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
-    for step in in_order(selection):  # options of the same names
-        stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
-    for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
-        if sentence:
-            warn(sentence)
 
 
 def _chosen(
@@ -232,18 +208,6 @@ def _after_scan_steps(
         done[step.name] = step.apply(prepared, source.angles[prepared.projections.view_ids], phases.progress)
         phases.progress(n, len(steps))
     return prepared
-
-
-def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
-    """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
-    table = stated_poses(source, selection)
-    poses_axis = None if table is None else table.axis_col
-    if poses_axis is None or selection.axis_col is not None or abs(poses_axis - axis_col) <= _SAME_AXIS:
-        return
-    warn(
-        f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
-        f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
-    )
 
 
 def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
@@ -321,7 +285,7 @@ def assemble(
         stretch=_stretch(source, geometry, resampled=resampling is not None),
         sample_radius=_stated_radius(source, selection),
     )
-    _warn_of_the_field(source, selection, prepared.ordinary, warn)
+    warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
 
 
@@ -330,22 +294,6 @@ def _stated_radius(source: ScanSource, selection: Selection) -> float | None:
     stated = source.attributes.get("sample_diameter_mm") if pixel_size(source, selection) is not None else None
     width = stated if selection.sample_width is None else selection.sample_width
     return None if width is None else float(width) / 2
-
-
-def _warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
-    """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
-    projections, geometry = prepared.projections, prepared.geometry
-    edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
-    if sides := edges.beyond():
-        light = ""
-        if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
-            light = without_air(source, edges.mean)
-        continued = edges.continued and has_direct_method(geometry)
-        warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
-        if unlevelled and (change := uncorrected_current(source, selection)):
-            warn(change)
-    elif ranges := edges.passing():
-        warn(passing_sentence(ranges, geometry.n_views))
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
@@ -363,21 +311,3 @@ def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> floa
             "copy of the file."
         )
     return source.row_pitch_mm / source.pixel_size_mm
-
-
-def report_defects(projections: Projections, warn: Warn) -> None:
-    """Report repaired pixels if there are more than one in a thousand."""
-    unseen = areas(projections.masked)
-    masked = float((projections.masked & ~unseen).mean())
-    if unseen.mean() > 1e-3:
-        warn(Note(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured."))
-    if masked > 1e-3:
-        warn(Note(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours."))
-    if projections.replaced > 1e-3:
-        replaced = f"{projections.replaced:.1%} of the pixels were zingers or not finite"
-        warn(Note(f"{replaced}: filled from their neighbours."))
-    if projections.floored > 1e-3:
-        warn(
-            f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
-            "least what the volume says, unless the darks are too high."
-        )

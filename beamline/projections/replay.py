@@ -2,41 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from beamline.core.errors import DataError
 from beamline.monitor.change import SPAN
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
-from beamline.monitor.evidence import full_scale
 from beamline.monitor.references import ReferenceLimits
-from beamline.monitor.watch import look_past_failures, start, usual_step
+from beamline.monitor.watch import look_past_failures, start
+from beamline.projections.replayed_frames import context_of, frames_of
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.hdf5 import NotReadyError
-from beamline.storage.interrupted import next_step
-from beamline.storage.readers.averaged import stated_frames_per_view
-from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
-from beamline.storage.rules.angles import FARTHEST
+from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.scan import altered_sentence
-from beamline.storage.writer_lock import PATIENCE, WriterWatch
 from drivers.base.clock import Clock
-from drivers.base.frame import Frame, FrameKind
-from recon.base.views import spread
-
-BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
-SAMPLES = 4  # frames of a kind that tell where the detector saturates
-PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
-POLL = 0.1  # s between looks at a growing file
+from drivers.base.frame import FrameKind
 
 
 @dataclass(frozen=True)
@@ -177,60 +159,6 @@ def replay(
         yield FrameVerdict(frame.index, frame.kind, flags, n, aside, failures)
 
 
-def frames_of(
-    source: ScanSource, *, follow: Clock | None = None, should_stop: Callable[[], bool] = lambda: False
-) -> Iterator[tuple[Frame, int]]:
-    """Every frame, in the order of the file, and how many the file has so far; arguments and errors as for `replay`.
-
-    A view that was taken again later has the kind that it had when it came.
-    """
-    done = 0
-    for n in growing(source, follow) if follow is not None else (source.refresh(),):
-        again = frozenset(rows_replaced(source).tolist())
-        for frame in _frames(source, done):
-            if should_stop():
-                return
-            if frame.index in again:  # what the monitor saw before it was taken again
-                frame = replace(frame, kind=FrameKind.PROJECTION)
-            yield frame, n
-        done = n
-
-
-def awaited(
-    opened: Callable[[], ScanSource], path: Path, clock: Clock, patience: float = PATIENCE, poll: float = POLL
-) -> ScanSource:
-    """The scan that begins at `path`, when its file can be read.
-
-    Raises:
-        DataError: none begins within `patience` s.
-    """
-    last = clock.now() + patience
-    while True:
-        try:
-            return opened()
-        except NotReadyError as error:
-            if clock.now() > last:
-                raise DataError(f"No scan began in {path} within {patience:.0f} s.") from error
-            clock.sleep(poll)
-
-
-def growing(source: ScanSource, clock: Clock, patience: float = PATIENCE, poll: float = POLL) -> Iterator[int]:
-    """Frames in a file at each look, until it is finished.
-
-    Raises:
-        DataError: it is not finished and grows no more.
-    """
-    writer, n, ended = WriterWatch(source.path, clock.now(), patience), 0, False
-    while not ended:
-        ended = source.finished  # asked before the frames, so that none can slip in between
-        before, n = n, source.refresh()
-        yield n
-        if not ended and (why := writer.lost(clock.now(), n > before, lambda: source.finished)):
-            raise DataError(f"{source.path} {why} and is not finished; it has {n} frames. {next_step(source.path)}")
-        if not ended:
-            clock.sleep(poll)
-
-
 def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
     """The verdict on the frames, together with the faults of darks, flats and the file.
 
@@ -276,81 +204,6 @@ def counts_of(kinds: Iterable[Kind]) -> Mapping[str, Mapping[str, int]]:
     for kind in kinds:
         counts.setdefault(kind.check, {})[str(kind.level)] = len(kind.frames)
     return counts
-
-
-def context_of(source: ScanSource) -> ScanContext:
-    """What the checks need to know of a file before its first frame.
-
-    The period is known of our own fly scans only.
-    """
-    rows, cols = source.shape
-    fly = source.plan.get("mode") == "fly"
-    period = (float(source.attributes.get("period_s", 0)) or None) if fly else None
-    context = ScanContext(
-        _saturation(source), rows * cols, period, _step(source), stated_frames_per_view(source),
-        cone=source.cone is not None, axis_col=source.axis_col,
-    )  # fmt: skip
-    if source.quantity != "line_integrals":
-        return context
-    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=check_block(source.shape)).preview
-    return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0, integrals=True)
-
-
-def _step(source: ScanSource) -> float:
-    """Radians from a view to the next, as the plan of our own scans has them, or as the file has its views."""
-    planned = source.plan.get("angles_deg")
-    if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
-        return usual_step(np.radians(planned[:: stated_frames_per_view(source)]))
-    return usual_step(source.angles[source.image_key == FrameKind.PROJECTION])
-
-
-def _saturation(source: ScanSource) -> float:
-    """Saturation as the file states it; else the end of the pixels' type, or of fewer bits where pixels pile up
-    there. Inf where pixels are real numbers."""
-    if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
-        return np.inf
-    stated = float(source.attributes.get("saturation", 0))
-    if 0 < stated <= np.iinfo(source.dtype).max:
-        return stated
-    for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
-        rows = np.flatnonzero(source.image_key == kind)
-        for row in spread(rows, SAMPLES):
-            image = read_known(source, [int(row)])[0]
-            largest = float(image.max())
-            if largest == full_scale(largest) and (image == image.max()).mean() > PILED_UP:
-                return largest
-    return float(np.iinfo(source.dtype).max)
-
-
-def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on. An angle that no stage reaches becomes NaN. An unknown exposure becomes 1 s, so that
-    views and flats agree."""
-    for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
-        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
-        yield replace(frame, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
-
-
-def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
-    for row in range(first, source.image_key.size):
-        pixels: NDArray[Any] = read_known(source, [row])[0]
-        if source.quantity == "line_integrals":
-            with np.errstate(over="ignore"):
-                pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
-            pixels = pixels.round().astype(np.uint16)
-        elif (kernel := _type_of_kernels(pixels.dtype)) != pixels.dtype:
-            pixels = pixels.astype(kernel)
-        kind, angle = FrameKind(int(source.image_key[row])), float(source.angles[row])
-        kind = FrameKind.INVALID if row in source.unreadable else kind
-        yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.exposures[row]))
-
-
-def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type that holds such pixels for compiled kernels, which know neither foreign orders of bytes nor floats of 16
-    or more than 64 bits."""
-    if dtype.kind == "f" and dtype.itemsize not in (4, 8):
-        return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)
-    return dtype.newbyteorder("=")
 
 
 def _excess(flag: Flag) -> float:

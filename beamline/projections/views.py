@@ -23,8 +23,9 @@ from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
+from beamline.storage.rules.pixels import quantity_stated
 from beamline.storage.rules.references import references_usable
-from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
+from beamline.storage.rules.scan import references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry

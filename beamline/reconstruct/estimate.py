@@ -20,7 +20,8 @@ from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, candidates_of, volumes_of
-from recon.base.volume import Grid, Slab, slabs_of
+from recon.base.slabs import Slab, slabs_of
+from recon.base.volume import Grid
 from recon.forecast import forecast
 from recon.warm_up import warm_up
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LawMeasured, Sink
+from beamline.core.events import Sink
+from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
@@ -168,7 +169,7 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
-_OPEN_BEAM = 8  # flats that show the noise of a frame
+_NOISE_FLATS = 8  # at most, which show the noise of a frame
 
 
 class PassLaws:
@@ -180,13 +181,13 @@ class PassLaws:
     def __init__(self, views: FollowedViews, seed: int, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self._views, self._sink, self._clock, self._warn = views, sink, clock, warn
         self._rng = np.random.default_rng(seed)
-        self._end = 0  # rows of the file at the end of the last pass that was looked at
+        self._end = 0  # rows of the file at the end of the last pass whose law was looked for
 
     def look(self, cursor: Cursor, axis_col: float | None, correction: ScanCorrection | None) -> None:
-        """Measure and report the law of the newest pass, if it is over and was not looked at yet.
+        """Measure and report the law at the end of the newest pass, unless this was done already.
 
-        Wide views are no data of it; where there are some, the density beside the field is known. What prevents a law
-        becomes a warning, and the reason of an event without one.
+        It is measured on ordinary views. Where there are wide ones, the density beside the field is known, and the
+        offset of the law is 0. What prevents a law becomes a warning, and the reason in an event without its numbers.
         """
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
@@ -207,16 +208,16 @@ class PassLaws:
         rows = np.array([*images], np.int64)
         if not rows.size or correction is None:
             return
-        sizes = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
+        views_at_ends = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
-            open_beam = correction.open_beam(_OPEN_BEAM)
-            law, gained = measured_law(np.stack([*images.values()]), geometry, sizes, self._rng, open_beam)
+            open_beam = correction.open_beam(_NOISE_FLATS)
+            law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
             why = str(error) or "the memory does not suffice"
             self._warn(f"No gain by further views is predicted: {why}.")
-            unknown = ends.size, rows.size, math.nan, math.nan, math.nan, math.nan
-            self._sink(LawMeasured(*unknown, reason=why, time=self._clock.now()))
+            without = ends.size, rows.size, math.nan, math.nan, math.nan, math.nan
+            self._sink(LawMeasured(*without, reason=why, time=self._clock.now()))
             return
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 import recon
 from beamline.core.durations import Phases, seconds_left
 from beamline.core.errors import DataError
-from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
+from beamline.core.events import KernelsCompiled, Sink, StateEntered
+from beamline.core.recon_events import FitReached
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
@@ -36,7 +37,8 @@ from recon.base.method import (
     candidates_of,
     setting,
 )
-from recon.base.volume import Grid, Slab
+from recon.base.slabs import Slab
+from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import LastRound

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import ReconStarted, Sink, StateEntered
+from beamline.core.events import Sink, StateEntered
+from beamline.core.recon_events import ReconStarted
 from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
 from beamline.projections.consistency import compare_with_flats

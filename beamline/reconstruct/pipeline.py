@@ -11,12 +11,13 @@ from pathlib import Path
 
 from beamline.core.durations import Phases
 from beamline.core.errors import DataError
-from beamline.core.events import ReconStarted, Sink, StateEntered
+from beamline.core.events import Sink, StateEntered
+from beamline.core.recon_events import ReconStarted
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections, hold_out
-from beamline.projections.replay import awaited, growing
+from beamline.projections.replayed_frames import awaited, growing
 from beamline.reconstruct.job import (
     Channels,
     Job,

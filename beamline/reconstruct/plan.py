@@ -48,8 +48,9 @@ from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 from recon.base.method import SampleRadius, volumes_of
+from recon.base.slabs import Slab, slabs_of
 from recon.base.views import parse_views
-from recon.base.volume import Grid, Slab, slabs_of
+from recon.base.volume import Grid
 from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import knows_outside, sample_radius
 from recon.voxels.field_edges import taller_than_field

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.events import Sink, VolumeDone, Warned
+from beamline.core.events import Sink, Warned
+from beamline.core.recon_events import VolumeDone
 from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
@@ -295,7 +296,7 @@ def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
 
 
 def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
-    """How the axis was checked, from the parameters of a reconstruction; None if the user gave it."""
+    """How the axis was found, from the parameters of a reconstruction; None if the user gave it."""
     if "axis_curve" not in parameters:
         return None
     return AxisEstimate(

@@ -10,7 +10,7 @@ import numpy as np
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.scan_facts import ReportContext, as_text, label_of
-from beamline.report import figures
+from beamline.report import pictures
 from beamline.report.history import (
     history_arrays,
     quality_against_time,
@@ -157,7 +157,7 @@ def _further(made: Reconstruction, prepared: PreparedProjections, context: Repor
             "Stray mass",
             "The highest density above each other, of voxels that the views show to be empty. All of it is an "
             "artefact: less is better.",
-            figures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
+            pictures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(
@@ -185,20 +185,20 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
         "Slices",
         "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
         "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
-        figures.orthogonal_slices(shown, unit, kind),
+        pictures.orthogonal_slices(shown, unit, kind),
     )
     yield Picture(
         "Sharpest edge, and values",
         "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
         "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
-        figures.profile_and_values(shown, unit, kind),
+        pictures.profile_and_values(shown, unit, kind),
     )
     if len(shown) > 1:
         yield Picture(
             "Differences",
             f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
             + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
-            figures.differences(shown, unit, kind),
+            pictures.differences(shown, unit, kind),
         )
 
 
@@ -224,13 +224,13 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
     """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
     unit, kind = prepared.length_unit, VoxelKind.ATTENUATION
     if unseen := unseen_wedges(prepared.geometry):
-        yield Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit))
+        yield Picture("Missing wedge", _of_wedges(unseen), pictures.wedges(made.volume, unseen, unit))
     if made.deviation is not None:
         yield Picture(
             "Error bars",
             "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
             "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
-            figures.error_bars(made.volume, made.deviation, unit, kind),
+            pictures.error_bars(made.volume, made.deviation, unit, kind),
         )
     if unexplained is not None:
         at = len(unexplained.significance) // 2
@@ -239,7 +239,7 @@ def _doubts(made: Reconstruction, prepared: PreparedProjections, unexplained: Un
             "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
             "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
             "much, red: too little.",
-            figures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
+            pictures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
         )
     if made.history:
         yield Picture(
@@ -256,20 +256,20 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
         "Projection",
         f"One corrected view: the line integral of the {VoxelKind.ATTENUATION.value} along each ray. Air is better the "
         "nearer to 0 and the more even it is.",
-        figures.projection(data, geometry, 0, unit),
+        pictures.projection(data, geometry, 0, unit),
     )
     yield Picture(
         "Sinogram",
         "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
         "that breaks off is a view that does not fit.",
-        figures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
+        pictures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
     )
     if axis is not None:
         yield Picture(
             "Rotation axis",
             f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 where "
             "they agree, about 1 where they have nothing in common. Columns are those of the binned detector.",
-            figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
+            pictures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
     if geometry.shifts.any() or turns.any():
@@ -278,7 +278,7 @@ def _views(prepared: PreparedProjections) -> Iterator[Picture]:
             "Poses of the views",
             "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
             "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
-            figures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
+            pictures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
         )
 
 

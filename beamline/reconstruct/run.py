@@ -27,7 +27,8 @@ from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
-from recon.base.volume import Grid, Slab, Volume, part_of, slabs_of
+from recon.base.slabs import Slab, part_of, slabs_of
+from recon.base.volume import Grid, Volume
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import by_name, with_settings, with_trait
 from recon.splatting.fit_method import FitMethod

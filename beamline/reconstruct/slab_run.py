@@ -25,7 +25,8 @@ from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions
 from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
-from recon.base.volume import Grid, Slab, Volume, part_of
+from recon.base.slabs import Slab, part_of
+from recon.base.volume import Grid, Volume
 from recon.voxels.methods import FistaTv
 
 _LOOKED_AT = 8  # views by which the rows with most matter are found

@@ -119,15 +119,15 @@ class Acquisition:
             monochromator.move_to(energy)
         for block in self._timeline.blocks:
             self._stop.refuse_abort()
-            if not block.left:
+            if not block.n_to_take:
                 self._done.append(BlockTally(block))
                 continue
             views = block.kind is FrameKind.PROJECTION and not self._stop.stopping
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            taken = any(done.block is block for done in self._done)  # wide views that were chosen
-            if taken or (self._stop.stopping and not self._still_needed(block)):
+            # Wide views may be taken already, where they were chosen after a pass.
+            if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
                 continue
             if block.kind is FrameKind.WIDE_VIEW:
                 yield from self._wide(block)
@@ -142,14 +142,19 @@ class Acquisition:
         """The views in passes, and what is chosen after each. What nobody chose is left to the plan.
 
         A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
+        Where that pass had ended, it does not end anew, and the choice comes next.
         """
-        plan, wide = self._timeline.plan, [b for b in self._timeline.blocks if b.kind is FrameKind.WIDE_VIEW and b.left]
-        passes, choice = passes_at_start(views, plan, wide), Choice((Choice.NEXT, *plan.choices)[-1])
-        rest = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
-        due = [*([rest] if rest.left else []), *(wide if choice is Choice.WIDE else [])]
+        plan, blocks = self._timeline.plan, [block for block in self._timeline.blocks if block.n_to_take]
+        wide = [block for block in blocks if block.kind is FrameKind.WIDE_VIEW]
+        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, wide)
+        choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
+        unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
+        blocks = [*([unfinished] if unfinished.n_to_take else []), *(wide if choice is Choice.WIDE else [])]
         while True:
             again = passes.done[-1] in passes.done[:-1]
-            for block in due:
+            for block in blocks:
+                if self._stop.stopping:
+                    return
                 taken = BlockTally(block, again)
                 yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(taken)
                 self.recovered += recover(self._done, taken.rows)
@@ -157,7 +162,9 @@ class Acquisition:
                 yield from self._retake(views)
             if self._stop.stopping:
                 return
-            self._supervision.pass_ended()
+            if not ended_before:
+                self._supervision.pass_ended()
+            ended_before = False
             passes = replace(passes, retakes=self._supervision.n_retakable(missing_views(self._done)))
             if not (passes.to_come or passes.wide or passes.retakes):
                 return
@@ -167,12 +174,12 @@ class Acquisition:
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
                 return
             before, passes = passes, passes.after(choice)
-            due = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
+            blocks = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
 
     def _block(self, taken: BlockTally) -> Iterator[Frame]:
         block = taken.block
         self._done.append(taken)
-        what = block.kind.name.lower(), str(block.mode), block.left, self.n_frames
+        what = block.kind.name.lower(), str(block.mode), block.n_to_take, self.n_frames
         self._sink(BlockStarted(*what, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
         set_shutter_and_sample(self._devices, block, self._warm_up)
@@ -193,11 +200,11 @@ class Acquisition:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
         beyond = middle_of_exposure(views)[triggers]
-        earlier = sum(before.block.left for before in self._done if before.again)
+        n_repeated = sum(before.block.n_to_take for before in self._done if before.again)
         taken = BlockTally(retake_block(views, triggers), again=True)
         for frame in self._block(taken):
             i = frame.trigger
-            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + earlier + i
+            angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + n_repeated + i
             if frame.kind is FrameKind.INVALID:
                 yield replace(frame, trigger=trigger)
                 continue
@@ -205,8 +212,8 @@ class Acquisition:
                 trigger = retakes[i].trigger
                 self.recovered += recover(self._done, [trigger])
             rows_astray = [astray_row for astray_row, _ in taken.astray.get(i, [])]
-            tried = -1 if frame.replaces in rows_astray else frame.replaces
-            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, tried))
+            replaces = -1 if frame.replaces in rows_astray else frame.replaces
+            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 
@@ -244,7 +251,7 @@ class Acquisition:
         A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.
 
         Args:
-            reopen: frames follow at once.
+            reopen: the shutter opens after it, as frames follow at once.
         """
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
         reason = pause.reason

@@ -98,7 +98,7 @@ class Progress:
     def __init__(self, timeline: Timeline) -> None:
         self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
         # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
-        periods = np.concatenate([np.full(block.left, block.period) for block in timeline.blocks])
+        periods = np.concatenate([np.full(block.n_to_take, block.period) for block in timeline.blocks])
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
         self._last_event = -EVENT_INTERVAL

@@ -183,7 +183,7 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
-        verb: or what is measured next, while the scan asks.
+        verb: what the scan is to do; or a choice of what it measures next, which it takes only while it asks.
 
     Raises:
         ConfigError: no scan runs there, or it does not ask.

@@ -10,9 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from beamline.core.events import LawMeasured, NextChosen, PassEnded, Sink, Warned
+from beamline.core.events import NextChosen, PassEnded, Sink, Warned
+from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
-from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
@@ -25,7 +26,7 @@ _NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="none
 
 @dataclass(eq=False, kw_only=True)
 class Decider:
-    """Called with the passes after each of them, it returns what is measured next.
+    """Called after each pass with the passes so far and to come, it returns what is measured next.
 
     Attributes:
         asks: the operator is asked; otherwise the program chooses.
@@ -33,9 +34,10 @@ class Decider:
         seconds_of: duration of a block, from where the stage stands.
         now: the instrument's clock, s.
         began: time of the first frame.
-        seconds: that count beside those since then: of earlier parts of the run, and of what must follow the views.
+        added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of what must follow
+            the views.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
-        unable: why no law can come; "" while one may. Once it has said so, the plan goes on without a wait.
+        why_no_law: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
         close_shutter: called before the scan waits.
         record: takes the values of a decision, for the file.
@@ -51,16 +53,16 @@ class Decider:
     stop: StopRequest
     sink: Sink
     began: float = math.inf
-    seconds: float = 0.0
+    added_seconds: float = 0.0
     number: int = 0
-    unable: Callable[[], str] = lambda: ""
+    why_no_law: Callable[[], str] = lambda: ""
     wait_a_moment: Callable[[], bool] = lambda: False
     close_shutter: Callable[[], None] = lambda: None
     record: Callable[[Mapping[str, Any]], None] = lambda values: None
     _law: LawMeasured = _NO_LAW  # the newest
-    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options by the number of the pass before
+    _chosen: dict[int, Mapping[str, Any]] = field(default_factory=dict)  # options, by the pass before each
     _outcome: Mapping[str, Any] = field(default_factory=dict)  # what came of a choice, as `NextChosen` has it
-    _unable: str = ""
+    _no_more_laws: str = ""  # why, once that was told
     _answers: frozenset[Choice] = frozenset()  # that the operator can give now
     _answer: Choice | None = None
 
@@ -68,12 +70,11 @@ class Decider:
         """Take a law from the live reconstruction; any thread."""
         self._law = law
         if law.gained is not None:
-            before = law.number - 1
-            predicted = self._chosen.get(before, {}).get("gain")
-            self._outcome = {"predicted": predicted, "gained": law.gained, "judged": before}
+            option = self._chosen.get(law.number - 1, {})
+            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:
-        """Take the operator's choice; any thread. One that is not asked for becomes a warning."""
+        """Take the operator's choice; any thread. One that is not on offer becomes a warning."""
         if choice in self._answers:
             self._answer = choice
         else:
@@ -81,28 +82,35 @@ class Decider:
             self.sink(Warned(f"The choice {choice!s} changed nothing: {expected}."))
 
     def __call__(self, passes: Passes) -> Choice:
-        """What is measured next, after a wait for the law and, where it asks, for the operator."""
+        """What is measured next, after a wait for the law and, if the operator is asked, for the answer."""
         self.number += 1
-        if self._unable:
+        if self._no_more_laws:
             return Choice.NEXT
         law, offered = self._predict(passes)
         if self.stop.stopping:
             return Choice.NEXT
         if law is not None:
-            by, (choice, reason) = "program", choose(offered, self.wish, rest_gain(passes, law), *self._spent(passes))
+            spent = self._spent(passes)
+            by, (choice, reason) = "program", choose(offered, self.wish, remaining_gain(passes, law), *spent)
         else:
-            self._unable, why = self.unable(), self._law.reason if self._law.number == self.number else ""
-            by, choice, reason = "plan", Choice.NEXT, self._unable or why or f"no prediction within {self.wait:g} s"
-        asks, remark = self.asks and not self._unable, "" if law else f"Gains are not known: {reason}."
-        facts = self.number, passes.n_views // self.timeline.plan.frames_per_view
-        values = [{name: None if value != value else value for name, value in vars(one).items()} for one in offered]
-        self.sink(PassEnded(*facts, values, choice, self.wait if asks else 0.0, remark))
+            by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
+            reason = (
+                self._no_more_laws
+                or (self._law.reason if self._law.number == self.number else "")
+                or f"no prediction within {self.wait:g} s"
+            )
+        asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
+        pass_ended = self.number, passes.n_frames // self.timeline.plan.frames_per_view
+        rows = [  # an event has None for NaN
+            {name: None if value != value else value for name, value in vars(option).items()} for option in offered
+        ]
+        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark))
         if asks:
             by, choice, reason = self._ask(choice, offered)
             if self.stop.stopping:
                 return Choice.NEXT
-        self._chosen[self.number] = {one["choice"]: one for one in values}.get(choice, {})
-        event = NextChosen(*facts, choice, by, reason, values, **self._outcome)
+        self._chosen[self.number] = {row["choice"]: row for row in rows}.get(choice, {})
+        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome)
         self._outcome = {}
         self.sink(event)
         self.record({"predicted": None, "gained": None} | event.data)
@@ -113,37 +121,44 @@ class Decider:
 
         An earlier law serves where by it the next pass is sure, so that the stage does not wait.
         """
-        law = self._newest(passes)
+        law = self._newest_law(passes)
         offered = options(passes, law, self.timeline, self.seconds_of)
-        spent = self._spent(passes)
-        if law is None or self.asks or self.unable() or not next_is_sure(passes, offered, self.wish, law, *spent):
+        if (
+            law is None
+            or self.asks
+            or self.why_no_law()
+            or not next_is_sure(passes, offered, self.wish, law, *self._spent(passes))
+        ):
             if not self._law_has_come():
                 self.close_shutter()  # a law takes seconds
                 self._wait(self._law_has_come)
-            law = self._newest(passes) if self._law.number == self.number else None
+            law = self._newest_law(passes) if self._law.number == self.number else None
             offered = options(passes, law, self.timeline, self.seconds_of)
         return law, offered
 
     def _law_has_come(self) -> bool:
         """Whether the law of all views so far is there, or none can come."""
-        return self._law.number == self.number or bool(self.unable())
+        return self._law.number == self.number or bool(self.why_no_law())
 
-    def _newest(self, passes: Passes) -> ErrorLaw | None:
-        """The newest law. Gains depend on ratios of numbers of views alone: a law of some views serves for all."""
+    def _newest_law(self, passes: Passes) -> ErrorLaw | None:
+        """The newest law, as of all frames so far; None: none is known.
+
+        It may be measured on some of the views: gains depend on ratios of their numbers alone.
+        """
         values = self._law.exponent, self._law.exponent_error, self._law.noise, self._law.offset
-        if self._law.reason or None in values or not 0 <= values[2] + values[3] <= 1:  # of a process that is not ours
+        if self._law.reason or None in values or not 0 <= values[2] + values[3] <= 1:  # another process says so
             return None
-        return ErrorLaw(passes.n_views, *values)
+        return ErrorLaw(passes.n_frames, *values)
 
     def _spent(self, passes: Passes) -> tuple[float, float]:
         """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
-        again = sum(one["frames"] for one in self._chosen.values() if one.get("choice") is Choice.RETAKE)
+        retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        frames = passes.n_views + again + wide - sum(block.left for block in passes.wide)
-        return self.now() - self.began + self.seconds, frames * frame_dose(self.timeline)
+        frames = passes.n_frames + retaken + wide - sum(block.n_to_take for block in passes.wide)
+        return self.now() - self.began + self.added_seconds, frames * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
-        """Wait at most as long as it may, or until a stop."""
+        """Wait until this is so, but `wait` s at most, and not beyond a stop."""
         for _ in range(round(self.wait / PAUSE_POLL)):
             if self.stop.stopping or until():
                 return
@@ -151,7 +166,7 @@ class Decider:
                 at_enter()
 
     def _ask(self, recommended: Choice, offered: Sequence[PassOption]) -> tuple[str, Choice, str]:
-        """Who chose, what, and why, once the operator has answered or time is over."""
+        """Who chose, what, and why: the operator, or the plan where there is no answer in time."""
 
         def answered() -> bool:
             if self.states.state is not State.ASKING:  # at first, and after a pause
@@ -160,7 +175,7 @@ class Decider:
             return self._answer is not None
 
         self.wait_a_moment()  # earlier input does not count
-        self._answer, self._answers = None, frozenset({Choice.NEXT, *(one.choice for one in offered)})
+        self._answer, self._answers = None, frozenset({Choice.NEXT, *(option.choice for option in offered)})
         self._wait(answered, lambda: self.answer(recommended))
         self._answers = frozenset()
         if self._answer is None:

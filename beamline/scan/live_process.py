@@ -12,18 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from beamline.config.load import Config, plan_of
-from beamline.core.events import (
-    Done,
-    Failed,
-    LawMeasured,
-    ReconDone,
-    Sink,
-    StateEntered,
-    Warned,
-    event_of,
-)
+from beamline.core.event_lines import event_of
+from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
+from beamline.core.recon_events import LawMeasured, ReconDone
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import describe
 from beamline.scan.live_plan import LivePlan, live_plan
@@ -129,7 +122,7 @@ class LiveReconstruction:
         low_priority: a scan beside it takes precedence.
 
     Attributes:
-        ended: it could not be started, or has ended in the scan and is not started again.
+        ended: no law will come: it could not be started, or has ended in the scan and is not started again.
     """
 
     def __init__(

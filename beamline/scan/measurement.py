@@ -89,7 +89,7 @@ class Measurement:
             states=self.states,
             stop=self.stop,
             sink=self.sink,
-            seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
+            added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
             + (self.series.seconds if self.series else 0.0),
             number=len(timeline.plan.choices),
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
@@ -228,7 +228,7 @@ class Measurement:
 
         cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
         ended = "no live reconstruction is running"
-        decider.unable = lambda: cone or (ended if follower is None or follower.ended else "")
+        decider.why_no_law = lambda: cone or (ended if follower is None or follower.ended else "")
         decider.record, decider.wait_a_moment = recorder.add_decision, wait_a_moment
         return acquisition
 
@@ -252,14 +252,14 @@ class Measurement:
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
         """Views that were flagged for it or gave no frame, which are announced."""
-        chosen, n = self._to_retake(recorder, missing)
+        chosen, n_bad = self._to_retake(recorder, missing)
         if not chosen:
             return ()
-        if len(chosen) < n:
+        if len(chosen) < n_bad:
             self.sink(
                 Warned(
-                    f"{n} views were flagged or gave no frame, and {len(chosen)} may be taken again "
-                    f"(monitor.retake_share): {n - len(chosen)} between them stay as they are."
+                    f"{n_bad} views were flagged or gave no frame, and {len(chosen)} may be taken again "
+                    f"(monitor.retake_share): {n_bad - len(chosen)} between them stay as they are."
                 )
             )
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
@@ -267,15 +267,16 @@ class Measurement:
         return chosen
 
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
-        """Views that were flagged or gave no frame, and their number; of more than the plan allows, an even spread."""
-        most = self.ready.plan.retakes - recorder.announced
-        if not most:
+        """Views that may be taken again now, and how many were flagged or gave no frame: of more than the plan still
+        allows, an even spread."""
+        allowed = self.ready.plan.retakes - recorder.announced
+        if not allowed:
             return (), 0
         recorder.wait()
-        lost, n = [Retake(-1, trigger) for trigger in missing], self.ready.plan.angles.size
-        once = [view for view in recorder.flagged.views_to_retake if view.trigger < n]  # others were taken again
-        bad = sorted([*once, *lost], key=lambda view: view.trigger)
-        return ((), 0) if self.stop.stopping else (spread_retakes(bad, most), len(bad))
+        flagged = recorder.flagged.views_to_retake
+        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]  # others were taken again
+        bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
+        return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
 
 
 def wait_in_pause(recorder: Recorder) -> bool:

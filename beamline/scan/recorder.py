@@ -132,7 +132,7 @@ class Recorder:
         self._raise_failure()
 
     def end_pass(self) -> None:
-        """Record that the frames so far end a pass, if the scan decides."""
+        """Record that the frames so far end a pass, if the scan decides. Views that were repeated end with it."""
         self._enqueue(self._writer.end_pass)
         if self._retaking:
             self.wait()

@@ -11,29 +11,26 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.config.load import NO_LIVE, Config, changed, load, plan_of, resolved_yaml
+from beamline.config.load import NO_LIVE, Config, changed, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
-from beamline.instrument import connect
-from beamline.plan.passes import Choice, passes_at_start, triggers_to_take
+from beamline.plan.passes import Choice
 from beamline.plan.plan import ScanPlan
-from beamline.plan.timeline import work_out
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
+from beamline.storage.interrupted import still_to_take
 from beamline.storage.parts import (
-    decisions_in,
     end_references_missing,
     files_with_frames,
     is_joined,
     join,
-    pass_ends_in,
+    plan_in,
     views_in,
     views_planned,
 )
@@ -63,6 +60,7 @@ class ResumableRun:
         planned: views of the whole plan.
         wide: triggers of the wide views in these files, likewise.
         choices: after each pass that ended in them, oldest first.
+        choice_due: the last one ended, and nothing was chosen yet.
         seconds: that they took, from the first frame of each to its last one.
         end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
@@ -80,6 +78,7 @@ class ResumableRun:
     end_references: frozenset[FrameKind] | None = None
     wide: frozenset[int] = frozenset()
     choices: tuple[str, ...] = ()
+    choice_due: bool = False
     seconds: float = 0.0
 
     @property
@@ -88,13 +87,17 @@ class ResumableRun:
         missing = self.planned - len(self.views)
         if self.end_references is not None:
             kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.end_references))
-            return f"Preparing: {self.run} has all {self.planned} views, its missing {kinds} of the end are taken now"
+            all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
+            return f"Preparing: {self.run} has all {all_views}, its missing {kinds} of the end are taken now"
+        if self.choices:  # some views were decided against, or are taken twice
+            return f"Preparing: {self.run} lacks {missing} of the views that it was to take, which are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
         """The part of the plan that is still missing."""
         stored = self.views | self.wide
-        return replace(plan, stored=stored, choices=self.choices, end_references=self.end_references)
+        references = self.end_references
+        return replace(plan, stored=stored, choices=self.choices, choice_due=self.choice_due, end_references=references)
 
     def begin(self, ready: ReadyScan) -> Path:
         """Recover parts whose writer died, join the parts, and create the folder of the new part.
@@ -187,48 +190,33 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
+                views_in(file)  # a damaged one is named
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
-    end_references, (views, wide, choices) = None, _stored(parts, config)
-    if len(views) >= planned:
-        with ExitStack() as opened:
-            end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
-        if not end_references:
-            _refuse_whole(run, parts, closed)
-    last, seconds = max(float(each.max()) for each in times), sum(float(np.ptp(each)) for each in times)
+    with ExitStack() as opened, hdf5.readable(run):
+        each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
+        missing, choices, due = still_to_take(each)
+        wide, end_references = _wide_stored(each, choices), None if missing else end_references_missing(each)
+    if not missing and not end_references:
+        _refuse_whole(run, parts, closed)
+    last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
     return ResumableRun(
-        run, lock, config, tuple(parts), frozenset(views), planned, last, tuple(left_out), end_references,
-        frozenset(wide), choices, seconds,
+        run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
+        end_references, wide, choices, due, seconds,
     )  # fmt: skip
 
 
-def _stored(parts: Sequence[Path], config: Config) -> tuple[set[int], set[int], tuple[str, ...]]:
-    """Triggers of the views, and of the wide ones, that need not be taken: those in the files, and those that the scan
-    decided against. And what it chose after each pass that ended; where it says nothing, the plan went on."""
-    views, wide, since, chosen, ended, decides = set[int](), set[int](), set[int](), dict[Any, Any](), 0, False
-    for part in parts:
-        with hdf5.open_hdf5(part) as file, hdf5.readable(part):
-            decides, ends = layout.PASS_ENDS in file, pass_ends_in(file)
-            since = {*views_in(file, int(ends[-1]))} if ends.size else since | views_in(file)
-            views |= views_in(file)
-            wide |= views_in(file, kind=FrameKind.ALIGNMENT)  # as which wide views are written
-            ended += ends.size
-            chosen |= {values.get("number"): values.get("choice") for values in decisions_in(file)}
-    if not decides:
-        return views, wide, ()
-    choices = tuple(str(chosen.get(number, Choice.NEXT)) for number in range(1, ended + 1))
-    plan = replace(plan_of(config), choices=choices)
-    stage, camera, to_counts = connect.describe(config)
-    passes = passes_at_start(work_out(plan, stage, to_counts, camera).views, plan)
-    missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
-    if choices[-1:] == (Choice.AGAIN,):
-        missing |= triggers_to_take(passes.done[-1]) - since
+def _wide_stored(files: Sequence[h5py.File], choices: Sequence[str]) -> frozenset[int]:
+    """Triggers of the wide views that need not be taken: those in the files, or all where the views were enough."""
     if Choice.ENOUGH in choices:
-        wide |= {plan.angles.size + i for i in range(plan.wide_views * len(plan.wide_places))}
-    return {*range(plan.angles.size)} - missing, wide, choices
+        plan = plan_in(files[0])
+        first, n = len(plan["angles_deg"]), plan.get("wide_views", 0) * len(plan.get("wide_places_mm", ()))
+        return frozenset(range(first, first + n))
+    kind = FrameKind.ALIGNMENT  # as which wide views are written
+    return frozenset[int]().union(*(views_in(file, kind=kind) for file in files))
 
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
@@ -306,7 +294,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
             if changed:
                 join(parts, run / JOINED)
             with hdf5.open_hdf5(run / JOINED) as file:
-                frames, missing = int(file[layout.COMMITTED][()]), (views_planned(file) or 0) - len(views_in(file))
+                frames, missing = int(file[layout.COMMITTED][()]), len(still_to_take([file])[0])
                 done.append(Recovered(run / JOINED, changed, frames, 0, missing))
         end_record(parts_of(run)[-1])
     return done, left_out

@@ -51,9 +51,9 @@ class Supervision:
     # next_pass: called after each pass of views, wide views or retakes, if something is left, and returns a choice that
     # is possible. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
     next_pass: Callable[[Passes], Choice] | None = None
-    # pass_ended: called before, and after the last pass, too; all frames were delivered
+    # pass_ended: called before `next_pass`, and after the last pass, too; all frames were delivered
     pass_ended: Callable[[], None] = lambda: None
-    # n_retakable: called then with the triggers without a frame; returns how many views `retakes` would return
+    # n_retakable: called before `next_pass` with the triggers without a frame; how many views `retakes` would return
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 

@@ -6,19 +6,34 @@ Every command that meets such a run says the same, by `next_step`.
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, RECON, SCAN, parts_of, run_of
-from beamline.plan.passes import Choice
+from beamline.plan.passes import Choice, Passes, passes_at_start, triggers_to_take
+from beamline.plan.plan import Block, Mode
 from beamline.storage import hdf5
-from beamline.storage.parts import decisions_in, files_with_frames, joined_file_of, to_join, views_in, views_planned
+from beamline.storage.parts import (
+    decisions_in,
+    files_with_frames,
+    joined_file_of,
+    pass_ends_in,
+    plan_in,
+    to_join,
+    views_in,
+    views_planned,
+)
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import abandoned, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import ending_in
+from drivers.base.frame import FrameKind
 
 
 def scan_file(path: str | Path) -> Path:
@@ -118,15 +133,45 @@ def _died(sure: bool) -> str:
 
 
 def _lacks_views(run: Path) -> bool:
-    """Whether the files of a run, all closed, lack views of its plan."""
-    planned, views, rejected = 0, set[int](), False  # rejected: the scan decided against views
-    try:
-        for part in files_with_frames(run):
-            with hdf5.open_hdf5(part) as file, hdf5.readable(part):
-                planned = views_planned(file) or 0
-                views |= views_in(file)
-                enough = any(values.get("choice") == Choice.ENOUGH for values in decisions_in(file))
-                rejected |= layout.PASS_ENDS in file and (enough or ending_in(file).status == "complete")
-    except (DataError, *hdf5.ALTERED):
-        return False
-    return len(views) < planned and not rejected
+    """Whether the files of a run, all closed, lack views that it was to take."""
+    with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
+        return bool(still_to_take([opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)])[0])
+    return False
+
+
+def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str, ...], bool]:
+    """Views that a scan still has to take, by its plan and what it chose; nothing for a file without its plan.
+
+    Args:
+        files: all of the scan, in the order that they were taken in, or the one that joins them.
+
+    Returns:
+        The triggers of these views, counted from 0: not those that the scan decided against, but those of a pass that
+        it was taking again. What it chose after each pass that ended, `Choice.NEXT` where the files do not say. Whether
+        a choice is due: the last pass has ended, and neither a choice nor a view follows.
+    """
+    views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
+    for file in files:
+        ends, taken = pass_ends_in(file), views_in(file)
+        since_pass_end = {*views_in(file, int(ends[-1]))} if ends.size else since_pass_end | taken
+        views, n_ended = views | taken, n_ended + ends.size
+        chosen |= {str(values.get("number")): values["choice"] for values in decisions_in(file) if "choice" in values}
+    if layout.PASS_ENDS not in files[0]:
+        return frozenset(range(views_planned(files[0]) or 0)) - views, (), False
+    due = str(n_ended) not in chosen and n_ended > 0 and not since_pass_end
+    choices = tuple(chosen.get(str(number), Choice.NEXT) for number in range(1, n_ended + 1 - due))
+    passes = _passes_of(plan_in(files[0]), choices)
+    missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
+    if choices[-1:] == (Choice.AGAIN,) and not due:
+        missing |= triggers_to_take(passes.done[-1]) - since_pass_end
+    return missing, choices, due
+
+
+def _passes_of(plan: Mapping[str, Any], choices: Iterable[str]) -> Passes:
+    """The passes of a plan as a file holds it, after these choices."""
+    angles = np.radians(plan["angles_deg"])
+    steps = np.diff(angles)
+    turns = np.flatnonzero(steps * steps[:1] < 0)  # where a fly scan begins its next sweep
+    sweep = int(turns[0]) + 1 if turns.size else 0
+    size = plan.get("pass_views", 0) * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else sweep
+    return passes_at_start(Block(FrameKind.PROJECTION, Mode.STEP, 0, angles, 0.0, 0.0), size, choices)

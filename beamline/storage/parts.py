@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import LARGEST_LOG, LONGEST
+from beamline.core.event_lines import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
@@ -72,7 +72,7 @@ def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
 
 
 def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass: values of the event `next_chosen`, likewise."""
+    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty likewise."""
     return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
 
 
@@ -86,11 +86,11 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
 
 def views_planned(file: h5py.File) -> int | None:
     """Number of planned views of the scan; None if the file does not contain its plan."""
-    angles = _plan_of(file).get("angles_deg")
+    angles = plan_in(file).get("angles_deg")
     return None if angles is None else len(angles)
 
 
-def _plan_of(file: h5py.File) -> dict[str, Any]:
+def plan_in(file: h5py.File) -> dict[str, Any]:
     """The plan of the scan; empty if the file does not hold it."""
     return json_object(file["/entry/record/plan"].asstr()[()]) or {}
 
@@ -126,7 +126,7 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
 def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
     """Numbers of references planned at the "start" or the "end" of the views, in the order of acquisition at the
     end."""
-    plan = _plan_of(file)
+    plan = plan_in(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
     return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in (when, "both")}
 

@@ -17,11 +17,12 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import no_file, refuse_existing, whole_file
+from beamline.core.files import no_file, refuse_existing, run_of, whole_file
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.disk_file import GrowingFile
-from beamline.storage.parts import copy_rows, gaps_in, is_whole, require_joined, views_in, views_planned
+from beamline.storage.interrupted import still_to_take
+from beamline.storage.parts import copy_rows, gaps_in, is_whole, require_joined, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
@@ -46,7 +47,8 @@ class Recovered:
         changed: whether the file was changed.
         frames: committed, and kept.
         dropped: frames at the end that were not committed when the writer died, and are cut off.
-        missing: views that were planned and not taken; None where the file does not hold its plan.
+        missing: views that were to be taken, by the plan and by what the scan chose, and were not; None where the file
+            does not hold its plan, and of a later part of a run, which others come before.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames that differ from their checksum; they are kept.
         altered: frames whose row in the log differs from its checksum; likewise kept.
@@ -165,7 +167,8 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                 if layout.END_TIME in made and not made[layout.END_TIME][()] and np.isfinite(times).any():
                     made[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
                 planned, dropped = views_planned(made), max(0, len(file[layout.DATA]) - committed)
-                missing = None if planned is None else planned - len(views_in(made))
+                alone = planned is not None and run_of(path.resolve().parent) == path.resolve().parent
+                missing = len(still_to_take([made])[0]) if alone else None
                 altered = tuple(altered_rows(made, 0, frames).tolist())
     except hdf5.ALTERED as error:
         if isinstance(error, OSError) and error.filename == str(target):

@@ -1,4 +1,5 @@
-"""Types of arrays that signatures share, masked arrays, the spread of values by their median, and binning of views."""
+"""Types of arrays that signatures share, masked and frozen arrays, the spread of values by their median, binning of
+views."""
 
 from __future__ import annotations
 
@@ -25,6 +26,13 @@ def without_mask(values: Any) -> Any:
     masked = any(isinstance(each, np.ma.MaskedArray) and np.ma.getmaskarray(each).any() for each in several)
     numbers: Any = np.ma.array(values) if masked else None
     return numbers.astype(np.result_type(numbers.dtype, np.float32)).filled(np.nan) if masked else values
+
+
+def frozen(values: F64) -> F64:
+    """A copy that cannot be written."""
+    copy = np.array(values, np.float64)
+    copy.setflags(write=False)
+    return copy
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:

@@ -1,8 +1,9 @@
 """Error law: how the error of a volume falls with further views, and the gain in dB that follows for each kind.
 
-The mean square error of a volume of n views has three shares: `offset`, an unknown density beside the field that adds
-a constant in the middle and falls only with wide views; `noise`, which falls with the light, at the same angles too;
-and the rest, by gaps between the angles. The last two together fall as n^-exponent when views at new angles come.
+The mean square error of a volume of n views has three parts, which are stated as shares of it. `offset` is a constant
+in the middle of the volume, by an unknown density beside the field, and falls only with wide views. `noise` falls with
+the light, also at the same angles. The third part, the remaining share, is by gaps between the angles. The last two
+together fall as n^-exponent with views at new angles.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ class ErrorLaw:
     Attributes:
         n_views: of the volume.
         exponent: of the fall of the mean square error with the number of views.
-        exponent_error: its standard error; those of the shares are as large a part of them.
+        exponent_error: the exponent is taken to lie within twice this, and both shares within the same part of
+            themselves, which gives the range of a gain. A convention of `recon.voxels.measured_law`, not measured.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
@@ -40,12 +42,12 @@ class ErrorLaw:
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
         """dB by so many views at new angles, at the same angles again, and by wide views."""
 
-        def of(scale: float) -> float:
-            noise = min(scale * self.noise, 1 - self.offset)
-            beside = self.offset * (max(1 - scale, 0) if wide else 1)
-            light = noise * self.n_views / (self.n_views + again)
-            left = (1 - noise - self.offset + light) * (1 + views / self.n_views) ** (-scale * self.exponent)
-            return -10 * math.log10(left + beside) or 0.0  # never -0.0
+        def decibels(factor: float) -> float:  # with the exponent and the shares times this factor
+            noise = min(factor * self.noise, 1 - self.offset)
+            offset = self.offset * (max(1 - factor, 0) if wide else 1)
+            gaps_and_noise = 1 - noise - self.offset + noise * self.n_views / (self.n_views + again)
+            square = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
+            return -10 * math.log10(square) or 0.0  # never -0.0
 
-        error = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
-        return Gain(of(1.0), of(1 - error), of(1 + error))
+        half_range = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
+        return Gain(decibels(1.0), decibels(1 - half_range), decibels(1 + half_range))

@@ -27,40 +27,24 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields, replace
-from typing import Any, TypedDict, Unpack
+from dataclasses import astuple, dataclass, fields, replace
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import F64
-from recon.base.declared_types import check_arguments, check_settings
+from recon.base.arrays import frozen
+from recon.base.declared_types import check_arguments
 from recon.base.greys import fan, html
-from recon.base.ray_width import NO_WIDTH, RayWidth
+from recon.base.placement import Where, checked_angles, placed_views
+from recon.base.ray_width import RayWidth
+from recon.base.view_rays import ViewRays
 
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
-_OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
-_SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
-
-
-class Where(TypedDict, total=False):
-    """Position of the rotation axis on the detector, and pose of each view; as the attributes of `Geometry`.
-
-    Attributes:
-        axis_col, axis_row: None or left out: the middle of the detector, at (cols - 1) / 2; rows alike.
-        shifts: [view, 2] pixels; None or left out: none.
-        roll, tilt: radians, one for all views or [view]; left out: 0.
-    """
-
-    axis_col: float | None
-    axis_row: float | None
-    shifts: ArrayLike | None
-    roll: ArrayLike
-    tilt: ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
-class Geometry:
+class Geometry(ViewRays):
     """Geometry of a set of views; construct it with `Geometry.parallel`, `Geometry.cone` or `Geometry.fan`.
 
     Attributes:
@@ -80,35 +64,6 @@ class Geometry:
             view's beam. Left out: the origin.
     """
 
-    angles: F64
-    detector_shape: tuple[int, int]
-    pixel_pitch: float
-    axis_col: float
-    axis_row: float
-    sod: float
-    sdd: float
-    shifts: F64
-    roll: F64
-    tilt: F64
-    width: RayWidth = NO_WIDTH
-    skew: float = 0.0
-    centres: F64 = field(default_factory=lambda: np.zeros((0, 3)))
-
-    def __post_init__(self) -> None:
-        check_settings(self)
-        if not self.centres.any():
-            object.__setattr__(self, "centres", _frozen(np.zeros((self.angles.size, 3))))
-        elif not self.is_cone or self.width.arc:
-            raise ValueError(
-                "centres need a cone beam whose stage does not turn during the exposure (no arc). Displace the views "
-                "of a parallel beam by shifts"
-            )
-        if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
-            raise ValueError(
-                f"skew must be finite, and 0 unless the beam is parallel and no view is rolled or tilted; got "
-                f"{self.skew:.3g} rad a row"
-            )
-
     @classmethod
     def parallel(
         cls,
@@ -127,7 +82,7 @@ class Geometry:
             ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
         """
         check_arguments(cls.parallel, locals())
-        return _checked(angles, detector_shape, pixel_pitch, (math.inf, math.inf), **where)
+        return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=math.inf, sdd=math.inf)
 
     @classmethod
     def cone(
@@ -151,7 +106,7 @@ class Geometry:
         check_arguments(cls.cone, locals())
         if not (math.isfinite(sod) and math.isfinite(sdd) and 0 < sod <= sdd):
             raise ValueError(f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}")
-        return _checked(angles, detector_shape, pixel_pitch, (float(sod), float(sdd)), **where)
+        return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=float(sod), sdd=float(sdd))
 
     @classmethod
     def fan(
@@ -195,134 +150,6 @@ class Geometry:
         centre = (self.axis_col + 0.5) / self.detector_shape[1]
         return html("Geometry", fan(self.angles, centre), {"views": repr(self)[9:-1]})
 
-    @property
-    def n_views(self) -> int:
-        return int(self.angles.size)
-
-    @property
-    def is_cone(self) -> bool:
-        return math.isfinite(self.sod)
-
-    @property
-    def is_straight(self) -> bool:
-        """Rows run along u and columns along the rotation axis: no roll, tilt or centres (views may be shifted)."""
-        return not (self.roll.any() or self.tilt.any() or self.centres.any())
-
-    @property
-    def rows_show_slices(self) -> bool:
-        """Each detector row shows one slice in all views: a parallel beam, straight, not shifted along the axis."""
-        return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
-
-    @property
-    def climbs(self) -> bool:
-        """Whether views step along the rotation axis by half the detector's rows or more, as in a helix.
-
-        By the middle half of them, which climbs half as far: single views that stand apart make no climb.
-        """
-        low, high = np.percentile(self.offsets[:, 1], (25, 75))
-        return bool(4 * (high - low) >= self.detector_shape[0])
-
-    @property
-    def lean(self) -> float:
-        """Largest displacement by roll and tilt, from row to row, of a point of the field: mm at the rotation axis."""
-        across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
-        return self.reach * float(across.max())
-
-    @property
-    def period(self) -> float:
-        """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
-
-        2π holds for a cone, and for an axis that leans along the beam by more than half a pixel over the field. It also
-        holds for an axis more than a tenth of the field off the detector's middle: views half a turn apart then see
-        different parts.
-        """
-        leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
-        return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
-
-    @property
-    def unseen_cone(self) -> float:
-        """Half angle, in radians, of the cone of wave vectors about the rotation axis that no view measures.
-
-        It is the least lean of the axis along the beam; 0 where that is at most half a pixel over the field.
-        """
-        least = float(np.abs(self.tilt).min())
-        return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
-
-    @property
-    def is_off_middle(self) -> bool:
-        """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
-        cols = self.detector_shape[1]
-        axis = (self.axis_col + self.offsets[:, 0])[self.ordinary]
-        return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
-
-    @property
-    def ordinary(self) -> NDArray[np.bool_]:
-        """[view] which views are no wide views: those show the sample stepped aside by more than half a field."""
-        aside = self.shifts[:, 0]
-        usual = np.sort(aside)[(aside.size - 1) // 2]
-        return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)
-
-    @property
-    def offsets(self) -> F64:
-        """Pixels (col, row) from (axis_col, axis_row) to the image of the object's origin, [view, 2]."""
-        if not self.centres.any():
-            return self.shifts
-        u, v, w = np.einsum("vij,vj->iv", [self.axes(view) for view in range(self.n_views)], -self.centres)
-        return np.asarray(self.shifts + np.stack((u, v), 1) * (self.sdd / (self.sod + w) / self.pixel_pitch)[:, None])
-
-    @property
-    def source_distance(self) -> float:
-        """mm from the object's origin to the nearest source; infinite for a parallel beam."""
-        if not self.centres.any():
-            return self.sod
-        beams = np.array([self.axes(view)[2] for view in range(self.n_views)])
-        return float(np.linalg.norm(self.centres - self.sod * beams, axis=1).min())
-
-    @property
-    def middle_height(self) -> float:
-        """z in mm of the middle of the detector's rows."""
-        return ((self.detector_shape[0] - 1) / 2 - self.axis_row) * self.sample_pitch
-
-    @property
-    def sample_pitch(self) -> float:
-        """Detector pixel in mm at the rotation axis."""
-        return self.pixel_pitch * self.sod / self.sdd if self.is_cone else self.pixel_pitch
-
-    @property
-    def reach(self) -> float:
-        """mm from the rotation axis to the farthest column edge of any view, measured at the axis.
-
-        Rolled views count as straight ones, wide views do not. For a wide cone the value is limited to 0.7 sod.
-        """
-        cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.ordinary]
-        reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
-        return float(min(reach, _SHORT_OF_SOURCE * self.source_distance))
-
-    @property
-    def heights(self) -> tuple[float, float]:
-        """Lowest and highest z in mm, at the rotation axis, that any view sees; tilted views count as straight ones."""
-        rows, axis = self.detector_shape[0], self.axis_row + self.offsets[:, 1]
-        low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
-        return float(low * self.sample_pitch), float(high * self.sample_pitch)
-
-    def axes(self, view: int) -> F64:
-        """Unit vectors [3, 3] of one view in the object's frame: along the columns, along the rows, along the beam."""
-        c, s = math.cos(self.angles[view]), math.sin(self.angles[view])
-        ct, st = math.cos(self.tilt[view]), math.sin(self.tilt[view])
-        cr, sr = math.cos(self.roll[view]), math.sin(self.roll[view])
-        (u0, u1, u2), (v0, v1, v2) = (c, s, 0.0), (-s * st, c * st, ct)
-        return np.array(
-            (
-                (cr * u0 + sr * v0, cr * u1 + sr * v1, cr * u2 + sr * v2),
-                (cr * v0 - sr * u0, cr * v1 - sr * u1, cr * v2 - sr * u2),
-                (-s * ct, c * ct, -st),
-            )
-        )
-
-    def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) of the origin of the object's frame, or of the view's centre, in one view."""
-        return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
-
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
         """The same geometry with only `views`, in that order.
 
@@ -332,7 +159,7 @@ class Geometry:
         chosen = np.atleast_1d(np.arange(self.n_views)[views])
         if chosen.size == 0:
             raise ValueError("no views are selected")
-        some: dict[str, Any] = {name: _frozen(getattr(self, name)[chosen]) for name in _OF_VIEWS}
+        some: dict[str, Any] = {name: frozen(getattr(self, name)[chosen]) for name in _OF_VIEWS}
         return replace(self, **some)
 
     def at(self, angles: ArrayLike) -> Geometry:
@@ -341,37 +168,32 @@ class Geometry:
         Raises:
             ValueError: for bad angles, or if shift, roll, tilt or centre differ between views: new ones are not known.
         """
-        for name, own in ((name, getattr(self, name)) for name in _OF_VIEWS if name != "angles"):
-            widest = float(np.ptp(own, axis=0).max())
+        for name in _OF_VIEWS[1:]:
+            widest = float(np.ptp(getattr(self, name), axis=0).max())
             if widest > 0:
                 raise ValueError(
                     f"{name} differ from view to view (by up to {widest:.3g}), so those at other angles are not "
                     f"known. Give a geometry whose views share one value, or one that holds the other views"
                 )
-        n = np.size(angles)
-        views = _checked(
-            angles, self.detector_shape, self.pixel_pitch, (self.sod, self.sdd), axis_col=self.axis_col,
-            axis_row=self.axis_row, shifts=np.broadcast_to(self.shifts[0], (n, 2)), roll=self.roll[0],
-            tilt=self.tilt[0],
-        ).seen_with(self.width, self.skew)  # fmt: skip
-        return views.about(np.broadcast_to(self.centres[0], (n, 3)))
+        theta = frozen(checked_angles(angles))
+        return replace(self.select(np.zeros(theta.size, np.int64)), angles=theta)
 
     def followed_by(self, other: Geometry) -> Geometry:
         """The views of this geometry, then those of another one of the same set-up."""
         both: dict[str, Any] = {
-            name: _frozen(np.concatenate((getattr(self, name), getattr(other, name)))) for name in _OF_VIEWS
+            name: frozen(np.concatenate((getattr(self, name), getattr(other, name)))) for name in _OF_VIEWS
         }
         return replace(self, **both)
 
     def straightened(self) -> Geometry:
         """The same views without roll, tilt and centres."""
-        none = _frozen(np.zeros(self.n_views))
-        return replace(self, roll=none, tilt=none, centres=_frozen(np.zeros((self.n_views, 3))))
+        none = frozen(np.zeros(self.n_views))
+        return replace(self, roll=none, tilt=none, centres=frozen(np.zeros((self.n_views, 3))))
 
     def scaled(self, factor: float) -> Geometry:
         """The same geometry with all lengths multiplied by `factor`, as in another unit."""
         lengths = {name: factor * getattr(self, name) for name in ("pixel_pitch", "sod", "sdd")}
-        return replace(self, **lengths, centres=_frozen(factor * self.centres))
+        return replace(self, **lengths, centres=frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
         """The same views with rays of a width, and a skew from row to row (rolling shutter).
@@ -391,11 +213,11 @@ class Geometry:
         points = np.asarray(centres, np.float64)
         if points.shape != (self.n_views, 3) or not np.isfinite(points).all():
             raise ValueError(f"centres must be finite mm (x, y, z) [{self.n_views}, 3], got shape {points.shape}")
-        return replace(self, centres=_frozen(points))
+        return replace(self, centres=frozen(points))
 
     def at_row(self, row: float) -> Geometry:
         """The same geometry without skew: all rows at the angle of this one."""
-        return replace(self, angles=_frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
+        return replace(self, angles=frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
 
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
@@ -410,7 +232,7 @@ class Geometry:
         keeps = self.is_cone or not self.is_straight
         axis_row = self.axis_row - start if keeps else off_middle + (stop - start - 1) / 2
         cropped = replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
-        return replace(cropped, angles=_frozen(self.angles + start * self.skew)) if start * self.skew else cropped
+        return replace(cropped, angles=frozen(self.angles + start * self.skew)) if start * self.skew else cropped
 
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
@@ -429,8 +251,8 @@ class Geometry:
             pixel_pitch=self.pixel_pitch * factor,
             axis_col=(whole.axis_col - (factor - 1) / 2) / factor,
             axis_row=(whole.axis_row - (factor - 1) / 2) / factor,
-            shifts=_frozen(self.shifts / factor),
-            angles=_frozen(whole.angles + (factor - 1) / 2 * self.skew),
+            shifts=frozen(self.shifts / factor),
+            angles=frozen(whole.angles + (factor - 1) / 2 * self.skew),
             width=self.width.binned(factor),
             skew=self.skew * factor,
         )
@@ -468,58 +290,3 @@ def geometry_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> Geometry:
     rows, cols = values.pop("detector_shape").tolist()
     width = RayWidth(*values.pop("width").tolist())
     return Geometry(detector_shape=(rows, cols), width=width, **values)
-
-
-def _checked(
-    angles: ArrayLike,
-    detector_shape: tuple[int, int],
-    pixel_pitch: float,
-    distances: tuple[float, float],
-    **where: Unpack[Where],
-) -> Geometry:
-    """The geometry with these `sod` and `sdd`. TypeError: a keyword that `Where` lacks."""
-    if unknown := where.keys() - Where.__annotations__.keys():
-        raise TypeError(f"a geometry has no {', '.join(sorted(unknown))}; expected {', '.join(Where.__annotations__)}")
-    check_arguments(Where, where)
-    axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
-    theta = _checked_angles(angles)
-    rows, cols = (operator.index(n) for n in detector_shape)
-    if rows < 1 or cols < 1:
-        raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
-    if not (np.isfinite(pixel_pitch) and pixel_pitch > 0):
-        raise ValueError(f"pixel_pitch must be a positive length in mm, got {pixel_pitch}")
-    col = (cols - 1) / 2 if axis_col is None else float(axis_col)
-    row = (rows - 1) / 2 if axis_row is None else float(axis_row)
-    for name, value in (("axis_col", col), ("axis_row", row)):
-        if not np.isfinite(value):
-            raise ValueError(f"{name} must be finite, got {value}")
-    moved = np.zeros((theta.size, 2)) if shifts is None else np.asarray(shifts, np.float64)
-    if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
-        raise ValueError(f"shifts must be finite pixels (col, row) [{theta.size}, 2], got shape {moved.shape}")
-    roll, tilt = (_checked_turns(name, where.get(name, 0.0), theta.size) for name in ("roll", "tilt"))
-    return Geometry(
-        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, *distances, _frozen(moved), roll, tilt
-    )  # fmt: skip
-
-
-def _checked_angles(angles: ArrayLike) -> F64:
-    theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
-    if theta.ndim != 1 or theta.size == 0:
-        raise ValueError(f"angles must be a non-empty list of radians, got shape {theta.shape}")
-    if not np.isfinite(theta).all():
-        bad = np.flatnonzero(~np.isfinite(theta))[:8].tolist()
-        raise ValueError(f"{(~np.isfinite(theta)).sum()} of {theta.size} angles are not finite (views {bad} ...)")
-    return theta
-
-
-def _checked_turns(name: str, turns: Any, views: int) -> F64:
-    given = np.asarray(turns, np.float64)
-    if given.shape not in ((), (views,)) or not np.isfinite(given).all():
-        raise ValueError(f"{name} must be finite radians, one for all views or [{views}], got {given.shape}")
-    return _frozen(np.broadcast_to(given, (views,)))
-
-
-def _frozen(values: F64) -> F64:
-    copy = np.array(values, np.float64)
-    copy.setflags(write=False)
-    return copy

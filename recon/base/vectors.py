@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 
 from recon.base.arrays import F64
 from recon.base.declared_types import check_arguments
-from recon.base.geometry import Geometry, Where
+from recon.base.geometry import Geometry
+from recon.base.placement import Where
 
 TOLERANCE = 0.1
 """Pixels by which a corner of the detector may lie off the one that the vectors state."""

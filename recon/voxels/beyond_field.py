@@ -169,7 +169,9 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
         least = best(_FINE ** (k / 2) for k in range(8))
     if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
         return None
-    alike = [ratio for ratio, (left, _) in tried.items() if not beyond_chance(left - tried[least][0], _ERRORS)]
+    alike = [
+        ratio for ratio, (residuals, _) in tried.items() if not beyond_chance(residuals - tried[least][0], _ERRORS)
+    ]
     radius = min(alike) * _FINE
     alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]
     densities = [tried[ratio][1] for ratio in alike]
@@ -236,5 +238,5 @@ class _Trial:
         volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume
         projector = Projector(apart, grid)
         model = projection_lines(projector.forward(volume.data))
-        left = unseen_residuals(model, projection_lines(judged), None, projector.resolution)
-        return left, _middle_density(volume, geometry.reach)
+        residuals = unseen_residuals(model, projection_lines(judged), None, projector.resolution)
+        return residuals, _middle_density(volume, geometry.reach)

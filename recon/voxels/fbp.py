@@ -22,7 +22,8 @@ from recon.base.arrays import F32, F64
 from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry, require_views
 from recon.base.registry import unknown
-from recon.base.volume import Grid, bands_of, slices_of
+from recon.base.slabs import bands_of, slices_of
+from recon.base.volume import Grid
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
 from recon.voxels.field_edges import FARTHEST, edge_levels, ends_in_matter, sample_reach
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights

@@ -14,8 +14,9 @@ from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, masked
 from recon.base.noise import air_level, noise_level, ring_offsets
+from recon.base.slabs import part_of
 from recon.base.views import spread
-from recon.base.volume import Grid, Volume, part_of
+from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
 from recon.voxels.resolution import at_voxel_resolution

@@ -1,7 +1,7 @@
 """The law of the error of a volume, measured in its views: what further views would bring, without a truth.
 
 Where noise makes the error, the square error of a volume of total variation falls as n^-0.6 with the views; where edges
-between voxels, fringes, a motion or matter beside the field make it, as n^-0.3 or less. Which of the two is so is
+between voxels, fringes, a motion or matter beside the field make it, as n^-0.3 or less. Which of the two holds is
 measured. A volume of seven eighths of the views stands for the sample, and in a copy of the scan noise alone is added
 to its projections (a parametric bootstrap; Efron & Tibshirani 1993, ch. 6.5). The copy tells the share of the noise in
 the error. Then volumes of half and of seven eighths of the views are judged by the eighth held out, in the scan and in
@@ -29,17 +29,17 @@ from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.held_out import preferred_strength, split_views, unseen_residuals
-from recon.voxels.iterative import solve
+from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 
 LEAST_VIEWS = 40
-_BY_NOISE, _BY_OTHERS = 0.6, 0.3  # exponents; on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
-_NOISY = 0.08, 0.16  # shares of noise in the error: up to the first something else, from the second noise makes it
-_SPREAD = 0.25  # half of the range of a gain, as a share of it: a convention, see docs/performance.md
-_SAME_ANGLES = 0.8  # of an exponent is the share of the error that falls with light at the same angles: median of 14
+_NOISE_EXPONENT, _OTHER_EXPONENT = 0.6, 0.3  # on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
+_NOISE_PRODUCT = 0.08, 0.16  # noise x ratio of falls: below the first other errors rule, above the second noise does
+_EXPONENT_ERROR = 0.25  # over the exponent: a convention, by which a gain's range is half to one and a half times it
+_SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
 _SWEEPS, _SUBSETS, _TV_STEPS, _TRIAL_VIEWS = 8, 9, 3, 64
@@ -49,14 +49,14 @@ _CIRCLE = 0.95  # of the field's radius, where errors count
 
 
 def measured_law(
-    data: F32, geometry: Geometry, sizes: Sequence[int], rng: np.random.Generator, open_beam: F32
+    data: F32, geometry: Geometry, views_at_ends: Sequence[int], rng: np.random.Generator, open_beam: F32
 ) -> tuple[ErrorLaw, float | None]:
     """The law of the error of the volume of these views, and dB by those of the last pass (None: not known).
 
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
         geometry: of these views: parallel beam, straight.
-        sizes: numbers of views at the ends of passes so far, the last of all.
+        views_at_ends: numbers of views at the ends of passes so far, the last of all.
         open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
             binned as the views.
 
@@ -64,63 +64,81 @@ def measured_law(
         ValueError: a cone, fewer than 40 views or 3 frames of the open beam, or views without matter.
     """
     n = len(data)
-    if geometry.is_cone or n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
-        needed = f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
-        there = f"{n} views and {len(open_beam)} frames of the open beam are there, {needed}"
+    if geometry.is_cone:
+        raise ValueError("the error of a volume is not measured: the beam is a cone")
+    if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
-            f"the error of a volume is not measured: {'the beam is a cone' if geometry.is_cone else there}"
+            f"the error of a volume is not measured: {n} views and {len(open_beam)} frames of the open beam are there, "
+            f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
         )
     sample = sample_radius(data, geometry)
     slab = _Slab.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
     most, held_out = split_views(slab.geometry)
-    parts = split_views(slab.geometry, 2)[1], most
-    weight = slab.chosen_weight()
-    measured = [slab.volume(slab.views, some, weight) for some in parts]
-    if not measured[1].any():
+    half = split_views(slab.geometry, 2)[1]  # every second one by angle, none of those held out
+    method = _TotalVariation(slab.chosen_weight())
+    volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
+    if not volumes[1].any():
         raise ValueError("the error of a volume is not measured: these views show no matter")
-    copy, other = slab.copies(measured[1], rng)
-    copied = [slab.volume(copy, some, weight) for some in parts]
-    errors = [slab.square_error(volume, measured[1]) for volume in copied]
-    noise = slab.square_error(copied[0], slab.volume(other, parts[0], weight)) / 2 / max(errors[0], _TINY)
-    fall = _fall(
-        [slab.unseen_power(volume, slab.views, held_out) for volume in measured],
+    copy, second_copy = slab.copies(volumes[1], rng)
+    copied = [slab.volume(method, copy, used) for used in (half, most)]
+    errors = [slab.square_error(volume, volumes[1]) for volume in copied]
+    noise = slab.square_error(copied[0], slab.volume(method, second_copy, half)) / 2 / max(errors[0], _TINY)
+    fall_ratio = _fall_ratio(
+        [slab.unseen_power(volume, slab.views, held_out) for volume in volumes],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    gaps = n < geometry.detector_shape[1]  # between the views: their error falls as that by noise does
-    by_noise = 1.0 if gaps else noise * (1.0 if fall is None else fall)
-    exponent = float(np.interp(by_noise, _NOISY, (_BY_OTHERS, _BY_NOISE)))
-    beside = offset_error(Volume(measured[1], slab.box), slab.geometry, sample)
-    offset = beside / (errors[1] + beside) if beside else 0.0
-    law = ErrorLaw(n, exponent, _SPREAD * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    if not fall or len(sizes) < 2 or min(errors) <= 0:
+    # Fewer views than columns leave gaps between them, whose error falls as that by noise does.
+    product = 1.0 if n < geometry.detector_shape[1] else noise * (1.0 if fall_ratio is None else fall_ratio)
+    exponent = float(np.interp(product, _NOISE_PRODUCT, (_OTHER_EXPONENT, _NOISE_EXPONENT)))
+    constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
+    offset = constant / (errors[1] + constant) if constant else 0.0
+    law = ErrorLaw(n, exponent, _EXPONENT_ERROR * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
+    if not fall_ratio or len(views_at_ends) < 2 or min(errors) <= 0:
         return law, None
-    measured_exponent = (
-        _VOLUME_OVER_VIEWS * fall * math.log(errors[0] / errors[1]) / math.log(len(most) / len(parts[0]))
-    )
-    return law, measured_exponent * 10 * math.log10(n / sizes[-2])
+    fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])  # of the scan, from half to most views
+    return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])
 
 
-def _fall(real: Sequence[float], ideal: Sequence[float]) -> float | None:
-    """The fall of the error from the first volume to the second, over that in the copy, 0 to 1; None: not known."""
-    if not ideal[0] > ideal[1] > 0:
+def _fall_ratio(scan: Sequence[float], copy: Sequence[float]) -> float | None:
+    """The fall of the error from the first volume to the second in the scan, over that in its copy, 0 to 1.
+
+    Args:
+        scan, copy: `_Slab.unseen_power` of the two volumes of each.
+
+    Returns:
+        None: not known, as the error of the copy does not fall.
+    """
+    if not copy[0] > copy[1] > 0:
         return None
-    fall = math.log(max(real[0], ideal[0] / 10) / max(real[1], ideal[1] / 10))
-    return min(max(fall / math.log(ideal[0] / ideal[1]), 0.0), 1.0)
+    fall = math.log(max(scan[0], copy[0] / 10) / max(scan[1], copy[1] / 10))
+    return min(max(fall / math.log(copy[0] / copy[1]), 0.0), 1.0)
 
 
 @dataclass(frozen=True)
 class _TotalVariation:
-    """FISTA-TV of a weight; None: only the weight by the noise is decided."""
+    """FISTA-TV with a weight that is stated for one view.
 
-    weight: float | None
+    That of n views is as many times it as the noise in the gradient of the sum over them: √n.
+    """
+
+    weight: float
     iterations: int = _SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        if self.weight is None:
-            problem.decide("weight", lambda: NoiseBalance.of(problem, x, self.iterations).first)
-            return x
+        weight = self.weight * math.sqrt(problem.projector.geometry.n_views)
         subsets = Subsets.of(problem, _SUBSETS)
-        return ordered_fista(problem, x, self.weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
+        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)
+
+
+@dataclass(frozen=True)
+class _WeightByNoise:
+    """Decides the weight of total variation by the noise of the views, and makes no volume."""
+
+    iterations: int = _SWEEPS
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        problem.decide("weight", lambda: NoiseBalance.of(problem, x, self.iterations).first)
+        return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,22 +146,22 @@ class _Slab:
     """Some rows of a scan, binned where they are many.
 
     Attributes:
-        views: [view, row, col]; noise: of one frame of the open beam [frame, row, col].
+        views: line integrals [view, row, col].
+        noise: of one frame of the open beam, [frame, row, col].
         box: as wide as the sample.
-        made: decisions of the first volume, which the others follow.
+        decisions: of the volumes so far, which the next ones follow.
     """
 
     views: F32
     geometry: Geometry
     box: Grid
     noise: F32
-    made: dict[str, list[Any]] = field(default_factory=dict)
+    decisions: dict[str, list[Any]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, width: float, open_beam: F32) -> _Slab:
         """Rows with most matter of a scan whose sample is `width` times as wide as the field."""
-        halvings = math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))
-        factor = 2 ** max(0, math.ceil(halvings))
+        factor = 2 ** max(0, math.ceil(math.log2(width * data.shape[2] * math.sqrt(len(data) / _WORK))))
         rows = busiest_rows(data, min(_ROWS * factor, data.shape[1]))
         views, geometry = np.ascontiguousarray(data[:, rows]), geometry.rows(rows.start, rows.stop)
         change = np.diff(open_beam, axis=0)
@@ -154,33 +172,30 @@ class _Slab:
         geometry, box = slab_of(geometry, Grid.matching(geometry), 0, geometry.detector_shape[0])
         return cls(views, geometry, box.reaching(width * geometry.reach, geometry) if width > 1 else box, noise)
 
-    def volume(self, views: F32, some: NDArray[np.intp], weight: float | None) -> F32:
-        """[z, y, x] of some of the views; `weight` of total variation: for one view, as of `_TotalVariation`.
-
-        It grows as the noise in the gradient of the sum over the views does: with the root of their number.
-        """
-        geometry, images = self.geometry.select(some), np.ascontiguousarray(views[some])
+    def volume(self, method: IterativeMethod, views: F32, used: NDArray[np.intp]) -> F32:
+        """[z, y, x], made of the views that are used (their numbers), from filtered back-projection of them."""
+        geometry, images = self.geometry.select(used), np.ascontiguousarray(views[used])
         start = Volume(np.maximum(fbp(images, geometry, self.box, filter="hann"), 0), self.box)
-        method, decide = _TotalVariation(weight and weight * math.sqrt(len(some))), Decisions(0, self.made)
+        decide = Decisions(0, self.decisions)
         volume = solve(method, Projector(geometry, self.box), images, start=start, decide=decide)
-        self.made.update(decide.made)
+        self.decisions.update(decide.made)
         return np.maximum(volume.data, 0)
 
     def chosen_weight(self) -> float:
-        """The weight that predicts views held out best, for one view."""
-        in_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
-        some = np.sort(in_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
-        self.volume(self.views, some, None)
-        by_noise = float(self.made["weight"][0] / math.sqrt(len(some)))
-        seen, unseen = (some[part] for part in split_views(self.geometry.select(some)))
-        projector, judges = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
+        """The weight of total variation for one view that predicts views held out best."""
+        by_angle = np.argsort(np.mod(self.geometry.angles, self.geometry.period), kind="stable")
+        tried = np.sort(by_angle[:: -(-len(self.views) // _TRIAL_VIEWS)])
+        self.volume(_WeightByNoise(), self.views, tried)
+        first = float(self.decisions["weight"][0] / math.sqrt(len(tried)))
+        seen, unseen = (tried[part] for part in split_views(self.geometry.select(tried)))
+        projector, held_out = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
 
         def residuals(weight: float) -> NDArray[np.float64]:
-            model = projector.forward(self.volume(self.views, seen, weight))
-            return unseen_residuals(projection_lines(model), judges, None, projector.resolution)
+            model = projector.forward(self.volume(_TotalVariation(weight), self.views, seen))
+            return unseen_residuals(projection_lines(model), held_out, None, projector.resolution)
 
-        best = preferred_strength(residuals, by_noise) if by_noise > 0 else None
-        return by_noise if best is None else best.strength
+        best = preferred_strength(residuals, first) if first > 0 else None
+        return first if best is None else best.strength
 
     def copies(self, sample: F32, rng: np.random.Generator) -> list[F32]:
         """Two scans [view, row, col] of a sample, with different noise like that of the open beam."""
@@ -192,17 +207,17 @@ class _Slab:
     def square_error(self, volume: F32, other: F32) -> float:
         """Mean square difference of two volumes within the field's circle."""
         y, x = np.meshgrid(*self.box.coordinates()[1:], indexing="ij")
-        part = np.subtract(volume, other)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
-        return float(np.mean(np.square(part, dtype=np.float64)))
+        difference = np.subtract(volume, other)[:, np.hypot(y, x) < _CIRCLE * self.geometry.reach]
+        return float(np.mean(np.square(difference, dtype=np.float64)))
 
     def unseen_power(self, volume: F32, views: F32, unseen: NDArray[np.intp]) -> float:
         """Power of the error of a volume in views that it was not made of, without that of their noise."""
         projector, n = Projector(self.geometry.select(unseen), self.box), len(self.noise)
-        seen = projection_lines(np.ascontiguousarray(views[unseen]))
-        left = at_voxel_resolution(seen, projector.resolution) - projection_lines(projector.forward(volume))
-        some = self.geometry.select(unseen[np.arange(n) * len(unseen) // n])
-        noise = at_voxel_resolution(projection_lines(self.noise), Projector(some, self.box).resolution)
-        return _ramp_power(left) - _ramp_power(noise) * float(np.exp(seen, dtype=np.float64).mean())
+        lines = projection_lines(np.ascontiguousarray(views[unseen]))
+        residual = at_voxel_resolution(lines, projector.resolution) - projection_lines(projector.forward(volume))
+        angles_of_noise = self.geometry.select(unseen[np.arange(n) * len(unseen) // n])  # it is smoothed as views are
+        noise = at_voxel_resolution(projection_lines(self.noise), Projector(angles_of_noise, self.box).resolution)
+        return _ramp_power(residual) - _ramp_power(noise) * float(np.exp(lines, dtype=np.float64).mean())
 
 
 def _ramp_power(lines: F32) -> float:

@@ -13,7 +13,8 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.noise import deviation_between_neighbours
-from recon.base.volume import Grid, Volume, part_of
+from recon.base.slabs import part_of
+from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
 LIMIT = 12.0

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid, Volume, bands_of
+from recon.base.slabs import bands_of
+from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
 from recon.kernels.cpu import one_slice as one_slice_cpu

@@ -14,30 +14,31 @@ from beamline.scan.preflight import preflight
 from beamline.scan.recorder import Recorder
 from beamline.scan.supervision import Supervision
 
-Chooser = Callable[[Passes], Choice]
+Chooser = Callable[[Passes], Choice | None]
 
 
 @contextmanager
 def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
-    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded."""
+    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded; None is no answer."""
     recorders: list[Recorder] = []
-    numbers = [0]  # of the passes so far
+    pass_numbers = [0]  # of the newest pass of each scan, from 1; a resumed one counts on
 
     def recorder(*given: Any, **more: Any) -> Recorder:
         recorders.append(Recorder(*given, **more))
         return recorders[-1]
 
     def next_pass(passes: Passes) -> Choice:
-        choice = choose(passes)
-        numbers[-1] += 1
-        values = {"number": numbers[-1], "n_views": passes.n_views, "choice": choice, "predicted": float("nan")}
+        if (choice := choose(passes)) is None:
+            return Choice.NEXT
+        pass_numbers[-1] += 1
+        values = {"number": pass_numbers[-1], "n_views": passes.n_frames, "choice": choice, "predicted": float("nan")}
         recorders[-1].add_decision(values)
         return choice
 
     def ready(*given: Any, **more: Any) -> Any:
-        made = preflight(*given, **more)
-        numbers.append(len(made.plan.choices))
-        return replace(made, info=replace(made.info, decides=True))
+        checked = preflight(*given, **more)
+        pass_numbers.append(len(checked.plan.choices))
+        return replace(checked, info=replace(checked.info, decides=True))
 
     def in_passes(config: Config) -> ScanPlan:
         return replace(plan_of(config), pass_views=pass_views)
@@ -45,17 +46,16 @@ def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) ->
     def supervised(*given: Any, **more: Any) -> Supervision:
         return Supervision(*given, **more | {"next_pass": next_pass})
 
-    with patch.context() as within:
-        for module in ("preflight", "resume"):
-            within.setattr(f"beamline.scan.{module}.plan_of", in_passes)
-        within.setattr("beamline.scan.run.preflight", ready)
-        within.setattr("beamline.scan.measurement.Recorder", recorder)
-        within.setattr("beamline.scan.measurement.Supervision", supervised)
+    with patch.context() as patched:
+        patched.setattr("beamline.scan.preflight.plan_of", in_passes)
+        patched.setattr("beamline.scan.run.preflight", ready)
+        patched.setattr("beamline.scan.measurement.Recorder", recorder)
+        patched.setattr("beamline.scan.measurement.Supervision", supervised)
         yield
 
 
-class Asked:
-    """Answers by a script, where they are possible, else that the plan goes on; keeps what it was asked."""
+class Scripted:
+    """Chooses by a script, and NEXT where that is not possible or over. Keeps what it was asked and what it chose."""
 
     def __init__(self, script: Iterable[Choice]) -> None:
         self.script, self.asked, self.answers = iter(script), list[Passes](), list[Choice]()

@@ -53,7 +53,7 @@ class State(NamedTuple):
     retaken: bool = False
 
     def __str__(self) -> str:
-        again = "".join(f"+{one}" for one in self.again)
+        again = "".join(f"+{repeated}" for repeated in self.again)
         return f"{self.passes}{again}{'w' if self.wide else ''}{'r' if self.retaken else ''}"
 
     def frames(self, number: int) -> int:
@@ -78,22 +78,20 @@ def whole_plan(number: int) -> State:
 
 def views_of(number: int, seed: int, state: State) -> tuple[F32, Geometry]:
     """Line integrals and geometry of the views of a state, in the order taken, without those that a crumb spoils."""
-    scene, taken = _scene(number), state.passes * PASS
-    first = _noisy(number, seed, 0)
-    spoilt = np.zeros(first.shape[0], np.bool_)
+    scene, n_planned = _scene(number), state.passes * PASS
+    spoilt = np.zeros(scene.geometry.n_views, np.bool_)
     if RECIPES[number].crumb:
         spoilt[CRUMBED.start : CRUMBED.stop] = True
-    own = np.flatnonzero(~spoilt[:taken])
-    parts = [(0, own)]
-    for k, one in enumerate(state.again):
-        take = 1 + state.again[:k].count(one)
-        parts.append((take, np.arange(one * PASS, (one + 1) * PASS)))
+    parts = [(0, np.flatnonzero(~spoilt[:n_planned]))]  # take, and numbers of its views
+    for k, repeated in enumerate(state.again):
+        take = 1 + state.again[:k].count(repeated)
+        parts.append((take, np.arange(repeated * PASS, (repeated + 1) * PASS)))
     if state.retaken:
-        parts.append((1, np.flatnonzero(spoilt[:taken])))
+        parts.append((1, np.flatnonzero(spoilt[:n_planned])))
     if state.wide:
-        parts.append((0, np.arange(VIEWS, first.shape[0])))
-    views = np.concatenate([_noisy(number, seed, take)[at] for take, at in parts])
-    return views, scene.geometry.select(np.concatenate([at for _, at in parts]))
+        parts.append((0, np.arange(VIEWS, spoilt.size)))
+    views = np.concatenate([_noisy(number, seed, take)[numbers] for take, numbers in parts])
+    return views, scene.geometry.select(np.concatenate([numbers for _, numbers in parts]))
 
 
 _scene = lru_cache(maxsize=2)(scene_of)
@@ -157,7 +155,7 @@ def _law_code() -> str:
     return hashlib.sha256(inspect.getsource(inspect.getmodule(measured_law) or measured_law).encode()).hexdigest()[:8]
 
 
-class Kept:
+class ScoreFile:
     """Scores and laws in a file, which several processes may add to."""
 
     def __init__(self, path: Path) -> None:
@@ -212,27 +210,27 @@ class Kept:
         return ErrorLaw(*self.laws[key][:5])
 
 
-def hindsight(number: int, kept: Kept, below: float = WISH) -> State:
+def hindsight(number: int, scores: ScoreFile, below: float = WISH) -> State:
     """The state of the fewest frames that is at most `below` dB under the whole plan's.
 
     Each of the plan's passes is taken to improve the volume, so that few states are looked at. States with passes taken
     twice count where the file has them.
     """
     whole = whole_plan(number)
-    least = kept.score(number, whole).quality - below
+    least = scores.score(number, whole).quality - below
 
-    def fewest(of: State) -> State:
-        first, last = 0, PASSES  # the first is too few, the last suffices
-        while last - first > 1:
-            middle = (first + last + 1) // 2
-            enough = kept.score(number, _with(of, middle)).quality >= least
-            first, last = (first, middle) if enough else (middle, last)
-        return _with(of, last)
+    def fewest(state: State) -> State:
+        too_few, enough = 0, PASSES
+        while enough - too_few > 1:
+            passes = (too_few + enough + 1) // 2
+            reached = scores.score(number, _with(state, passes)).quality >= least
+            too_few, enough = (too_few, passes) if reached else (passes, enough)
+        return _with(state, enough)
 
     best = fewest(whole)
     plain = State(best.passes) if whole.wide else fewest(State(PASSES))
-    twice = [state for state in (State(1, (0,)), State(2, (1,))) if kept.has(number, state)]
-    reached = [state for state in (plain, *twice) if kept.score(number, state).quality >= least]
+    twice = [state for state in (State(1, (0,)), State(2, (1,))) if scores.has(number, state)]
+    reached = [state for state in (plain, *twice) if scores.score(number, state).quality >= least]
     return min((best, *reached), key=lambda state: state.frames(number))
 
 
@@ -241,26 +239,26 @@ def _with(state: State, passes: int) -> State:
     return state._replace(passes=passes, retaken=state.retaken and passes * PASS > CRUMBED.start)
 
 
-def fixed(number: int, kept: Kept, frames: int) -> float:
+def fixed(number: int, scores: ScoreFile, frames: int) -> float:
     """dB of the fixed plan of so many frames, between those of whole passes; wide views and retakes come last."""
     whole = whole_plan(number)
     if frames >= VIEWS:
-        return kept.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality
+        return scores.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality
     low = max(1, frames // PASS)
     share = frames / PASS - low
-    below = kept.score(number, State(low)).quality
-    return below + share * (kept.score(number, State(low + 1)).quality - below) if share else below
+    below = scores.score(number, State(low)).quality
+    return below + share * (scores.score(number, State(low + 1)).quality - below) if share else below
 
 
-def table(kept: Kept, numbers: Sequence[int]) -> str:
+def table(scores: ScoreFile, numbers: Sequence[int]) -> str:
     """Markdown: dB by passes, the fewest frames in hindsight, and the density of the middle with the whole plan."""
     heads = [f"{PASS * passes}" for passes in range(1, PASSES + 1)]
     lines = ["| scene | " + " | ".join(heads) + " | whole plan | hindsight | middle |", "|---" * (len(heads) + 4) + "|"]
     for number in numbers:
-        whole, best = whole_plan(number), hindsight(number, kept)
+        whole, best = whole_plan(number), hindsight(number, scores)
         states = [State(passes) for passes in range(1, PASSES + 1)]
-        shown = [f"{kept.score(number, state).quality:.2f}" if kept.has(number, state) else "" for state in states]
-        score = kept.score(number, whole)
+        shown = [f"{scores.score(number, state).quality:.2f}" if scores.has(number, state) else "" for state in states]
+        score = scores.score(number, whole)
         shown += [f"{score.quality:.2f} ({whole.frames(number)})", f"{best.frames(number)} ({best})"]
         lines.append(f"| {number} {RECIPES[number]} | " + " | ".join([*shown, f"{score.middle:.3f}"]) + " |")
     return "\n".join(lines)
@@ -270,8 +268,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scores", type=Path)
     parser.add_argument("--scenes", default=",".join(map(str, DEV)))
-    asked = parser.parse_args()
-    print(table(Kept(asked.scores), [int(number) for number in asked.scenes.split(",")]))
+    arguments = parser.parse_args()
+    print(table(ScoreFile(arguments.scores), [int(number) for number in arguments.scenes.split(",")]))
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def config_of(number: int, **more: object) -> Config:
 class Scanned:
     """A scan that decided: its file's decisions, rows, and real seconds from the last frame of a pass to each."""
 
-    decisions: tuple[dict[str, Any], ...]
+    decisions: tuple[Mapping[str, Any], ...]
     rows: int
     waits: tuple[float, ...]
     seconds: float
@@ -100,11 +101,11 @@ class Scanned:
 
 def scanned(config: Config, folder: Path) -> Scanned:
     """Run a scan as `beamline scan` does, with its live reconstruction."""
-    waits, asked = list[float](), Decider.__call__
+    waits, decide = list[float](), Decider.__call__
 
     def timed(decider: Decider, passes: Passes) -> Choice:
         begin = time.monotonic()
-        choice = asked(decider, passes)
+        choice = decide(decider, passes)
         waits.append(time.monotonic() - begin)
         return choice
 
@@ -121,21 +122,22 @@ def scanned(config: Config, folder: Path) -> Scanned:
     with patch.object(Decider, "__call__", timed), suppress(ScanStopped):
         run_scan(config, folder, [note], stop, live=how.live, afterwards=how.afterwards)
     with open_scan(path) as source:
-        return Scanned(tuple(source.decisions), source.n, tuple(waits), time.monotonic() - begin)
+        return Scanned(source.decisions, source.image_key.size, tuple(waits), time.monotonic() - begin)
 
 
-def lines_of(made: Scanned) -> list[str]:
+def lines_of(scan: Scanned) -> list[str]:
     """A line of Markdown for each decision, and one for the scan."""
     lines = []
-    for one, wait in zip(made.decisions, made.waits, strict=False):
+    for decision, wait in zip(scan.decisions, scan.waits, strict=False):
         gains = ", ".join(
-            f"{option['choice']} {option['gain']:.2f}" for option in one["options"] if option["gain"] is not None
+            f"{option['choice']} {option['gain']:.2f}" for option in decision["options"] if option["gain"] is not None
         )
-        came = "" if one["gained"] is None else f"{one['gained']:.2f}"
+        gained = "" if decision["gained"] is None else f"{decision['gained']:.2f}"
         lines.append(
-            f"| {one['number']} | {one['n_views']} | {one['choice']} by {one['by']} | {gains} | {came} | {wait:.1f} |"
+            f"| {decision['number']} | {decision['n_views']} | {decision['choice']} by {decision['by']} | {gains} "
+            f"| {gained} | {wait:.1f} |"
         )
-    return [*lines, f"{made.rows} rows, {made.seconds:.0f} s in all, real"]
+    return [*lines, f"{scan.rows} rows, {scan.seconds:.0f} s in all, real"]
 
 
 def main() -> None:
@@ -143,13 +145,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", default="0,4,5,7")
     parser.add_argument("--set", action="append", default=[], help="KEY=VALUE of the configuration")
-    asked = parser.parse_args()
-    for number in map(int, asked.scenes.split(",")):
-        more = {key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in asked.set)}
+    arguments = parser.parse_args()
+    for number in map(int, arguments.scenes.split(",")):
+        more = {key: yaml.safe_load(value) for key, _, value in (word.partition("=") for word in arguments.set)}
         print(f"\nscene {number}, {RECIPES[number]}\n", flush=True)
         print("| pass | views | choice | gains in dB | gained by the last | s |\n|---|---|---|---|---|---|")
-        made = scanned(config_of(number, **{"scan.decide": "do", **more}), asked.folder)
-        print("\n".join(lines_of(made)), flush=True)
+        scan = scanned(config_of(number, **{"scan.decide": "do", **more}), arguments.folder)
+        print("\n".join(lines_of(scan)), flush=True)
 
 
 if __name__ == "__main__":

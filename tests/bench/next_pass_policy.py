@@ -18,14 +18,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from beamline.plan.choose import Wish, choose, options, rest_gain
+from beamline.plan.choose import Wish, choose, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.base.frame import FrameKind
 from recon.base.error_law import ErrorLaw
-from tests.bench.next_pass import WISH, Kept, State, fixed, hindsight, whole_plan
+from tests.bench.next_pass import WISH, ScoreFile, State, fixed, hindsight, whole_plan
 from tests.bench.next_pass_devices import config_of
 from tests.bench.next_pass_scenes import CRUMBED, DEV, PASS, PASSES, RECIPES
 
@@ -34,12 +34,12 @@ CLOSE_DB, CLOSE_SHARE = 0.3, 0.3
 
 @dataclass(frozen=True)
 class Step:
-    """A pass end: the passes so far, the law of their error, what is chosen, and dB that the rest of the plan adds."""
+    """A pass end: the passes so far, the law of their error, what is chosen, and dB by all that the plan still has."""
 
     state: State
     law: ErrorLaw
     choice: Choice
-    rest: float
+    remaining: float
 
 
 @lru_cache(maxsize=1)
@@ -48,7 +48,7 @@ def planned(number: int) -> DryRun:
     return dry_run(config_of(number))
 
 
-def way(number: int, seed: int, kept: Kept, wish: Wish) -> tuple[list[Step], State]:
+def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list[Step], State]:
     """The decisions of `do`, and the state that the scan ends in."""
     plan = planned(number)
     timeline = plan.timeline
@@ -63,10 +63,10 @@ def way(number: int, seed: int, kept: Kept, wish: Wish) -> tuple[list[Step], Sta
         passes = Passes(done, to_come, () if state.wide else wide, _retakes(number, state))
         if not (passes.to_come or passes.wide or passes.retakes):
             return steps, state
-        law = kept.law(number, seed, state)
-        offered, rest = options(passes, law, timeline, seconds_of), rest_gain(passes, law)
-        choice, _ = choose(offered, wish, rest, 0.0, 0.0)
-        steps.append(Step(state, law, choice, rest.mean))
+        law = scores.law(number, seed, state)
+        offered, remaining = options(passes, law, timeline, seconds_of), remaining_gain(passes, law)
+        choice, _ = choose(offered, wish, remaining, 0.0, 0.0)
+        steps.append(Step(state, law, choice, remaining.mean))
         match choice:
             case Choice.NEXT:
                 done, to_come = (*done, to_come[0]), to_come[1:]
@@ -108,54 +108,54 @@ class Outcome:
     middle: float
 
 
-def outcome(number: int, seed: int, kept: Kept, wish: Wish) -> Outcome:
+def outcome(number: int, seed: int, scores: ScoreFile, wish: Wish) -> Outcome:
     """Of one scene and noise."""
-    steps, state = way(number, seed, kept, wish)
-    score, frames = kept.score(number, state), state.frames(number)
+    steps, state = decided(number, seed, scores, wish)
+    score, frames = scores.score(number, state), state.frames(number)
     right = []
     for step in steps:
         if step.state.passes + len(step.state.again) < PASSES:
             following = step.state._replace(passes=step.state.passes + 1)
-            gain = kept.score(number, following).quality - kept.score(number, step.state).quality
+            gain = scores.score(number, following).quality - scores.score(number, step.state).quality
             off = abs(step.law.gain(views=PASS).mean - gain)
             right.append(off <= max(CLOSE_DB, CLOSE_SHARE * abs(gain)))
     return Outcome(
         state,
         frames,
-        frames / hindsight(number, kept).frames(number),
-        kept.score(number, whole_plan(number)).quality - score.quality,
-        score.quality - fixed(number, kept, frames),
+        frames / hindsight(number, scores).frames(number),
+        scores.score(number, whole_plan(number)).quality - score.quality,
+        score.quality - fixed(number, scores, frames),
         tuple(right),
         score.middle,
     )
 
 
-def table(kept: Kept, numbers: Sequence[int], seeds: Sequence[int], wish: Wish) -> str:
+def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], wish: Wish) -> str:
     """Markdown: medians of the seeds for each scene, and in the last line what was asked of all."""
     lines = [
         "| scene | ends with | frames | over hindsight | below all, dB | over fixed, dB | predictions | middle |",
         "|---" * 8 + "|",
     ]
-    each = []
+    of_all = []
     for number in numbers:
-        made = [outcome(number, seed, kept, wish) for seed in seeds]
-        each += made
-        right = [one for outcome in made for one in outcome.right]
+        outcomes = [outcome(number, seed, scores, wish) for seed in seeds]
+        of_all += outcomes
+        right = [was_right for one in outcomes for was_right in one.right]
         median = {
-            name: statistics.median(getattr(one, name) for one in made)
+            name: statistics.median(getattr(one, name) for one in outcomes)
             for name in ("frames", "ratio", "below", "over_fixed", "middle")
         }
-        states = ", ".join(dict.fromkeys(str(one.state) for one in made))
+        states = ", ".join(dict.fromkeys(str(one.state) for one in outcomes))
         lines.append(
             f"| {number} {RECIPES[number]} | {states} | {median['frames']:.0f} | {median['ratio']:.2f} "
             f"| {median['below']:.2f} | {median['over_fixed']:+.2f} | {sum(right)} of {len(right)} "
             f"| {median['middle']:.3f} |"
         )
-    right = [one for outcome in each for one in outcome.right]
-    ratio = statistics.median(one.ratio for one in each)
-    worst = min(one.over_fixed for one in each)
+    right = [was_right for one in of_all for was_right in one.right]
+    ratio = statistics.median(one.ratio for one in of_all)
+    worst = min(one.over_fixed for one in of_all)
     wished = wish.quality_db or 0.0
-    near = f"{sum(one.below <= wished for one in each)} of {len(each)} reach {wished:g}"
+    near = f"{sum(one.below <= wished for one in of_all)} of {len(of_all)} reach {wished:g}"
     lines.append(f"| all | | | {ratio:.2f} | {near} | {worst:+.2f} at least | {sum(right)} of {len(right)} | |")
     return "\n".join(lines)
 
@@ -165,9 +165,9 @@ def main() -> None:
     parser.add_argument("scores", type=Path)
     parser.add_argument("--scenes", default=",".join(map(str, DEV)))
     parser.add_argument("--seeds", default="0,1,2")
-    asked = parser.parse_args()
-    numbers, seeds = ([int(word) for word in words.split(",")] for words in (asked.scenes, asked.seeds))
-    print(table(Kept(asked.scores), numbers, seeds, Wish(quality_db=WISH)))
+    arguments = parser.parse_args()
+    numbers, seeds = ([int(word) for word in words.split(",")] for words in (arguments.scenes, arguments.seeds))
+    print(table(ScoreFile(arguments.scores), numbers, seeds, Wish(quality_db=WISH)))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ import recon
 from beamline.plan.plan import interlaced
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from simulators.effects.scattering.phase_fringes import PhaseFringes
+from simulators.effects.catalogue import load_effect
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Detector, Pose
 from simulators.light import Beam
 from simulators.samples.composed import build_sample
@@ -137,7 +138,7 @@ def mapping_of(recipe: Recipe, number: int) -> dict[str, object]:
     return keys | larger | {"diameter": 2 * radius * PITCH, "seed": 70 + number}
 
 
-def _lines(sample: Sample, geometry: Geometry, moved: F64, fringes: PhaseFringes | None) -> tuple[F32, F32 | None]:
+def _lines(sample: Sample, geometry: Geometry, moved: F64, fringes: ImageEffect | None) -> tuple[F32, F32 | None]:
     """Line integrals [view, row, col] of a sample that stands `moved` [view] pixels aside, and with fringes."""
     rows, cols = ROWS + 2 * EDGE, COLS + 2 * EDGE
     shot = shots.shot(detector=Detector.centred((rows, cols), PITCH))
@@ -157,10 +158,8 @@ def made(number: int) -> Scene:
     """Compute the scene of this number."""
     recipe = RECIPES[number]
     sample = build_sample("phantom", mapping_of(recipe, number), Beam(1e5))
-    delta_beta, distance, energy = OPTICS[recipe.sample]
-    fringes = None
-    if recipe.fringes:
-        fringes = PhaseFringes(delta_beta, distance, energy, method="transport")  # type: ignore[abstract]
+    phase_fringes = load_effect("phase_fringes")
+    fringes = phase_fringes(*OPTICS[recipe.sample], method="transport") if recipe.fringes else None
     truth = sample.attenuation(Grid((ROWS, COLS, COLS), PITCH)) * np.float32(PITCH)
     geometry = geometry_of(recipe.over, interlaced(VIEWS, PASSES))
     moved = np.zeros(geometry.n_views)
@@ -173,7 +172,7 @@ def made(number: int) -> Scene:
     return Scene(plain if fringed is None else fringed, crumb, truth.astype(np.float32), geometry)
 
 
-def _shown_by(fringes: PhaseFringes, sample: Sample) -> F32:
+def _shown_by(fringes: ImageEffect, sample: Sample) -> F32:
     """[z, y, x], what fringes add to a volume of noiseless views at twice as many angles."""
     twice = Geometry.parallel(np.arange(2 * VIEWS) * np.pi / (2 * VIEWS), (ROWS, COLS))
     without, with_fringes = _lines(sample, twice, np.zeros(2 * VIEWS), fringes)

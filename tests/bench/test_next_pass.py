@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.bench.next_pass import Kept, Score, State, fixed, hindsight, judged, views_of
+from tests.bench.next_pass import Score, ScoreFile, State, fixed, hindsight, judged, views_of
 from tests.bench.next_pass_scenes import CRUMBED, PASS, PASSES, RECIPES, VIEWS, scene_of
 
 pytestmark = pytest.mark.bench
@@ -19,10 +19,10 @@ FROZEN = {0: (0.6176541, 0.004823597), 2: (0.78914, 0.004135457), 5: (1.523901, 
 FITS, WIDE, CRUMB = 0, 2, 4
 
 
-def kept_of(path: Path, number: int, quality: dict[State, float]) -> Kept:
-    kept = Kept(path)
-    kept.scores = {f"{number}|0|r2|{state}": Score(db, 1.0, 1.0) for state, db in quality.items()}
-    return kept
+def kept_of(path: Path, number: int, quality: dict[State, float]) -> ScoreFile:
+    scores = ScoreFile(path)
+    scores.scores = {f"{number}|0|r2|{state}": Score(db, 1.0, 1.0) for state, db in quality.items()}
+    return scores
 
 
 @pytest.mark.parametrize("number", FROZEN)
@@ -46,8 +46,8 @@ def test_wide_views_count_where_they_were_needed(tmp_path: Path) -> None:
 
 
 def test_the_fixed_plan_lies_between_whole_passes(tmp_path: Path) -> None:
-    kept = kept_of(tmp_path / "scores", FITS, {State(n): 20.0 + n * n for n in range(1, PASSES + 1)})
-    assert [fixed(FITS, kept, frames) for frames in (PASS, PASS * 3 // 2, 2 * PASS, VIEWS)] == [21, 22.5, 24, 84]
+    scores = kept_of(tmp_path / "scores", FITS, {State(n): 20.0 + n * n for n in range(1, PASSES + 1)})
+    assert [fixed(FITS, scores, frames) for frames in (PASS, PASS * 3 // 2, 2 * PASS, VIEWS)] == [21, 22.5, 24, 84]
 
 
 def test_spoilt_views_are_left_out_until_they_are_taken_again() -> None:

@@ -17,7 +17,8 @@ from beamline.cli.options import json_option
 from beamline.cli.terminal import answering
 from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
+from beamline.core.event_lines import event_of
+from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned
 from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
 from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.text import SENTENCE, csv_text, one_line, safe_name

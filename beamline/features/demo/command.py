@@ -14,7 +14,8 @@ import click
 from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, RunDone, Sink, VolumeDone
+from beamline.core.events import Event, RunDone, Sink
+from beamline.core.recon_events import VolumeDone
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock

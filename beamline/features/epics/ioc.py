@@ -1,4 +1,4 @@
-"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control also verbs and answers to it."""
+"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control it takes verbs and answers."""
 
 from __future__ import annotations
 
@@ -123,31 +123,31 @@ class RunServer:
         self._send(pv, op, lambda: choice_of(self._run.stamped.values, op.value().raw.value))
 
     def _send(self, pv: Any, op: Any, verb_of: Callable[[], Verb | Choice]) -> None:
-        """Send a verb to the run at once; `look` answers the client."""
+        """Send a verb, or an answer to what the scan asks, to the run at once; `look` answers the client."""
         try:
             verb = verb_of()
             self._say(f"{verb} from {op.peer()}")
             self._asked.append((pv, op, ask(newest(self._run.runs), verb)))
         except (BeamlineError, OSError) as error:
-            self._refuse(pv, op, error)
+            self._end(pv, op, error)
 
     def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
         """Answer the client of a verb that is done; one that is not yet waits for the next look."""
         try:
             done = asked.state() is not None
         except (BeamlineError, OSError) as error:
-            self._refuse(pv, op, error)
+            self._end(pv, op, error)
             return
         if done:
-            pv.post(_posted("" if pv is self._decide else False, Stamp(self._now())))
-            op.done()
+            self._end(pv, op)
         else:
             self._asked.append((pv, op, asked))
 
-    def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
-        stamp = Stamp(self._now(), Severity.MAJOR, user_message(error))
+    def _end(self, pv: Any, op: Any, error: Exception | None = None) -> None:
+        """Post what a PV held before it was written to, with the error as its alarm, and answer the client."""
+        stamp = Stamp(self._now(), *(() if error is None else (Severity.MAJOR, user_message(error))))
         pv.post(_posted("" if pv is self._decide else False, stamp))
-        op.done(error=stamp.message)
+        op.done(error=stamp.message or None)
 
 
 def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:

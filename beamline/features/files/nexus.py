@@ -94,14 +94,14 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
         return
     steps = np.diff(stamps)
     new = np.zeros(triggers.size, np.bool_)
-    of_pass = np.searchsorted(pass_ends_in(places.entry.file), np.arange(key.size), "right")  # which may be repeated
+    passes = np.searchsorted(pass_ends_in(places.entry.file), np.arange(key.size), "right")  # one may be repeated
     aside = _column(places, "sample/x_translation")  # wide views count from the last view, as those taken again do
     aside = aside if aside.size == key.size else np.zeros(key.size)
-    new[np.unique(np.stack([key, triggers, of_pass, aside]), axis=1, return_index=True)[1]] = True
+    new[np.unique(np.stack([key, triggers, passes, aside]), axis=1, return_index=True)[1]] = True
     parts = places.data.virtual_sources() if places.data.is_virtual else []
     begin = [part.vspace.get_select_bounds()[0][0] for part in parts]
     new[[row for row in begin if row < new.size]] = True
-    armed = new[1:] & ((steps < 0) | (stamps[1:] == 0))
+    armed = (np.diff(passes) > 0) | (new[1:] & ((steps < 0) | (stamps[1:] == 0)))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))
     if repeated.size:

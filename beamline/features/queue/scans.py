@@ -92,7 +92,13 @@ class QueueError(BeamlineError):
         self.exit_code = code
 
 
-def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: bool = False) -> tuple[QueuedScan, ...]:
+def load_queue(
+    files: Sequence[Path],
+    overrides: Sequence[str],
+    *,
+    rehearse: bool = False,
+    no_live: Callable[[str], None] | None = None,
+) -> tuple[QueuedScan, ...]:
     """The scans of these configurations and tables, in their order.
 
     A table is a CSV file. Its first line names the column `config`, the file of a configuration (relative to the
@@ -100,6 +106,7 @@ def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: boo
 
     Args:
         overrides: of all scans, after those of a table.
+        rehearse, no_live: as of `load`.
 
     Raises:
         ConfigError: every scan that cannot be, with what is wrong. Nothing was started.
@@ -113,7 +120,7 @@ def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: boo
             continue
         for place, config_file, own in rows:
             try:
-                config = load(config_file, (*own, *overrides), rehearse=rehearse)
+                config = load(config_file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
             except ConfigError as error:
                 faults.append(f"{place}{error}")
             else:
@@ -287,8 +294,7 @@ def _seconds(worked: DryRun) -> float:
 def take_all(request: ScanRequest) -> None:
     """Run the scans of a queue, or compute their needs, and print the outcome of each."""
     with json_events(request.as_json) as json_sink:
-        settings = request.settings
-        queue = load_queue(request.files, settings, rehearse=request.rehearse)
+        queue = load_queue(request.files, request.overrides, rehearse=request.rehearse, no_live=request.unless_live)
         needs = queue_needs(queue, request.output)
         if request.dry:
             if not request.as_json:

@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Event, Sink, TrialDone, TrialReached
+from beamline.core.events import Done, Event, Sink, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
 from beamline.core.process import ProcessEnd, json_object, run_to_end
+from beamline.core.recon_events import TrialDone
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable

@@ -11,7 +11,7 @@ from itertools import chain
 from typing import Literal
 
 from beamline.core.errors import DataError
-from beamline.core.events import StudyStarted, TradeoffStarted
+from beamline.core.recon_events import StudyStarted, TradeoffStarted
 from beamline.core.sinks import Warn
 from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
 from beamline.features.trials.trial import Outcome, Trial

@@ -20,8 +20,8 @@ _Sizes = NDArray[np.int64]
 _AT_REFRESH = ("image_key", "angles", "exposures")
 BY_FRAME = ("currents", "energies", "times", "shifts", "aside_mm")
 _OF_FRAMES = (*_AT_REFRESH, *BY_FRAME)
-_PRESENT = {"unreadable", "facts", "stated_shifts", "stated_ending", "pass_ends", "decisions", *_OF_FRAMES}
-_COPIED = {*ScanSource.__annotations__} - _PRESENT
+_AT_PRESENT = {"unreadable", "facts", "stated_shifts", "stated_ending", "pass_ends", "decisions", *_OF_FRAMES}
+_COPIED = {*ScanSource.__annotations__} - _AT_PRESENT
 
 
 class Frames(ScanSource):

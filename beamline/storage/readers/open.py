@@ -21,7 +21,7 @@ from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSou
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
-from beamline.storage.readers.nxtomo import NXtomoSource
+from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.replacements import (
     Angles,
     Images,
@@ -254,7 +254,7 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
             named = datasets.dataset(file, data)
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
-            return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
+            return open_nxtomo(path, own_angles=options.angles is None and options.angles_path is None, data=data)
     of_views = options.angles_path if options.angle_rows is None else None
     return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
 

@@ -26,7 +26,7 @@ from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
-from beamline.storage.readers.nxtomo import NXtomoSource
+from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
 from beamline.storage.readers.transforms import type_wrapped, unsigned
@@ -234,7 +234,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     for places in find(file):
         keys = np.ravel(datasets.values_of(places.image_key))
         if (keys == kind).any():
-            return _of_scan(NXtomoSource(path, own_angles=False, data=str(places.data.name)), kind)
+            return _of_scan(open_nxtomo(path, own_angles=False, data=str(places.data.name)), kind)
     exchange = datasets.dataset(file, _EXCHANGE[kind])
     if exchange is not None and datasets.dataset(file, "exchange/data") is not None:
         return _of_scan(open_exchange(path, own_angles=False), kind)

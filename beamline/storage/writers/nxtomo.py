@@ -200,13 +200,13 @@ class NXtomoWriter:
 
         DataError for a disk that does not take it, as of `append`.
         """
-        self._add(layout.PASS_ENDS, self._rows)
+        self._append_last(layout.PASS_ENDS, self._rows, "the end of a pass")
 
     def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass, likewise."""
-        self._add(layout.DECISIONS, json.dumps(values, default=str).encode())
+        self._append_last(layout.DECISIONS, json.dumps(values, default=str).encode(), "a decision")
 
-    def _add(self, path: str, value: int | bytes) -> None:
+    def _append_last(self, path: str, value: int | bytes, what: str) -> None:
         if self._broken or path not in self._last:
             return
         try:
@@ -216,7 +216,7 @@ class NXtomoWriter:
             self.flush()
         except FAILURES as error:
             self._broken = True
-            raise self._disk_error("take the end of a pass", error) from error
+            raise self._disk_error(f"take {what}", error) from error
 
     def close(
         self,

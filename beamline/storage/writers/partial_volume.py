@@ -24,7 +24,7 @@ from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
 from beamline.storage.writers.recon_file import value_of, write_record
-from recon.base.volume import Slab
+from recon.base.slabs import Slab
 
 _SLABS = "entry/reconstruction/slabs"
 _PLACES = {

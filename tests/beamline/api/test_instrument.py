@@ -171,6 +171,16 @@ def test_events_and_sentences_are_those_of_the_command(
     assert out == "" and f"Scan complete: {FRAMES} frames" in err
 
 
+def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(connected: Connected) -> None:
+    said: list[str] = []
+    words = {"scan.decide": "do", "recon.live": True, "scan.mode": "step", "scan.pass_views": 5}
+    with connected(say=said.append, **words) as instrument:
+        assert instrument.scan(live=False).clean
+        instrument.scan(live=False, set={"scan.decide": "off"})
+    sentence = "scan.decide do needs a live reconstruction, and this scan has none: its plan is taken as it is."
+    assert said.count(sentence) == 1
+
+
 def test_importing_the_package_loads_nothing_heavy() -> None:
     heavy = {"torch", "numba", "matplotlib", "h5py", "pydantic", "click", "scipy"}
     code = f"import sys, beamline.api; print(sorted({heavy} & set(sys.modules)))"

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from beamline.cli.main import main, own_commands
 from beamline.cli.recipe import GROUPS, Grouped
 from beamline.cli.terminal import Terminal
-from beamline.core.events import FitReached
 from beamline.core.process import with_our_path
+from beamline.core.recon_events import FitReached
 
 CONTEXT = click.Context(main)
 COMMANDS = {name: command for name in own_commands() if (command := main.get_command(CONTEXT, name))}

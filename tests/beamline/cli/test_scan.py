@@ -68,6 +68,20 @@ def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
     assert instrument.log[-1] == "close"  # devices that the command opened are closed
 
 
+DECIDES = {"scan.decide": "ask", "scan.mode": "step", "scan.pass_views": 5}
+
+
+def test_without_a_live_reconstruction_it_says_that_nothing_is_decided(tmp_path: Path) -> None:
+    said = "scan.decide ask needs a live reconstruction, and this scan has none: its plan is taken as it is."
+    assert f"{SIMULATED}: {said}" in scan("--dry-run", **DECIDES).stderr
+    assert "scan.decide" not in scan("--dry-run", **DECIDES | {"scan.decide": "off"}).stderr
+    table = tmp_path / "day.csv"
+    table.write_text(f"config,scan.decide\n{SIMULATED},\n{SIMULATED},ask\n", encoding="utf-8")
+    words = [word for key in ("scan.mode", "scan.pass_views") for word in ("--set", f"{key}={DECIDES[key]}")]
+    queue = CliRunner().invoke(main, ["scan", str(table), "--no-live", "--dry-run", *words])
+    assert queue.exit_code == 0 and queue.stderr.count(said) == 1
+
+
 def test_a_rehearsal_says_what_the_scan_takes(tmp_path: Path) -> None:
     small = {"devices.camera.roi": "[1100,1900,32,64]", "scan.mode": "step", "scan.angles.views": 4}
     small |= {"scan.darks.count": 1, "scan.flats.count": 1}

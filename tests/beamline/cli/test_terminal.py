@@ -7,8 +7,11 @@ from typing import Any
 import pytest
 
 from beamline.cli.terminal import Terminal
-from beamline.core.events import FitReached, FrameStored, Warned, event_of
+from beamline.core.event_lines import event_of
+from beamline.core.events import FrameStored, Warned
+from beamline.core.recon_events import FitReached
 from beamline.core.sinks import UserLog, sentence
+from tests.beamline.pass_options import UNKNOWN, option
 
 FRAME: dict[str, Any] = {
     "n": 90,
@@ -104,12 +107,9 @@ SCAN = {
     "alarmed_frames": 0, "alarmed_views": 0, "retaken": 0, "reference_faults": [], "recon": None,
 }  # fmt: skip
 OPTIONS = [
-    {"choice": choice, "frames": frames, "seconds": seconds, "dose": dose, "bytes": size, "gain": gain,
-     "low": low, "high": high}
-    for choice, frames, seconds, dose, size, gain, low, high in (
-        ("next", 90, 95.2, 0.125, 1.21e9, 0.82, 0.61, 1.02), ("again", 90, 95.2, 0.125, 1.21e9, -0.31, -0.52, 0.1),
-        ("wide", 48, 12345.0, 0.067, 6.4e11, None, None, None), ("enough", 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0),
-    )
+    option("next", 0.82, (0.61, 1.02), 90, 95.2, 0.125, 1.21e9),
+    option("again", -0.31, (-0.52, 0.1), 90, 95.2, 0.125, 1.21e9),
+    option("wide", None, UNKNOWN, 48, 12345.0, 0.067, 6.4e11), option("enough"),
 ]  # fmt: skip
 CHOSEN = {"number": 3, "n_views": 270, "choice": "again", "reason": "it brings most a second.", "options": OPTIONS}
 EVENTS = [

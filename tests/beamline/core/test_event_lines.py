@@ -1,12 +1,15 @@
 """JSON lines of events keep their names and values: lines recorded from commands before events were classes."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from beamline.core.events import KINDS, LONGEST, event_in, event_of
+from beamline.core.event_lines import LONGEST, event_in, event_of
+from beamline.core.events import KINDS
 from beamline.page.followed_run import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
@@ -20,6 +23,12 @@ def test_a_line_that_was_recorded_is_written_as_it_was(line: str) -> None:
 def test_lines_of_nearly_every_kind_were_recorded() -> None:
     rare = {"check"}  # minutes of work
     assert KINDS.keys() - {json.loads(line)["event"] for line in LINES} <= rare
+
+
+def test_who_reads_lines_knows_all_kinds_without_importing_them() -> None:
+    code = "import sys; from beamline.core.event_lines import KINDS; sys.stdout.write(' '.join(KINDS))"
+    known = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {json.loads(line)["event"] for line in LINES} <= {*known}
 
 
 def test_a_line_of_no_kind_is_refused_with_its_values() -> None:

@@ -130,6 +130,18 @@ def test_a_wait_before_the_camera_was_armed_anew_is_no_finding(fake: Any, armed_
     assert len(fake.of("timing", frames)) == found
 
 
+def test_a_pass_that_is_taken_again_is_looked_at_and_views_repeated_alone_are_not(fake: Any) -> None:
+    """Triggers 2 and 3 have no frame at first; the pass is then flown again, where 5 comes late and 6 not at all."""
+    once = fake.views(8)
+    again = [replace(f, index=6 + i, time=f.time + 30) for i, f in enumerate(once)]
+    again[5] = replace(again[5], time=again[5].time + 0.3 * PERIOD)
+    del once[2:4], again[6]
+    late = [replace(again[i], time=60 + 2 * i, framestamp=i, replaces=-1) for i in (2, 3)]
+    late[1] = replace(late[1], trigger=6)
+    flags = fake.of("timing", once + again + late)
+    assert [(f.score, f.level) for f in flags] == [(2, Level.INFO), (pytest.approx(0.3), Level.WARN), (1, Level.INFO)]
+
+
 def test_triggers_whose_views_are_stored_are_not_missing(fake: Any) -> None:
     frames = fake.views(8)
     del frames[3:5]

@@ -21,6 +21,7 @@ from beamline.core.events import (
 from beamline.core.flag import Flag, Level
 from beamline.page.followed_run import RunValues, Severity, Stamp, StampedValues, choice_of
 from beamline.plan.passes import Choice
+from tests.beamline.pass_options import UNKNOWN, option
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
 FRAME = FrameStored(5, 20, "projection", 2.5, 40.0, 6.0, 812.0)
@@ -66,10 +67,7 @@ def test_flags_are_counted_by_check_until_another_run_begins() -> None:
     assert _after(STARTED, *flags, STARTED).flag_names == ()
 
 
-NEXT, ENOUGH = (
-    {"choice": "next", "frames": 90, "seconds": 95.5, "dose": 0.125, "bytes": 2e9, "gain": 0.8, "low": 0.6, "high": 1},
-    {"choice": "enough", "frames": 0, "seconds": 0, "dose": 0, "bytes": 0, "gain": None, "low": None, "high": None},
-)
+NEXT, ENOUGH = option("next", 0.8, (0.6, 1.0), 90, 95.5, 0.125, 2e9), option("enough", None, UNKNOWN)
 ASKED = PassEnded(3, 270, [NEXT, ENOUGH], "next", 30.0)
 CHOSEN = NextChosen(3, 270, "enough", "operator", "as asked", [NEXT, ENOUGH], 0.8, 0.7)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, rest_gain
+from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.plan.timeline import block_seconds
@@ -31,20 +31,20 @@ def seconds_of(block: Block) -> float:
 
 
 def after(timeline: Timeline, n: int, retakes: int = 0) -> Passes:
-    each, wide = pass_blocks(timeline.views, 0), tuple(block for block in timeline.blocks if block.aside)
-    return Passes(each[:n], each[n:], wide, retakes)
+    blocks, wide = pass_blocks(timeline.views, 0), tuple(block for block in timeline.blocks if block.aside)
+    return Passes(blocks[:n], blocks[n:], wide, retakes)
 
 
 def test_options_are_what_is_possible_with_what_each_takes() -> None:
     timeline = scan(wide=5)
-    offered = {one.choice: one for one in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
+    offered = {option.choice: option for option in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
     assert list(offered) == [Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.RETAKE, Choice.ENOUGH]
-    assert [one.frames for one in offered.values()] == [12, 12, 10, 3, 0]
+    assert [option.frames for option in offered.values()] == [12, 12, 10, 3, 0]
     assert offered[Choice.NEXT].dose == pytest.approx(12 / 58) and offered[Choice.WIDE].dose == pytest.approx(10 / 58)
     assert offered[Choice.NEXT].bytes == pytest.approx(12 * timeline.total_bytes / timeline.n_frames, abs=1)
     assert offered[Choice.NEXT].seconds == seconds_of(pass_blocks(timeline.views, 0)[1])
     assert offered[Choice.RETAKE].seconds == pytest.approx(3 / 12 * timeline.retake_seconds)
-    gains = {choice: (one.gain, one.low, one.high) for choice, one in offered.items()}
+    gains = {choice: (option.gain, option.low, option.high) for choice, option in offered.items()}
     assert gains == {
         Choice.NEXT: tuple(vars(LAW.gain(views=12)).values()), Choice.AGAIN: tuple(vars(LAW.gain(again=12)).values()),
         Choice.WIDE: tuple(vars(LAW.gain(wide=True)).values()), Choice.RETAKE: tuple(vars(LAW.gain(views=3)).values()),
@@ -55,14 +55,15 @@ def test_options_are_what_is_possible_with_what_each_takes() -> None:
 def test_what_is_not_possible_is_no_option_and_without_a_law_no_gain_is_known() -> None:
     timeline = scan()
     last = options(after(timeline, 4), LAW, timeline, seconds_of)
-    assert [one.choice for one in last] == [Choice.ENOUGH]
+    assert [option.choice for option in last] == [Choice.ENOUGH]
     unknown = options(after(timeline, 1), None, timeline, seconds_of)
-    assert [one.choice for one in unknown] == [Choice.NEXT, Choice.AGAIN, Choice.ENOUGH]
-    assert [math.isnan(one.gain) for one in unknown] == [True, True, False]
+    assert [option.choice for option in unknown] == [Choice.NEXT, Choice.AGAIN, Choice.ENOUGH]
+    assert [math.isnan(option.gain) for option in unknown] == [True, True, False]
     instrument = FakeInstrument()
     steps = instrument.timeline(10, Mode.STEP)
-    each = pass_blocks(steps.views, 4)  # the last one has two views, so four take too much
-    assert Choice.AGAIN not in {one.choice for one in options(Passes(each[:1], each[1:]), LAW, steps, seconds_of)}
+    blocks = pass_blocks(steps.views, 4)  # the last one has two views, so four take too much
+    offered = options(Passes(blocks[:1], blocks[1:]), LAW, steps, seconds_of)
+    assert Choice.AGAIN not in {option.choice for option in offered}
 
 
 def option(choice: Choice, gain: float, seconds: float = 10.0, off: float = 0.0, dose: float = 0.1) -> PassOption:
@@ -105,10 +106,10 @@ def test_the_choice_and_its_reason(
 
 def test_the_rest_is_all_that_the_plan_still_has() -> None:
     timeline = scan(wide=5)
-    assert rest_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
+    assert remaining_gain(after(timeline, 1, retakes=3), LAW) == LAW.gain(views=39, wide=True)
     later = after(timeline, 1, retakes=3).after(Choice.NEXT)
-    assert rest_gain(later, LAW) == replace(LAW, n_views=24).gain(views=27, wide=True)
-    assert rest_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
+    assert remaining_gain(later, LAW) == replace(LAW, n_views=24).gain(views=27, wide=True)
+    assert remaining_gain(after(scan(), 4), LAW) == Gain(0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -147,17 +148,17 @@ def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
     passes, choices = after(TIMELINE, 1, retakes=3), list[Choice]()
     seconds, dose = seconds_of(passes.done[0]), 12 * frame_dose(TIMELINE)
     while passes.to_come or passes.wide or passes.retakes:
-        so_far = replace(law, n_views=passes.n_views)
+        so_far = replace(law, n_views=passes.n_frames)
         offered = options(passes, so_far, TIMELINE, seconds_of)
-        choice, _ = choose(offered, wish, rest_gain(passes, so_far), seconds, dose)
+        choice, _ = choose(offered, wish, remaining_gain(passes, so_far), seconds, dose)
         choices.append(choice)
         if choice is Choice.ENOUGH:
             break
-        one = next(one for one in offered if one.choice is choice)
-        assert one.gain > 0  # nothing that brings nothing is taken before ENOUGH
-        seconds, dose = seconds + one.seconds, dose + one.dose
+        option = next(option for option in offered if option.choice is choice)
+        assert option.gain > 0  # nothing that brings nothing is taken before ENOUGH
+        seconds, dose = seconds + option.seconds, dose + option.dose
         passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
-    return choices, passes.n_views, seconds, dose
+    return choices, passes.n_frames, seconds, dose
 
 
 @given(LAWS, WISHES)

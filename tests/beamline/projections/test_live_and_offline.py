@@ -20,7 +20,8 @@ from beamline.core.events import Event, Warned
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
-from beamline.projections.replay import context_of, replay
+from beamline.projections.replay import replay
+from beamline.projections.replayed_frames import context_of
 from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.recorder import Recorder
 from beamline.storage.flag_legend import FrameFlags

@@ -17,7 +17,8 @@ from beamline.monitor.check import Flag, Level, Look
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.monitor.frames import SaturationCheck
-from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay, verdict
+from beamline.projections.replay import by_kind, counts_of, judged_flags, replay, verdict
+from beamline.projections.replayed_frames import context_of
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -103,12 +104,6 @@ def test_line_integrals_are_judged_as_counts_of_a_beam_and_nothing_is_said_of_li
     advice = [flag.advice for flag in flags if flag.check == "beam"]
     assert any("+0.1 off" in text for text in advice)
     assert not any("light" in text or "flats" in text for text in advice)
-
-
-@pytest.mark.parametrize(("level", "expected"), [(4095, 4095.0), (4000, 65535.0), (65535, 65535.0)])
-def test_the_end_of_the_range_is_where_pixels_pile_up(level: int, expected: float) -> None:
-    data = np.full((4, *SCAN.shape), level, np.uint16)
-    assert context_of(ArraySource(data, [1, 1, 0, 0], np.zeros(4))).saturation == expected  # type: ignore[arg-type]
 
 
 def _grow(path: Path, frames: list[Frame], close: bool) -> Iterator[int]:

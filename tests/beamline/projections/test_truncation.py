@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from beamline.projections.consistency import cut_sentence
 from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.scan_warnings import cut_sentence
 from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.core.events import Event, LawMeasured
+from beamline.core.events import Event
+from beamline.core.recon_events import LawMeasured
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -59,9 +60,9 @@ class Laws:
 
 @pytest.fixture
 def laws(monkeypatch: pytest.MonkeyPatch) -> Laws:
-    made = Laws()
-    monkeypatch.setattr("beamline.reconstruct.followed_views.measured_law", made)
-    return made
+    stand_in = Laws()
+    monkeypatch.setattr("beamline.reconstruct.followed_views.measured_law", stand_in)
+    return stand_in
 
 
 @dataclass
@@ -83,7 +84,7 @@ class Followed:
 
 @pytest.fixture
 def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
-    made: list[Followed] = []
+    begun: list[Followed] = []
 
     def begin(
         frames: Sequence[Frame] = FRAMES,
@@ -97,13 +98,13 @@ def follow(tmp_path: Path) -> Iterator[Callable[..., Followed]]:
         wanted = options(tmp_path, **(changes or {}))
         source = wanted.source.open(follow=True)
         follower = ScanFollower(wanted, source, events.append, clock, Warnings(events.append, clock))
-        made.append(Followed(clock, follower, events))
-        return made[-1]
+        begun.append(Followed(clock, follower, events))
+        return begun[-1]
 
     yield begin
-    for each in made:
-        each.follower.source.close()
-        close(each.clock)
+    for scan in begun:
+        scan.follower.source.close()
+        close(scan.clock)
 
 
 def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[..., Followed], tmp_path: Path) -> None:
@@ -114,8 +115,8 @@ def test_one_law_a_pass_of_all_views_until_its_end(laws: Laws, follow: Callable[
         scan.seconds(n)
         scan.seconds(0)
     assert laws.sizes == [[10], [10, 20], [10, 20, 30]]
-    told = scan.of("error_law")
-    assert [(law["n_views"], law["exponent"], law["noise"], law.get("gained")) for law in told] == [
+    events = scan.of("error_law")
+    assert [(law["n_views"], law["exponent"], law["noise"], law.get("gained")) for law in events] == [
         (n, 1.5, 0.25, gained) for n, gained in ((10, 0.5), (20, 1.0), (30, 1.5))
     ]
     assert isinstance(scan.events[-1], LawMeasured)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from beamline.cli.terminal import results
-from beamline.core.events import Event, VolumeDone
+from beamline.core.events import Event
+from beamline.core.recon_events import VolumeDone
 from beamline.core.stop import StopOnSignal
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions

@@ -6,7 +6,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from beamline.reconstruct.snapshots import live_picture, volume_rows
+from beamline.report.live_picture import live_picture, volume_rows
 from recon.base.volume import Grid, Volume
 
 pytestmark = pytest.mark.usefixtures("real_pictures")

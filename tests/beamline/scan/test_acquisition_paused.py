@@ -21,7 +21,7 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame
 from drivers.in_beam import ManualShutter
 from tests.beamline.acquired import Run, assert_safe
-from tests.beamline.chosen import Asked, Chooser
+from tests.beamline.chosen import Chooser, Scripted
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults, assert_true
 
 FIRST = 5  # triggers before the views: 3 darks and 2 flats
@@ -169,11 +169,11 @@ def test_frames_without_beam_are_taken_again_within_their_pass(number: int) -> N
 
     paused.instrument.on_frame = lost
     script = [Choice.AGAIN, Choice.NEXT]
-    run = paused.run(12, passes=4, speed=20, choose=Asked(script))
+    run = paused.run(12, passes=4, speed=20, choose=Scripted(script))
     assert run.error is None and run.scan.missing == []
     assert {frame.replaces for frame in run.frames} - {-1} == {number - 1, number}
     kept = [frame for frame in run.frames if frame.index not in (number - 1, number)]
-    expected = Paused().run(12, passes=4, speed=20, choose=Asked(script)).frames
+    expected = Paused().run(12, passes=4, speed=20, choose=Scripted(script)).frames
     assert_same([replace(frame, index=i, replaces=-1) for i, frame in enumerate(kept)], expected)
 
 
@@ -207,7 +207,7 @@ def test_a_pause_asked_for_before_the_first_frame_is_kept() -> None:
 
 
 class Moment(PauseRequest):
-    """Asked for when it is looked at for the `nth` time, and taken back before the next look."""
+    """Scripted for when it is looked at for the `nth` time, and taken back before the next look."""
 
     def __init__(self, nth: int) -> None:
         super().__init__()

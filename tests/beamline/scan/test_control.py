@@ -2,12 +2,12 @@
 
 import os
 import stat
+import threading
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
-from beamline.cli.control import CHOICES
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, NextChosen
@@ -88,7 +88,6 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert tuple(Choice) == CHOICES
     run = tmp_path / "runs" / "a"
     run.mkdir(parents=True)
     (run / "config.resolved.yaml").touch()
@@ -98,9 +97,13 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
-        taken = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
-        with (run / "events.jsonl").open("a") as log:
-            log.write(f"{taken.to_json()}\n")
+        event = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
+
+        def write() -> None:
+            with (run / "events.jsonl").open("a") as log:
+                log.write(f"{event.to_json()}\n")
+
+        threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
         file.put(RunRecord(State.TAXI))
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
@@ -108,8 +111,10 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
         assert list((run / "control").iterdir()) == [] and not chosen
         file.put(RunRecord(State.ASKING))
-        told = CliRunner().invoke(main, ["decide", str(run), "again"])
-        assert (told.exit_code, told.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        taken = CliRunner().invoke(main, ["decide", str(run), "again"])
+        assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
+        file.put(RunRecord(State.ASKING))
+        assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
         file.put(RunRecord(State.ASKING))
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr

@@ -55,9 +55,9 @@ print(json.dumps({"event": "done", "output": sys.argv[2]}), flush=True)
 
 def live(*laws: tuple[float, float, float | None]) -> Callable[[Path, Path], Sequence[str]]:
     """A live reconstruction that measures these laws after the passes: exponent, its error, and dB gained."""
-    each = [{"exponent": exponent, "exponent_error": error, "gained": gained} for exponent, error, gained in laws]
+    values = [{"exponent": exponent, "exponent_error": error, "gained": gained} for exponent, error, gained in laws]
     ready = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
-    return lambda scan, output: [sys.executable, "-c", ready + LIVE, str(scan), str(output), json.dumps(each)]
+    return lambda scan, output: [sys.executable, "-c", ready + LIVE, str(scan), str(output), json.dumps(values)]
 
 
 def written(ran: Ran) -> tuple[list[int], list[dict[str, Any]]]:
@@ -71,12 +71,13 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     assert ran.error is None and ran.states[-1] == "done" and ran.result.clean
     ends, decisions = written(ran)
     assert ends == [8, 11, 14]  # after 3 darks and 2 flats
-    assert [(each["choice"], each["by"]) for each in decisions] == [("next", "program")] * 2 + [("enough", "program")]
+    chosen = [(decision["choice"], decision["by"]) for decision in decisions]
+    assert chosen == [("next", "program")] * 2 + [("enough", "program")]
     assert (decisions[1]["predicted"], decisions[1]["gained"]) == (decisions[0]["options"][0]["gain"], 2.5)
-    assert [each.data | {"time": 0} for each in ran.of("next_chosen")] == [
-        {name: value for name, value in each.items() if value is not None} | {"time": 0} for each in decisions
+    assert [event.data | {"time": 0} for event in ran.of("next_chosen")] == [
+        {name: value for name, value in decision.items() if value is not None} | {"time": 0} for decision in decisions
     ]
-    assert [each.data["number"] for each in ran.of("pass_ended")] == [1, 2, 3]
+    assert [event.data["number"] for event in ran.of("pass_ended")] == [1, 2, 3]
     ran.assert_good_file(16, "complete")  # with the flats of the end
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
@@ -89,7 +90,7 @@ def test_what_is_better_than_the_next_pass_is_measured_in_place_of_the_last_one(
     )  # fmt: skip
     assert ran.error is None
     ends, decisions = written(ran)
-    assert ends == [8, 11, 14, 17] and [each["choice"] for each in decisions] == ["again"] * 3
+    assert ends == [8, 11, 14, 17] and [decision["choice"] for decision in decisions] == ["again"] * 3
     assert ran.result.n_frames == 19
 
 
@@ -144,7 +145,7 @@ def test_the_operator_is_asked_with_a_closed_shutter_and_answers_from_another_te
     )  # fmt: skip
     assert ran.error is None
     assert seen == [("asking", False)] * 2
-    assert [each.data["by"] for each in ran.of("next_chosen")] == ["operator"] * 2
+    assert [event.data["by"] for event in ran.of("next_chosen")] == ["operator"] * 2
     ran.assert_good_file(13, "complete")
     ran.assert_safe()
 

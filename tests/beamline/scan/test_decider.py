@@ -3,11 +3,14 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
 
-from beamline.core.events import Event, LawMeasured
+from beamline.core.event_lines import event_of
+from beamline.core.events import Event
+from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
 from beamline.plan.choose import Wish
 from beamline.plan.passes import Choice, Passes, pass_blocks
@@ -17,12 +20,18 @@ from beamline.scan.decider import Decider
 from beamline.scan.supervision import PAUSE_POLL
 from tests.beamline.fakes import FakeInstrument
 
-EACH = 12  # views of each of four passes
+PASS_VIEWS = 12  # of each of four passes
 QUALITY = Wish(quality_db=1.0)
 
 
-def law(n: int, exponent: float = 1.0, error: float = 0.1, noise: float = 0.3, **more: Any) -> LawMeasured:
-    return LawMeasured(-(-n // EACH), n, exponent, error, noise, 0.0, **more)
+def law(
+    n: int, exponent: float | None = 1.0, error: float | None = 0.1, noise: float | None = 0.3, **more: Any
+) -> LawMeasured:
+    """The law of n views, as the line of another process gives it: None is a null there."""
+    numbers = {"exponent": exponent, "exponent_error": error, "noise": noise, "offset": 0.0}
+    event = event_of({"event": "error_law", "number": -(-n // PASS_VIEWS), "n_views": n, **numbers, **more})
+    assert isinstance(event, LawMeasured)
+    return event
 
 
 class Scan:
@@ -30,10 +39,10 @@ class Scan:
 
     def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, **more: Any) -> None:
         instrument = FakeInstrument()
-        plan = replace(instrument.plan(4 * EACH, passes=4), retake_share=0.25)
+        plan = replace(instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25)
         self.timeline = instrument.worked_out(plan)
         self.moments: list[Callable[[], object]] = []
-        self.waited, self.reason = 0, ""
+        self.waited, self.why_no_law = 0, ""
         self.events: list[Event] = []
         self.recorded: list[Any] = []
         self.log: list[str] = []
@@ -47,7 +56,7 @@ class Scan:
         self.decide = Decider(
             asks=asks, wish=wish, wait=wait, timeline=self.timeline, seconds_of=seconds_of, now=lambda: self.now,
             states=self.states, stop=self.stop, sink=self.events.append, began=90.0, **more,
-            unable=lambda: self.reason, wait_a_moment=self.moment, record=self.recorded.append,
+            why_no_law=lambda: self.why_no_law, wait_a_moment=self.moment, record=self.recorded.append,
             close_shutter=lambda: self.log.append("close shutter"),
         )  # fmt: skip
 
@@ -57,10 +66,10 @@ class Scan:
 
     def after(self, n: int, *measured: LawMeasured, retakes: int = 0, again: int = 0) -> Choice:
         """What follows n passes and some that were taken again; the laws come one by one while it waits."""
-        self.moments += [lambda each=each: self.decide.add_law(each) for each in measured]  # type: ignore[misc]
+        self.moments += [partial(self.decide.add_law, each) for each in measured]
         self.waited, self.decide.number = 0, n - 1
-        each = pass_blocks(self.timeline.views, 0)
-        done, to_come = each[: n - again], each[n - again : len(each) - again]
+        blocks = pass_blocks(self.timeline.views, 0)
+        done, to_come = blocks[: n - again], blocks[n - again : len(blocks) - again]
         return self.decide(Passes(done + done[-1:] * again, to_come, (), retakes))
 
     def of(self, name: str) -> list[dict[str, Any]]:
@@ -77,7 +86,7 @@ def test_it_waits_for_the_law_of_these_views_and_says_what_it_chose() -> None:
     (ended,), chosen = scan.of("pass_ended"), scan.chosen
     assert ended["number"] == chosen["number"] == 1 and ended["n_views"] == chosen["n_views"] == 12
     assert ended["recommended"] == chosen["choice"] == "next" and chosen["by"] == "program"
-    assert [one["choice"] for one in ended["options"]] == ["next", "again", "enough"]
+    assert [option["choice"] for option in ended["options"]] == ["next", "again", "enough"]
     assert ended["options"] == chosen["options"] and ended["wait"] == 0 and "remark" not in ended
     assert "dB" in chosen["reason"] and "predicted" not in chosen and scan.waited == 1
     assert json.loads(json.dumps(scan.recorded)) == [chosen | {"predicted": None, "gained": None}]
@@ -118,8 +127,8 @@ def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
 
 def test_the_seconds_of_a_wish_are_those_since_the_first_frame_and_what_follows() -> None:
     takes = Scan().decide.seconds_of(pass_blocks(Scan().timeline.views, 0)[1])
-    for beside, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
-        scan = Scan(Wish(seconds=10.5 + takes), seconds=beside)
+    for added, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
+        scan = Scan(Wish(seconds=10.5 + takes), added_seconds=added)
         assert scan.after(1, law(12)) is choice
 
 
@@ -139,7 +148,7 @@ def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
     assert scan.after(1) is Choice.NEXT and scan.waited == round(0.5 / PAUSE_POLL)
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("plan", "no prediction within 0.5 s")
     assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: no prediction within 0.5 s."
-    assert {one["gain"] for one in scan.chosen["options"]} == {None, 0.0}
+    assert {option["gain"] for option in scan.chosen["options"]} == {None, 0.0}
     assert scan.after(3, law(12), law(33, exponent=0.2)) is Choice.ENOUGH  # the first is of an earlier pass, and late
     assert scan.waited == 2
 
@@ -156,20 +165,20 @@ def test_a_dead_live_process_means_the_plan_and_is_said_once(asks: bool) -> None
     scan = Scan(asks=asks, wait=0.5)
 
     def die() -> None:
-        scan.reason = "the live reconstruction has ended"
+        scan.why_no_law = "the live reconstruction has ended"
 
     scan.moments = [die]
     assert scan.after(1) is Choice.NEXT and scan.waited == 1
     assert [scan.after(n) for n in (2, 3)] == [Choice.NEXT] * 2
     assert scan.waited == 0 and scan.states.state is State.ACQUIRING
-    assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.reason)]
-    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.reason}."]
+    assert [(each["by"], each["reason"]) for each in scan.of("next_chosen")] == [("plan", scan.why_no_law)]
+    assert [each["remark"] for each in scan.of("pass_ended")] == [f"Gains are not known: {scan.why_no_law}."]
 
 
 def test_a_law_of_before_does_not_serve_when_the_process_is_dead() -> None:
     scan = Scan(Wish(1.0))
     scan.after(1, law(12, exponent=2.0, noise=0.0))
-    scan.reason = "the live reconstruction has ended"
+    scan.why_no_law = "the live reconstruction has ended"
     assert scan.after(2) is Choice.NEXT and scan.chosen["by"] == "plan"
 
 
@@ -236,7 +245,7 @@ def test_the_shutter_stays_open_where_the_law_is_there() -> None:
 @pytest.mark.parametrize("asks", [False, True])
 def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
     scan = Scan(asks=asks, wait=0.5)
-    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")  # type: ignore[arg-type]
+    none = law(12, exponent=None, error=None, noise=None, reason="30 views are few")
     assert scan.after(1, none) is Choice.NEXT
     assert scan.waited == 1 or asks
     assert scan.of("pass_ended")[0]["remark"] == "Gains are not known: 30 views are few."
@@ -250,5 +259,5 @@ def test_a_reason_in_place_of_a_law_ends_the_wait(asks: bool) -> None:
 
 def test_a_law_without_its_numbers_is_none() -> None:
     scan = Scan(wait=0.2)
-    assert scan.after(1, law(12, exponent=None)) is Choice.NEXT  # type: ignore[arg-type]
+    assert scan.after(1, law(12, exponent=None)) is Choice.NEXT
     assert scan.chosen["by"] == "plan"

@@ -30,7 +30,7 @@ from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
-from tests.beamline.chosen import Asked, Chooser, choosing
+from tests.beamline.chosen import Chooser, Scripted, choosing
 from tests.beamline.fakes import FakeInstrument, assert_true, decode
 from tests.beamline.ran import small
 
@@ -155,13 +155,13 @@ def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.Monkey
     """Two of its four passes are taken twice; the kills come in the first, in its second time, and in the last."""
     script = [Choice.AGAIN, Choice.NEXT, Choice.AGAIN]
     moments = [FIRST + share * PASS for share in (0.5, 1.5, 3.7)]
-    for run in _killed(tmp_path, moments, True, Asked(script)):
+    for run in _killed(tmp_path, moments, True, Scripted(script)):
         recover_run(run)
         with h5py.File(run / "scan.h5") as file:
             n = len(decisions_in(file))
             if pass_ends_in(file).size > n:  # just between the two, where the plan goes on
                 continue
-        with choosing(monkeypatch, Asked(script[n:]), PASS), open_for_resume(run) as series:
+        with choosing(monkeypatch, Scripted(script[n:]), PASS), open_for_resume(run) as series:
             instrument = FakeInstrument()
             instrument.clock.sleep(1e4)
             run_scan(series.config, series, instrument=instrument.connected())

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ScanStopped
-from beamline.core.events import Event, LawMeasured
+from beamline.core.events import Event
 from beamline.core.process import ChildProcess
+from beamline.core.recon_events import LawMeasured
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import live_process
@@ -221,7 +222,7 @@ def test_after_a_stopped_scan_the_volume_comes_soon(tmp_path: Path, monkeypatch:
     instrument = FakeInstrument(at={10: stop.stop})
     ran = Ran(tmp_path, instrument, stop=stop, live=script(DELIVERS))
     assert type(ran.error) is ScanStopped
-    assert [event.data["output"] for event in ran.of("recon_done")] == [str(ran.folder / "recon.h5")]  # type: ignore[operator]
+    assert [event.data["output"] for event in ran.of("recon_done")] == [str(ran.folder / "recon.h5")]
 
 
 def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> None:
@@ -267,14 +268,14 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=T
 
 
 def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path) -> None:
-    said = """
+    program = """
 import json
 law = {"event": "error_law", "number": 1, "n_views": 90, "noise": 0.2, "offset": 0.0}
 print(json.dumps({**law, "exponent": 1.1, "exponent_error": 0.1, "gained": None}))
 print(json.dumps({"event": "error_law", "n_views": 90}))
 """
     laws: list[LawMeasured] = []
-    command = script(said)(tmp_path / "scan.h5", tmp_path / "recon.h5")
+    command = script(program)(tmp_path / "scan.h5", tmp_path / "recon.h5")
     process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, laws.append)
     process.finish(stop=lambda: False, hurry=lambda: False)
     (law,) = laws
@@ -282,14 +283,14 @@ print(json.dumps({"event": "error_law", "n_views": 90}))
 
 
 @pytest.mark.parametrize(("code", "ended"), [("raise SystemExit(1)", True), ("import time; time.sleep(100)", False)])
-def test_one_that_gives_no_law_any_more_is_known(tmp_path: Path, code: str, ended: bool) -> None:
+def test_a_live_reconstruction_that_gives_no_law_any_more_is_known(tmp_path: Path, code: str, ended: bool) -> None:
     command = script(code)(tmp_path / "scan.h5", tmp_path / "recon.h5")
-    said: list[Event] = []
-    process = LiveReconstruction(command, tmp_path / "recon.log", said.append)
-    wait_until(lambda: len(said) == 1 + ended)
+    events: list[Event] = []
+    process = LiveReconstruction(command, tmp_path / "recon.log", events.append)
+    wait_until(lambda: len(events) == 1 + ended)
     assert process.ended is ended
     process.close()
-    absent = LiveReconstruction([str(tmp_path / "no program")], tmp_path / "other.log", said.append)
+    absent = LiveReconstruction([str(tmp_path / "no program")], tmp_path / "other.log", events.append)
     assert absent.ended
 
 

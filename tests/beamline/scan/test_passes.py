@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,11 +13,11 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from beamline.cli.main import main
-from beamline.core.errors import ScanStopped
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
-from beamline.plan.passes import Choice
+from beamline.plan.passes import Choice, Passes
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, recover_run
@@ -27,7 +28,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.chosen import Asked, choosing
+from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true, decode
 from tests.beamline.ran import Ran, killed
 
@@ -74,19 +75,19 @@ def frames_of(path: Path) -> list[Frame]:
 @given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH])))
 def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> None:
     words, pass_views, sizes = MODES[mode]
-    asked = Asked(script)
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+    chooser = Scripted(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, chooser, pass_views):
         ran = Ran(Path(folder), FakeInstrument(), *WORDS, *words)
         ran.assert_safe()
-        sets = expected(sizes, asked.answers)
+        sets = expected(sizes, chooser.answers)
         frames = frames_of(ran.folder / "scan.h5")
         views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
-        assert [frame.trigger for frame in views] == [trigger for one in sets for trigger in one]
+        assert [frame.trigger for frame in views] == [trigger for triggers in sets for trigger in triggers]
         assert all((frame.trigger >= VIEWS) is (frame.kind is FrameKind.WIDE_VIEW) for frame in views)
         assert len(views) <= VIEWS + WIDE and all(frame.replaces < 0 for frame in frames)
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         assert [decode(frame.counts)[3] for frame in frames] == list(range(len(frames)))
-        enough = Choice.ENOUGH in asked.answers
+        enough = Choice.ENOUGH in chooser.answers
         assert len(frames) == FIRST + len(views) + 2  # flats of the end
         assert ran.error is None
         assert (ran.result.missing, ran.result.n_frames, ran.result.retaken) == ((), len(frames), 0)
@@ -95,15 +96,15 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
             assert len(views) < VIEWS + WIDE or last["n"] == last["of"] == len(frames)
         assert sum(event.data["n"] for event in ran.of("block_started")) == len(frames)
         with h5py.File(ran.folder / "scan.h5") as file:
-            asked_for = sets if len(asked.answers) >= len(sets) else sets[: len(asked.answers) + 1]
-            rows = [FIRST + sum(map(len, sets[: i + 1])) for i in range(len(asked_for))]
+            ended = sets if len(chooser.answers) >= len(sets) else sets[: len(chooser.answers) + 1]
+            rows = [FIRST + sum(map(len, sets[: i + 1])) for i in range(len(ended))]
             assert pass_ends_in(file).tolist() == rows[: len(pass_ends_in(file))]
             decisions = decisions_in(file)
-            assert [values["choice"] for values in decisions] == asked.answers
+            assert [values["choice"] for values in decisions] == chooser.answers
             assert len(pass_ends_in(file)) in (len(decisions), len(decisions) + 1)
             assert file[layout.STATUS][()].decode() == "complete"
         assert next_step(ran.folder / "scan.h5") == ""  # it has what it was to take
-        so_far = [passes.n_views for passes in asked.asked]
+        so_far = [passes.n_frames for passes in chooser.asked]
         assert so_far == [values["n_views"] for values in decisions]
 
 
@@ -122,12 +123,12 @@ def test_views_are_taken_again_between_passes_within_the_budget(
     words, pass_views, sizes = MODES[mode]
     n = sizes[0]
     lost, flagged = FIRST + 1, {FIRST + 2, FIRST + n + 3 + 1}
-    asked = Asked([Choice.RETAKE, Choice.RETAKE, Choice.NEXT])
+    chooser = Scripted([Choice.RETAKE, Choice.RETAKE, Choice.NEXT])
     retake = ("monitor.retake=true", "monitor.retake_share=0.25")
-    with choosing(monkeypatch, asked, pass_views):
+    with choosing(monkeypatch, chooser, pass_views):
         ran = Ran(tmp_path, FakeInstrument(Faults(lost={lost}, repeats=flagged)), *WORDS, *retake, *words)
-    assert asked.answers[:2] == [Choice.RETAKE, Choice.NEXT]  # each view is taken again once
-    assert [passes.retakes for passes in asked.asked][:2] == [2, 0]
+    assert chooser.answers[:2] == [Choice.RETAKE, Choice.NEXT]  # each view is taken again once
+    assert [passes.retakes for passes in chooser.asked][:2] == [2, 0]
     frames = frames_of(ran.result.path)
     again = [frame for frame in frames if frame.trigger >= VIEWS and frame.kind is FrameKind.PROJECTION]
     assert (ran.result.missing, ran.result.retaken, len(again)) == ((), 3, 2)
@@ -143,11 +144,21 @@ def test_a_view_without_a_frame_has_one_when_its_pass_is_taken_again(
 ) -> None:
     words, _, sizes = MODES["fly"]
     faults = Faults(lost={FIRST + 1, FIRST + sizes[0] + 2})  # another one when it is taken again
-    with choosing(monkeypatch, Asked([Choice.AGAIN])):
+    with choosing(monkeypatch, Scripted([Choice.AGAIN])):
         ran = Ran(tmp_path, FakeInstrument(faults), *WORDS, *words)
     assert (ran.result.missing, ran.result.retaken) == ((), 1)
     triggers = [frame.trigger for frame in frames_of(ran.result.path) if frame.kind is FrameKind.PROJECTION]
     assert triggers == [0, 2, 0, 1, *range(3, 9)]
+
+
+def test_the_camera_counts_anew_in_each_pass_also_where_its_first_frame_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 6}")
+    with choosing(monkeypatch, Scripted([])):
+        ran = Ran(tmp_path, FakeInstrument(Faults(lost={FIRST + 2})), *WORDS[2:], *words)
+    errors = [one.message for one in validate(ran.folder / "scan.h5") if one.severity == "error"]
+    assert errors == []  # views 1 and 3, of two passes, both are the second frame of their camera's count
 
 
 def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again(
@@ -169,6 +180,16 @@ def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again
     ran.assert_safe()
 
 
+def test_a_stop_in_the_wide_views_of_one_place_does_not_move_the_sample_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted([Choice.WIDE])):
+        ran = Ran(tmp_path, FakeInstrument(at={FIRST + 3: stop.stop}), *WORDS, *MODES["fly"][0], stop=stop)
+    wide = [frame.trigger for frame in frames_of(ran.folder / "scan.h5") if frame.kind is FrameKind.WIDE_VIEW]
+    assert wide == [VIEWS]
+
+
 CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
 
 
@@ -177,8 +198,8 @@ CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choi
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
-    asked = Asked(script)
-    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, asked, pass_views):
+    chooser = Scripted(script)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch, choosing(patch, chooser, pass_views):
         for part, cut in enumerate([*cuts, None]):
             stop, instrument = StopRequest(), FakeInstrument()
             instrument.clock.sleep(1e4 * part)
@@ -192,21 +213,83 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         recover_run(ran.folder)
         with pytest.raises(NothingMissing), open_for_resume(ran.folder):
             ...
-        sets = expected(sizes, asked.answers)
+        sets = expected(sizes, chooser.answers)
         path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
         frames = frames_of(path)
         rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
-        assert [frame.trigger for frame in rows] == [trigger for one in sets for trigger in one]
+        assert [frame.trigger for frame in rows] == [trigger for triggers in sets for trigger in triggers]
         assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
         with h5py.File(path) as file:
             ends, decisions = pass_ends_in(file), decisions_in(file)
             assert ending_in(file).missing == ()
         assert next_step(path) == ""
-        assert [values["choice"] for values in decisions] == asked.answers
+        assert [values["choice"] for values in decisions] == chooser.answers
         so_far = [sum(frame.index < end for frame in rows) for end in ends]
         assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]
         assert len(ends) in (len(decisions), len(decisions) + 1)
-        assert [one for one in validate(path, lambda done, of: None) if one.severity == "error"] == []
+        assert [finding for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
+
+
+@pytest.mark.parametrize(
+    ("script", "cut", "missing", "words"),
+    [
+        ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in the last flats
+        ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
+        ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
+    ],
+)
+def test_views_that_the_scan_decided_against_are_not_missing(
+    script: list[Choice], cut: int, missing: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither of the file whose writer died, nor of the one that joins the parts."""
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted(script)), killed(monkeypatch):
+        ran = Ran(tmp_path, FakeInstrument(at={cut: stop.abort}), *WORDS[1:], *MODES["fly"][0], stop=stop)
+    (recovered,), _ = recover_run(ran.folder)
+    assert recovered.missing == missing
+    (unfinished,) = [one.message for one in validate(ran.folder / "scan.h5") if one.rule == "unfinished"]
+    assert words in unfinished and ("--resume" in unfinished) is (missing > 0)
+    stop, instrument = StopRequest(), FakeInstrument()
+    instrument.clock.sleep(1e4)
+    instrument.at = {FIRST: stop.stop}
+    resumed, chooser = open_for_resume(ran.folder), Scripted([])
+    with choosing(monkeypatch, chooser), killed(monkeypatch), resumed as series, suppress(ScanStopped, DataError):
+        assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
+        run_scan(series.config, series, stop=stop, instrument=instrument.connected())
+    _, part, joined = recover_run(ran.folder)[0]
+    assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))
+
+
+def stopped(stop: StopRequest, passes: Passes) -> None:
+    """No choice: the scan is stopped instead."""
+    stop.stop()
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words, pass_views, sizes = MODES[mode]
+    for folder, ending in (("stopped", nullcontext()), ("died", killed(monkeypatch))):
+        stop = StopRequest()
+        with choosing(monkeypatch, partial(stopped, stop), pass_views), ending:
+            ran = Ran(tmp_path / folder, FakeInstrument(), *WORDS, *words, stop=stop)
+        instrument = FakeInstrument()
+        instrument.clock.sleep(1e4)
+        again = Scripted([Choice.NEXT, Choice.ENOUGH])
+        with choosing(monkeypatch, again, pass_views), open_for_resume(ran.folder) as series:
+            assert series.in_words.endswith(f"has {sizes[0]} of 12 views, {12 - sizes[0]} are taken")
+            run_scan(series.config, series, instrument=instrument.connected())
+        assert [(len(passes.done), len(passes.to_come)) for passes in again.asked] == [
+            (1, len(sizes) - 1),
+            (2, len(sizes) - 2),
+        ]
+        with open_scan(ran.folder / "joined.h5") as source:
+            assert [values["number"] for values in source.decisions] == [1, 2]
+            views = [frame.index for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
+            assert [sum(row < end for row in views) for end in source.pass_ends] == [sizes[0], sum(sizes[:2])]
+        with pytest.raises(NothingMissing), open_for_resume(ran.folder):
+            ...
 
 
 def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
@@ -215,21 +298,21 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     """By validate, by a copy, by the monitor over the file, and by a reconstruction."""
     words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 32, passes: 4}", "scan.period_s=0.4")
     wide = ("scan.wide_views=2", "sample.diameter_mm=0.9")
-    asked = Asked([Choice.AGAIN, Choice.WIDE])
-    with choosing(monkeypatch, asked):
+    chooser = Scripted([Choice.AGAIN, Choice.WIDE])
+    with choosing(monkeypatch, chooser):
         ran = Ran(tmp_path / "runs", FakeInstrument(), *words, *wide)
     path = ran.result.path
-    assert asked.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
+    assert chooser.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
     assert ran.result.flags == {}
     ingest(path, tmp_path / "copy.h5")
     for file in (path, tmp_path / "copy.h5"):
-        assert [one.message for one in validate(file) if one.severity != "info"] == []
+        assert [finding.message for finding in validate(file) if finding.severity != "info"] == []
         with open_scan(file) as source:
             assert source.pass_ends.tolist() == [13, 21, 25, 33, 41]
-            assert [values["choice"] for values in source.decisions] == asked.answers
+            assert [values["choice"] for values in source.decisions] == chooser.answers
             assert usable_views(source, use_flags=True).frames.size == 32
             assert judged_flags(source).flagged.sum() == 0
     out = tmp_path / "volume.h5"
-    said = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])
-    assert said.exit_code == 0, said.output
-    assert [line for line in said.output.splitlines() if "arning" in line or "again" in line] == []
+    made = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])
+    assert made.exit_code == 0, made.output
+    assert [line for line in made.output.splitlines() if "arning" in line or "again" in line] == []

@@ -14,7 +14,8 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
-from recon.base.volume import Grid, part_of, slabs_of
+from recon.base.slabs import part_of, slabs_of
+from recon.base.volume import Grid
 from recon.voxels.projector import Projector, seen_rays
 
 

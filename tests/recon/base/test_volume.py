@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -17,6 +19,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
+from tests.recon.trigonometry import pixel_of
 
 TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 
@@ -198,3 +201,110 @@ def test_a_volume_is_saved_with_its_places_and_nothing_is_overwritten(tmp_path: 
     with pytest.raises(ValueError, match="beamline export"):
         volume.save(tmp_path / "v.tif")
     assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]
+
+
+def test_the_edges_are_half_a_voxel_beyond_the_centres() -> None:
+    grid = Grid((3, 4, 5), 0.5, centre=(1.0, 2.0, 3.0))
+    low, high = grid.edges
+    for axis, centres in zip((2, 1, 0), grid.coordinates(), strict=True):
+        assert (low[axis], high[axis]) == pytest.approx((centres[0] - 0.25, centres[-1] + 0.25))
+
+
+def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
+    for cols, pitch in ((7, 0.1), (160, 0.0046), (2048, 1.0)):
+        views = Geometry.parallel([0.0], (5, cols), pixel_pitch=pitch)
+        assert Grid.of_field(views, pitch) == Grid.matching(views)
+
+
+def test_a_grid_takes_any_list_of_whole_numbers() -> None:
+    assert Grid([2, 3, 4], centre=np.zeros(3)) == Grid((2, 3, 4))  # type: ignore[arg-type]
+    for arguments, message in (
+        ({"shape": (2.5, 3, 4)}, "3 values, each a whole number"),
+        ({"shape": (0, 3, 4)}, "shape"), ({"voxel_size": 0.0}, "voxel_size"), ({"centre": (0, np.nan, 0)}, "centre"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            Grid(**({"shape": (2, 3, 4)} | arguments))  # type: ignore[arg-type]
+
+
+def test_a_volume_fits_its_grid() -> None:
+    with pytest.raises(ValueError, match="shape"):
+        Volume(np.zeros((2, 2, 2), np.float32), Grid((2, 2, 3)))
+
+
+def _edges(geometry: Geometry, view: int) -> np.ndarray:
+    """u and z in mm [2, 2] at which the first and last edge of a view's columns and rows see the plane of the axis.
+
+    From where three points of that plane fall, so from nothing but trigonometry: pixels are linear in u and z there.
+    """
+    c, s = np.cos(geometry.angles[view]), np.sin(geometry.angles[view])
+    middle, right, up = (pixel_of(geometry, view, np.array(p)) for p in ((0.0, 0.0, 0.0), (c, s, 0.0), (0.0, 0.0, 1.0)))
+    rows, cols = geometry.detector_shape
+    u = (np.array([-0.5, cols - 0.5]) - middle[0]) / (right - middle)[0]
+    z = (np.array([-0.5, rows - 0.5]) - middle[1]) / (up - middle)[1]
+    return np.stack((u, z))
+
+
+moves = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-30, 30)), min_size=1, max_size=4)
+
+
+@given(
+    rows=st.integers(1, 9), cols=st.integers(1, 40), axis=st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
+    pitch=st.floats(1e-3, 1e3), coarser=st.floats(1, 5), shifts=moves, cone=st.booleans(),
+)  # fmt: skip
+def test_the_field_holds_every_ray_and_no_more(
+    rows: int, cols: int, axis: tuple[float, float], pitch: float, coarser: float,
+    shifts: list[tuple[float, float]], cone: bool,
+) -> None:  # fmt: skip
+    shifts = [(col * cols / 2, row) for col, row in shifts]  # farther aside would be wide views
+    angles, how = 0.7 * np.arange(len(shifts)), {"axis_row": axis[1], "shifts": shifts}
+    if cone:
+        views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis_col=axis[0], **how)
+    else:
+        views = Geometry.parallel(angles, (rows, cols), pixel_pitch=pitch, axis_col=axis[0], **how)
+    voxel = pitch * coarser
+    (*_, bottom), (x, y, top) = Grid.of_field(views, voxel).edges
+    u, z = np.stack([_edges(views, view) for view in range(views.n_views)], axis=1)
+    slack = 1e-5 * voxel
+    # The plane of the axis turns: what is seen at u is somewhere on the circle of that radius.
+    assert x == y and np.abs(u).max() - slack <= x < np.abs(u).max() + voxel / 2 + slack
+    assert bottom <= z.min() + slack and z.max() - slack <= top
+    assert top - bottom < np.ptp(z) + voxel + slack and top + bottom == pytest.approx(z.min() + z.max(), abs=slack)
+
+
+def test_shifts_common_to_all_views_equal_a_moved_axis() -> None:
+    angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    moved = Geometry.parallel(angles, (10, 32), axis_col=29.5, axis_row=14.5)
+    shifted = Geometry.parallel(angles, (10, 32), shifts=np.tile([14.0, 10.0], (48, 1)))
+    assert Grid.of_field(moved, 1.0) == Grid.of_field(shifted, 1.0) == Grid((10, 60, 60), centre=(-10.0, 0, 0))
+    beyond = Geometry.parallel(angles, (10, 48), axis_col=-20)
+    assert Grid.of_field(beyond, 1.0).shape == (10, 135, 135)  # to 67.5 pixels from the axis
+
+
+@given(sod=st.floats(3, 60), voxel=st.floats(1, 9), axis=st.floats(0, 40))
+def test_the_field_of_a_wide_cone_ends_before_its_source(sod: float, voxel: float, axis: float) -> None:
+    views = Geometry.cone([0.0, 2.0], (5, 40), 2.0, sod, 2 * sod, axis_col=axis)
+    field = Grid.of_field(views, min(voxel, sod))
+    beyond = field.voxel_size / 2  # where voxels are interpolated to zero
+    assert np.hypot(*(field.edges[1, :2] + beyond)) < sod or field.shape[1] == 1
+    assert field.edges[1, 0] >= min(views.reach, 0.7 * sod - field.voxel_size) * (1 - 1e-9)
+
+
+def test_a_fit_takes_voxels_like_those_wanted_from_one_to_four_pixels() -> None:
+    views = Geometry.cone([0.0], (8, 32), 1.0, 100.0, 200.0)  # pixels of 0.5 mm
+    for wanted, edge in ((0.1, 0.5), (0.5, 0.5), (1.2, 1.2), (2.0, 2.0), (32.0, 2.0)):
+        assert Grid.for_fit(views, Grid((1, 1, 1), wanted)) == Grid.of_field(views, edge)
+
+
+def test_a_grid_follows_the_height_of_the_axis_row() -> None:
+    view = Geometry.parallel([0.0], (5, 8), pixel_pitch=0.5, axis_row=3.0)  # the middle row, 2, is one row below z = 0
+    assert Grid.matching(view).centre[0] == pytest.approx(-0.5)
+    assert Grid.of_field(view, 0.5).centre[0] == pytest.approx(-0.5)
+
+
+def test_voxels_may_be_longer_along_z() -> None:
+    grid = Grid((4, 6, 6), 0.5, slice_pitch=2.0)
+    assert grid.spacing == (2.0, 0.5, 0.5)
+    np.testing.assert_allclose(grid.coordinates()[0], [-3, -1, 1, 3])
+    np.testing.assert_allclose(grid.edges[:, 2], [-4, 4])
+    with pytest.raises(ValueError, match="slice_pitch"):
+        Grid((4, 6, 6), 0.5, slice_pitch=0.0)

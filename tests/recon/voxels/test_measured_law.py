@@ -108,17 +108,17 @@ def test_fewer_views_than_columns_leave_gaps_that_others_fill() -> None:
 
 
 def test_views_of_many_columns_are_binned(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, seen = law_of(192, 300)[0], list[int]()
+    whole, columns = law_of(192, 300)[0], list[int]()
     monkeypatch.setattr("recon.voxels.measured_law._WORK", 192 * SIDE**2 - 1)
-    made = NoiseBalance.of
+    balance_of = NoiseBalance.of
 
-    def of(problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
-        seen.append(problem.data.shape[1])
-        return made(problem, start, sweeps)
+    def noted(problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
+        columns.append(problem.data.shape[1])
+        return balance_of(problem, start, sweeps)
 
-    monkeypatch.setattr(NoiseBalance, "of", of)
+    monkeypatch.setattr(NoiseBalance, "of", noted)
     binned = law_of(192, 300)[0]
-    assert seen == [SIDE // 2]
+    assert columns == [SIDE // 2]
     assert binned.n_views == 192 and binned.exponent == pytest.approx(whole.exponent, abs=0.15)
 
 

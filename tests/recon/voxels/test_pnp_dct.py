@@ -13,7 +13,8 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, RunControl
-from recon.base.volume import Grid, part_of, slabs_of
+from recon.base.slabs import part_of, slabs_of
+from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
 from recon.voxels import methods
 from recon.voxels.methods import PnpDct

@@ -12,7 +12,8 @@ import recon
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
-from recon.base.volume import Grid, bands_of
+from recon.base.slabs import bands_of
+from recon.base.volume import Grid
 from recon.kernels.cpu.spread import spread
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize

@@ -1,7 +1,7 @@
 // What can be measured after a pass, side by side; buttons that answer while the scan asks; what was chosen so far.
 
 const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", wide: "wide views", retake: "bad views again", enough: "no further view" };
-const BY = { program: "program", operator: "operator", plan: "nobody: as planned" };
+const CHOSEN_BY = { program: "program", operator: "operator", plan: "nobody: as planned" };
 
 export class Passes {
   /** answer: takes a choice, where the person may act and the scan asks. */
@@ -15,11 +15,12 @@ export class Passes {
   /** A state that ends the question without a choice. */
   finish() { this.asks = false; this.draw(); }
 
-  /** What was chosen; what an earlier choice has brought stands in this event. */
+  /** What was chosen. The event also says what an earlier decision has brought, by the number of its pass. */
   choose(data) {
-    const before = this.decisions.find((each) => each.number === data.judged) ?? this.decisions[this.decisions.length - 1], own = data.options.find((each) => each.choice === data.choice);
-    if (before) { before.predicted = data.predicted ?? before.predicted; before.gained = data.gained ?? before.gained; }
-    this.decisions.push({ ...data, predicted: own?.gain ?? null, gained: null });
+    const judged = this.decisions.find((decision) => decision.number === data.judged) ?? this.decisions[this.decisions.length - 1];
+    if (judged) { judged.predicted = data.predicted ?? judged.predicted; judged.gained = data.gained ?? judged.gained; }
+    const chosen = data.options.find((option) => option.choice === data.choice);
+    this.decisions.push({ ...data, predicted: chosen?.gain ?? null, gained: null });
     this.asks = false;
     this.draw();
   }
@@ -34,35 +35,36 @@ export class Passes {
   draw() {
     const find = (name) => this.box.querySelector(name), asks = this.asks && this.runs, { ended } = this;
     this.box.hidden = !ended && !this.decisions.length;
-    find("thead + tbody").replaceChildren(...(ended ? ended.options : []).map((each) => this.option(each, asks && this.mayAct)));
+    find("thead + tbody").replaceChildren(...(ended ? ended.options : []).map((option) => this.rowOf(option, asks && this.mayAct)));
     find("small").textContent = ended ? `pass ${ended.number} is over, ${ended.n_views} views so far` : "";
     const how = this.mayAct ? "Choose above" : "beamline decide CHOICE";
     const question = asks ? `The scan asks what is next. ${how}; after ${ended.wait.toFixed(0)} s without an answer the plan goes on.` : "";
     find(".asks").textContent = [ended?.remark, question].filter(Boolean).join(" ");
     find(".decisions").hidden = !this.decisions.length;
-    find(".decisions tbody").replaceChildren(...this.decisions.map((each) => row([each.number, each.choice, BY[each.by] ?? each.by, db(each.predicted), db(each.gained), each.reason])).reverse());
+    find(".decisions tbody").replaceChildren(...this.decisions.map((decision) => row([decision.number, decision.choice, CHOSEN_BY[decision.by] ?? decision.by, db(decision.predicted), db(decision.gained), decision.reason])).reverse());
   }
 
-  option(each, asked) {
-    const { choice, gain, low, high, seconds } = each, marked = choice === this.ended.recommended;
+  /** A row of the table, with a button where this person may answer. */
+  rowOf(option, mayAnswer) {
+    const { choice, gain, low, high, seconds } = option, recommended = choice === this.ended.recommended;
     const range = low === null || high === null || low === high ? "" : ` (${low.toFixed(2)} to ${high.toFixed(2)})`;
     const rate = gain === null || !seconds ? "-" : db(60 * gain / seconds);
-    const made = row([MEANINGS[choice] ? `${choice}: ${MEANINGS[choice]}` : choice, gain === null ? "not known" : db(gain) + range, rate, `${seconds.toFixed(0)} s`, `${(100 * each.dose).toFixed(1)} %`, size(each.bytes), marked ? "recommended" : ""]);
-    if (marked) made.className = "recommended";
-    if (asked) {
+    const line = row([MEANINGS[choice] ? `${choice}: ${MEANINGS[choice]}` : choice, gain === null ? "not known" : db(gain) + range, rate, `${seconds.toFixed(0)} s`, `${(100 * option.dose).toFixed(1)} %`, size(option.bytes), recommended ? "recommended" : ""]);
+    if (recommended) line.className = "recommended";
+    if (mayAnswer) {
       const button = document.createElement("button");
       button.textContent = choice;
       button.addEventListener("click", () => this.answer(choice));
-      made.insertCell().append(button);
+      line.insertCell().append(button);
     }
-    return made;
+    return line;
   }
 }
 
 function row(texts) {
-  const made = document.createElement("tr");
-  for (const text of texts) made.insertCell().textContent = text;
-  return made;
+  const line = document.createElement("tr");
+  for (const text of texts) line.insertCell().textContent = text;
+  return line;
 }
 function db(value) { return value === null || value === undefined ? "-" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`; }
 function size(bytes) { return bytes < 1e9 ? `${(bytes / 1e6).toFixed(0)} MB` : `${(bytes / 1e9).toFixed(2)} GB`; }

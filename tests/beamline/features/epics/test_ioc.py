@@ -17,6 +17,7 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.features.epics.ioc import RunServer
 from tests.beamline.features.run_folder import FAILED, STARTED, asking, write_run
+from tests.beamline.pass_options import UNKNOWN, option
 from tests.beamline.scans import TwoCylinders, frames_of
 
 thread = pytest.importorskip("p4p.client.thread")
@@ -129,8 +130,7 @@ def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
 ASKED = {
     "event": "pass_ended", "time": 1.7e9 + 3, "number": 3, "n_views": 270, "recommended": "next", "wait": 30.0,
     "options": [
-        {"choice": "next", "seconds": 95.0, "dose": 0.125, "bytes": 2e9, "gain": 0.8, "low": 0.6, "high": 1.0},
-        {"choice": "enough", "seconds": 0.0, "dose": 0.0, "bytes": 0, "gain": None, "low": None, "high": None},
+        option("next", 0.8, (0.6, 1.0), 90, 95.0, 0.125, 2e9), option("enough", None, UNKNOWN),
     ],
 }  # fmt: skip
 

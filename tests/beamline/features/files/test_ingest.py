@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,6 +19,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.rows import Rows
 from drivers.base.frame import FrameKind
 from tests.beamline.cli.small_scan import left
+from tests.beamline.storage.readers.foreign_scans import CONE, VIEWS, nxtomo
 
 SHAPE = (24, 32)
 N = 9
@@ -141,3 +143,31 @@ def test_kinds_and_order_come_through(tmp_path: Path) -> None:
     with open_scan(tmp_path / "out.h5") as source:
         assert source.read(slice(None))[:, 0, 0].tolist() == [10, 900, 502, 510]
         assert source.image_key.tolist() == [FrameKind.DARK, FrameKind.FLAT, 0, 0]
+
+
+COPIED: dict[str, list[tuple[str, Any, str | None]]] = {
+    "a cone": [*CONE, ("instrument/beam/incident_energy", 25.0, "keV")],
+    "a distance": [("detector/distance", 0.2, "m")],
+    "mirrored": [("detector/x_flipped", True, None), ("detector/y_flipped", True, None)],
+}
+
+
+@pytest.mark.parametrize("changes", COPIED.values(), ids=COPIED.keys())
+def test_a_copy_of_ours_states_the_same(tmp_path: Path, changes: list[tuple[str, Any, str | None]]) -> None:
+    path = nxtomo(tmp_path / "s.nx", *changes)
+    assert ingest(path, tmp_path / "copy.h5").doubts == ()
+    with open_scan(path) as source, open_scan(tmp_path / "copy.h5") as copy:
+        for name in ("cone", "pixel_size_mm", "energy_kev", "row_pitch_mm"):
+            assert getattr(copy, name) == pytest.approx(getattr(source, name)), name
+        assert copy.attributes.get("distance_mm") == source.attributes.get("distance_mm")
+        np.testing.assert_array_equal(copy.read(slice(None)), source.read(slice(None)))
+
+
+def test_what_a_copy_cannot_state_is_refused_or_named(tmp_path: Path) -> None:
+    path = nxtomo(tmp_path / "s.nx", ("detector/y_pixel_size", 2.0, "um"))
+    with pytest.raises(DataError, match=r"0\.001 x 0\.002"):
+        ingest(path, tmp_path / "copy.h5")
+    assert not (tmp_path / "copy.h5").exists()
+    climbs = ("sample/z_translation", np.r_[0, 0, np.arange(VIEWS)] * 1e-6, "m")
+    (doubt,) = ingest(nxtomo(tmp_path / "t.nx", climbs), tmp_path / "copy.h5").doubts
+    assert "sample/z_translation, 0 to 4e-06 m, which is not used" in doubt

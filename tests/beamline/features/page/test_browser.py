@@ -29,6 +29,7 @@ from tests.beamline.features.page.chromium import (
 from tests.beamline.features.page.served import listed, served, viewed
 from tests.beamline.features.page.test_run_browser import made
 from tests.beamline.features.run_folder import asking
+from tests.beamline.pass_options import option
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 __all__ = ["browser"]
@@ -50,19 +51,7 @@ def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
         assert browser.complaints() == []
 
 
-NEXT, ENOUGH = (
-    {
-        "choice": "next",
-        "frames": 90,
-        "seconds": 90.0,
-        "dose": 0.125,
-        "bytes": 2e9,
-        "gain": 0.8,
-        "low": 0.6,
-        "high": 1.0,
-    },
-    {"choice": "enough", "frames": 0, "seconds": 0.0, "dose": 0.0, "bytes": 0, "gain": 0.0, "low": 0.0, "high": 0.0},
-)
+NEXT, ENOUGH = option("next", 0.8, (0.6, 1.0), 90, 90.0, 0.125, 2e9), option("enough")
 PASS = {"n_views": 90, "options": [NEXT, ENOUGH], "time": 1.7e9}
 ENDED = {"event": "pass_ended", "recommended": "next", "wait": 30.0, **PASS}
 CHOSEN = {"event": "next_chosen", "choice": "next", "by": "program", "reason": "<b>most a second", **PASS}

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import Frame, FrameKind
+from tests.beamline.storage.readers.foreign_scans import FRAMES, exchange
 
 Parts = dict[str, np.ndarray]
 
@@ -174,3 +176,18 @@ def test_a_piece_of_the_file_that_holds_many_frames_is_unpacked_once(
         one_by_one = [other.read([row])[0] for row in range(64)]
         assert process_time() - started < 12 * at_once
         np.testing.assert_array_equal(one_by_one, frames)
+
+
+@pytest.mark.parametrize("axes", [None, "theta:y:x", "y:theta:x", "y:x:theta", "x:y:theta", "theta:x:y", "x:theta:y"])
+def test_frames_in_any_order_of_axes_are_the_same_scan(tmp_path: Path, axes: str | None) -> None:
+    with open_scan(exchange(tmp_path / "s.h5", axes=axes)) as source:
+        np.testing.assert_array_equal(source.read(slice(None)), FRAMES)
+        np.testing.assert_array_equal(source.read([6, 0, 3, 4], slice(1, 3)), FRAMES[[6, 0, 3, 4], 1:3])
+
+
+def test_axes_that_are_unknown_are_named(tmp_path: Path) -> None:
+    path = exchange(tmp_path / "s.h5")
+    with h5py.File(path, "r+") as file:
+        file["exchange/data"].attrs["axes"] = "a:b:c"
+    (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
+    assert hit.severity == "warning" and "exchange/data@axes, a:b:c" in hit.message

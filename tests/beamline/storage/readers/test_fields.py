@@ -10,57 +10,22 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.core.errors import DataError
-from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
-from beamline.storage.readers.open import SourceOptions, open_scan
-
-ROWS, COLS, VIEWS = 4, 6, 5
-KEY = np.r_[2, 1, [0] * VIEWS]
-DETECTOR = "instrument/detector"
-FRAMES = np.random.default_rng(3).integers(100, 60000, (2 + VIEWS, ROWS, COLS)).astype(np.uint16)
-
-
-def put(parent: h5py.Group, where: str, value: Any, units: str | None = None, **attributes: Any) -> None:
-    if where in parent:
-        del parent[where]
-    parent[where] = value
-    if units is not None:
-        parent[where].attrs["units"] = units
-    parent[where].attrs.update(attributes)
-
-
-def nxtomo(path: Path, *changes: tuple[str, Any, str | None], also: Callable[[h5py.Group], None] | None = None) -> Path:
-    """A foreign NXtomo with other values or more of them, below its entry."""
-    with h5py.File(path, "w") as file:
-        entry = file.create_group("entry0000")
-        put(entry, "definition", "NXtomo")
-        put(entry, f"{DETECTOR}/data", FRAMES)
-        put(entry, f"{DETECTOR}/image_key", KEY)
-        put(entry, f"{DETECTOR}/x_pixel_size", 1e-3, "mm")
-        put(entry, f"{DETECTOR}/y_pixel_size", 1e-6, "m")
-        put(entry, "sample/rotation_angle", np.r_[0, 0, np.arange(VIEWS) * 36.0], "degree")
-        for where, value, units in changes:
-            put(entry, f"instrument/{where}" if where.startswith("detector/") else where, value, units)
-        if also is not None:
-            also(entry)
-    return path
-
-
-def exchange(path: Path, *changes: tuple[str, Any, str | None], axes: str | None = None) -> Path:
-    order = [["theta", "y", "x"].index(axis) for axis in (axes or "theta:y:x").split(":")]
-    with h5py.File(path, "w") as file:
-        for name, kind in (("data_dark", 2), ("data_white", 1), ("data", 0)):
-            file[f"exchange/{name}"] = np.ascontiguousarray(FRAMES[kind == KEY].transpose(order))
-        if axes is not None:
-            file["exchange/data"].attrs["axes"] = axes
-        put(file, "exchange/theta", np.arange(VIEWS) * 36.0, "deg")
-        for where, value, units in changes:
-            put(file, where, value, units)
-    return path
-
+from beamline.storage.readers.open import open_scan
+from tests.beamline.storage.readers.foreign_scans import (
+    COLS,
+    CONE,
+    DETECTOR,
+    FRAMES,
+    KEY,
+    ROWS,
+    VIEWS,
+    exchange,
+    nxtomo,
+    opened,
+)
 
 MATTERS: dict[str, tuple[Any, str | None]] = {  # values of a field that is not used, and that may change the volume
     "detector/beam_center_x": (0.0, "pixel"),
@@ -93,7 +58,6 @@ HARMLESS: dict[str, Any] = {  # of those, values that change nothing
     "exchange/data_shift_y": np.zeros(VIEWS),
     "measurement/instrument/interferometer/number_of_grid_steps": 1,
 }
-CONE = (("instrument/source/distance", -0.01, "m"), ("detector/distance", 0.01, "m"))
 
 
 @pytest.mark.parametrize("field", [field for field in (*NXTOMO, *EXCHANGE) if not field.used], ids=lambda f: f.where)
@@ -112,29 +76,6 @@ def test_what_is_not_used_is_named(tmp_path: Path, field: Entry) -> None:
     if field.matters is not None:
         value, units = MATTERS[field.where]
         assert said(value, units) == "warning"
-
-
-def opened(path: Path) -> ScanSource:
-    with open_scan(path) as source:
-        source.read([0])
-        return source
-
-
-def _axes(entry: h5py.Group) -> None:
-    entry.create_group("data").attrs["axes"] = ["rotation_angle", "x", "y"]
-
-
-def _turned(vertical: str, **turns: float) -> Callable[[h5py.Group], None]:
-    vectors = {"rx": (1, 0, 0), "ry": (0, 1, 0), "rz": (0, 0, 1)}
-
-    def add(entry: h5py.Group) -> None:
-        group = f"{DETECTOR}/transformations"
-        down = -np.array(vectors["r" + vertical])
-        put(entry, f"{group}/gravity", 9.8, "m/s2", vector=down, transformation_type="translation")
-        for name, angle in turns.items():
-            put(entry, f"{group}/{name}", angle, "degree", vector=vectors[name], transformation_type="rotation")
-
-    return add
 
 
 PLACES = ("detector", "sample")
@@ -249,7 +190,7 @@ USED_EXCHANGE |= {
         lambda s: s.image_key.tolist(), [1, 0, 0, 0, 0, 0, 2],
     ),
 }  # fmt: skip
-TRIED = {"detector/transformations"}  # below
+TRIED = {"detector/transformations"}  # in test_nexus
 
 
 def test_every_row_of_the_lists_is_tried() -> None:
@@ -315,161 +256,8 @@ def test_joules_are_the_units_of_data_exchange(tmp_path: Path) -> None:
         assert opened(exchange(tmp_path / "s.h5", (ENERGY, 4.00544e-15, units))).energy_kev == pytest.approx(25, 1e-4)
 
 
-@pytest.mark.parametrize(
-    ("sod", "distance", "width", "cone"),
-    [
-        (-0.1, 0.1, 400e-6, True),  # a laboratory's
-        (0.1, 0.1, 400e-6, True),  # without the sign
-        (-145.0, 30.0, 1e-6, True),  # magnifies by 1.2
-        (-52.0, 0.03, 0.67e-6, False),  # a synchrotron's
-        (-0.5, 0.001, 0.02e-3, False),
-        (-0.005, 1e-5, 1e-3, True),  # nearly no magnification, but a wide fan
-    ],
-)
-def test_a_distance_of_the_source_makes_a_cone(
-    tmp_path: Path, sod: float, distance: float, width: float, cone: bool
-) -> None:
-    changes = [("instrument/source/distance", sod, "m"), ("detector/distance", distance, "m")]
-    path = nxtomo(tmp_path / "s.nx", *changes, *((f"detector/{side}_pixel_size", width, "m") for side in "xy"))
-    source = opened(path)
-    assert source.cone == (pytest.approx((abs(sod) * 1e3, (abs(sod) + distance) * 1e3)) if cone else None)
-    assert source.pixel_size_mm == pytest.approx(width * 1e3)
-    assert cone or "a parallel beam (magnification 1.00" in str(source.attributes["source_distance"])
-
-
-def test_a_pixel_at_the_sample_is_magnified_to_that_on_the_detector(tmp_path: Path) -> None:
-    at_sample = (("sample/x_pixel_size", 0.5, "um"), ("sample/y_pixel_size", 0.5, "um"))
-    assert opened(nxtomo(tmp_path / "s.nx", *CONE, *at_sample)).pixel_size_mm == pytest.approx(1e-3)
-    with pytest.raises(DataError, match=r"is 0 mm"):
-        open_scan(nxtomo(tmp_path / "s.nx", ("instrument/source/distance", 0.0, "m"), CONE[1]))
-
-
-UPSIDE_DOWN, LEFT_RIGHT = (slice(None, None, -1), slice(None)), (slice(None), slice(None, None, -1))
-
-
-@pytest.mark.parametrize(
-    ("changes", "also", "mirrored"),
-    [
-        ([("detector/x_flipped", True, None)], None, [LEFT_RIGHT]),
-        ([("detector/y_flipped", 1, None)], None, [UPSIDE_DOWN]),
-        ([("detector/y_flipped", "True", None), ("detector/x_flipped", True, None)], None, [UPSIDE_DOWN, LEFT_RIGHT]),
-        ([("detector/y_flipped", False, None)], None, []),
-        ([], _turned("z", ry=180.0, rz=0.0), [UPSIDE_DOWN]),
-        ([], _turned("z", rz=-180.0), [LEFT_RIGHT]),
-        ([], _turned("z", rx=180.0), [UPSIDE_DOWN, LEFT_RIGHT]),
-        ([], _turned("y", ry=180.0), [LEFT_RIGHT]),
-        ([], _turned("y", rx=180.0, rz=360.0), [UPSIDE_DOWN]),
-        ([], _turned("y", rx=180.0, ry=180.0), [UPSIDE_DOWN, LEFT_RIGHT]),
-    ],
-)
-def test_mirrored_frames_are_mirrored_back(
-    tmp_path: Path,
-    changes: list[tuple[str, Any, str | None]],
-    also: Callable[[h5py.Group], None] | None,
-    mirrored: list[tuple[slice, slice]],
-) -> None:
-    expected = FRAMES
-    for part in mirrored:
-        expected = expected[:, *part]
-    with open_scan(nxtomo(tmp_path / "s.nx", *changes, also=also)) as source:
-        for rows in (slice(None), slice(1, 3), slice(0, 4, 2), slice(3, 3)):
-            np.testing.assert_array_equal(source.read([4, 0, 6], rows), expected[[4, 0, 6], rows])
-        np.testing.assert_array_equal(list(source.frames())[3].counts, expected[3])
-
-
-def test_another_turn_of_the_detector_is_named(tmp_path: Path) -> None:
-    with open_scan(nxtomo(tmp_path / "s.nx", also=_turned("z", rx=5.0))) as source:
-        assert source.not_used[0][:2] == ("detector/transformations", "rx 5°")
-    hits = [hit for hit in validate(tmp_path / "s.nx") if "rx 5°" in hit.message]
-    assert [hit.severity for hit in hits] == ["warning"]
-
-
-@pytest.mark.parametrize("axes", [None, "theta:y:x", "y:theta:x", "y:x:theta", "x:y:theta", "theta:x:y", "x:theta:y"])
-def test_frames_in_any_order_of_axes_are_the_same_scan(tmp_path: Path, axes: str | None) -> None:
-    with open_scan(exchange(tmp_path / "s.h5", axes=axes)) as source:
-        np.testing.assert_array_equal(source.read(slice(None)), FRAMES)
-        np.testing.assert_array_equal(source.read([6, 0, 3, 4], slice(1, 3)), FRAMES[[6, 0, 3, 4], 1:3])
-
-
-def test_axes_that_are_unknown_are_named_and_those_of_nxdata_must_fit(tmp_path: Path) -> None:
-    path = exchange(tmp_path / "s.h5")
-    with h5py.File(path, "r+") as file:
-        file["exchange/data"].attrs["axes"] = "a:b:c"
-    (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
-    assert hit.severity == "warning" and "exchange/data@axes, a:b:c" in hit.message
-    with pytest.raises(DataError, match=r"rotation_angle"):
-        open_scan(nxtomo(tmp_path / "s.nx", also=_axes))
-
-
-@pytest.mark.parametrize("height", [0.5, 2.0, 1.01])
-def test_pixels_that_are_not_square_are_told(tmp_path: Path, height: float) -> None:
-    def said(*more: tuple[str, Any, str | None]) -> list[str]:
-        path = nxtomo(tmp_path / "s.nx", ("detector/y_pixel_size", height, "um"), *more)
-        assert describe(path)["pixel_height_mm"] == pytest.approx(height * 1e-3)
-        return [hit.severity for hit in validate(path) if hit.rule == "pixel-height"]
-
-    assert said() == ["info"]
-    assert said(*CONE) == ["error"]
-
-
-COPIED: dict[str, list[tuple[str, Any, str | None]]] = {
-    "a cone": [*CONE, ("instrument/beam/incident_energy", 25.0, "keV")],
-    "a distance": [("detector/distance", 0.2, "m")],
-    "mirrored": [("detector/x_flipped", True, None), ("detector/y_flipped", True, None)],
-}
-
-
-@pytest.mark.parametrize("changes", COPIED.values(), ids=COPIED.keys())
-def test_a_copy_of_ours_states_the_same(tmp_path: Path, changes: list[tuple[str, Any, str | None]]) -> None:
-    path = nxtomo(tmp_path / "s.nx", *changes)
-    assert ingest(path, tmp_path / "copy.h5").doubts == ()
-    with open_scan(path) as source, open_scan(tmp_path / "copy.h5") as copy:
-        for name in ("cone", "pixel_size_mm", "energy_kev", "row_pitch_mm"):
-            assert getattr(copy, name) == pytest.approx(getattr(source, name)), name
-        assert copy.attributes.get("distance_mm") == source.attributes.get("distance_mm")
-        np.testing.assert_array_equal(copy.read(slice(None)), source.read(slice(None)))
-
-
-def test_what_a_copy_cannot_state_is_refused_or_named(tmp_path: Path) -> None:
-    path = nxtomo(tmp_path / "s.nx", ("detector/y_pixel_size", 2.0, "um"))
-    with pytest.raises(DataError, match=r"0\.001 x 0\.002"):
-        ingest(path, tmp_path / "copy.h5")
-    assert not (tmp_path / "copy.h5").exists()
-    climbs = ("sample/z_translation", np.r_[0, 0, np.arange(VIEWS)] * 1e-6, "m")
-    (doubt,) = ingest(nxtomo(tmp_path / "t.nx", climbs), tmp_path / "copy.h5").doubts
-    assert "sample/z_translation, 0 to 4e-06 m, which is not used" in doubt
-
-
 def test_the_page_lists_every_field() -> None:
     page = (Path(__file__).parents[4] / "docs" / "scan_files.md").read_text(encoding="utf-8")
     for field in (*NXTOMO, *EXCHANGE):
         use = field.use if field.used else f"not used{', warned of' if field.matters else ''}: {field.use}"
         assert f"| `{field.where}` | {use} |\n" in page, field.where
-
-
-def test_another_scan_of_the_file_is_named(tmp_path: Path) -> None:
-    def second(entry: h5py.Group) -> None:
-        entry.file.attrs["default"] = entry.name
-        entry.file.copy(entry, "entry0001")
-
-    path = nxtomo(tmp_path / "s.nx", also=second)
-    (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
-    other = f"/entry0001/{DETECTOR}/data"
-    assert hit.severity == "warning" and f"--data-path {other}" in hit.message
-    with open_scan(SourceOptions(path, data_path=other)) as source:
-        assert source.not_used == ()
-
-
-def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path) -> None:
-    kev = np.r_[np.nan, 20.0, [20, 30, 20, 30, 20]]
-    path = nxtomo(tmp_path / "s.nx", ("instrument/beam/incident_energy", kev, "keV"))
-    (hit,) = [hit for hit in validate(path) if hit.rule == "energies"]
-    assert hit.severity == "error" and "3 at 20 keV, 2 at 30 keV" in hit.message
-    with open_scan(SourceOptions(path, frames="energy=20", darks=FRAMES[:2])) as source:
-        assert source.energy_kev == 20
-        assert source.image_key.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
-    assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
-    with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
-        open_scan(SourceOptions(path, frames="energy=25"))
-    with pytest.raises(DataError, match="states no energy of each frame"):
-        open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))

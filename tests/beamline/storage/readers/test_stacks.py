@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.scan import axis_vertical
+from beamline.storage.rules.stored_order import axis_vertical
 
 PATHS = {
     "data_path": "/raw/images",

@@ -9,9 +9,11 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import write_nxtomo
+from tests.beamline.storage.readers.foreign_scans import FRAMES, nxtomo
 
 DARK, FLAT, VIEW, NONE = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION, FrameKind.INVALID
 SHAPE = (4, 6)
@@ -104,3 +106,18 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
         open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
     with pytest.raises(DataError, match="cannot be followed with --then"):
         open_scan(SourceOptions(paths[0], then=(paths[1],)), follow=True)
+
+
+def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path) -> None:
+    kev = np.r_[np.nan, 20.0, [20, 30, 20, 30, 20]]
+    path = nxtomo(tmp_path / "s.nx", ("instrument/beam/incident_energy", kev, "keV"))
+    (hit,) = [hit for hit in validate(path) if hit.rule == "energies"]
+    assert hit.severity == "error" and "3 at 20 keV, 2 at 30 keV" in hit.message
+    with open_scan(SourceOptions(path, frames="energy=20", darks=FRAMES[:2])) as source:
+        assert source.energy_kev == 20
+        assert source.image_key.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
+    assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
+    with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
+        open_scan(SourceOptions(path, frames="energy=25"))
+    with pytest.raises(DataError, match="states no energy of each frame"):
+        open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))

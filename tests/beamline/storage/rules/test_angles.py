@@ -6,6 +6,7 @@ Scans of balls by the formula of a sphere's chord; one sample is wider than the 
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,8 +133,8 @@ def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: 
 
 
 def test_views_that_count_up_are_asked_about_unless_a_plan_of_ours_states_them() -> None:
-    source = scan(WITHIN, turn(60, 60), np.arange(60.0))
-    (asked,) = angles_spread(source)  # type: ignore[arg-type]
+    source: Any = scan(WITHIN, turn(60, 60), np.arange(60.0))
+    (asked,) = angles_spread(source)
     source.plan = {"angles_deg": np.arange(180.0)}
-    (known,) = angles_spread(source)  # type: ignore[arg-type]
+    (known,) = angles_spread(source)
     assert "do they count the frames?" in asked.message and "count" not in known.message

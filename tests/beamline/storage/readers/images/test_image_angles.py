@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from beamline.storage.readers.images.image_angles import angles_in
 from beamline.storage.readers.images.image_names import in_order
 
 UP, BOTH, FINE = np.arange(0, 180, 2.0), np.arange(-90, 90, 2.0), np.arange(0, 180, 1.25)
@@ -75,3 +76,11 @@ def test_what_may_be_read_in_two_ways_is_asked_for(kind: str) -> None:
     assert np.isnan(images.angles).all()
     assert "angles in names such as" in images.doubt
     assert why in images.doubt
+
+
+def test_other_numbers_in_names_are_no_angles() -> None:
+    tiles = [f"sample_{i // 4:03d}_{i % 4:03d}_{i:04d}.tif" for i in range(12)]
+    assert angles_in(tiles).radians is None
+    assert angles_in([f"sample_{i:04d}.tif" for i in range(12)]).radians is None
+    assert angles_in([f"angle_5_{i:04d}.tif" for i in range(12)]).radians is None
+    assert angles_in([]).radians is None

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_names import angles_in, kinds_of
+from beamline.storage.readers.images.image_names import kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.replacements import load_images
 from drivers.base.frame import FrameKind
@@ -81,14 +81,6 @@ def test_angles_in_names_go_with_their_frames_in_the_order_of_numbers(tmp_path: 
         assert source.attributes["angles_from"] == "the names of the files"
     with open_scan(SourceOptions(tmp_path, angles=np.radians(degrees[::-1]))) as source:  # those given go first
         np.testing.assert_allclose(np.degrees(source.angles), degrees[::-1])
-
-
-def test_other_numbers_in_names_are_no_angles() -> None:
-    tiles = [f"sample_{i // 4:03d}_{i % 4:03d}_{i:04d}.tif" for i in range(VIEWS)]
-    assert angles_in(tiles).radians is None
-    assert angles_in([f"sample_{i:04d}.tif" for i in range(VIEWS)]).radians is None
-    assert angles_in([f"angle_5_{i:04d}.tif" for i in range(VIEWS)]).radians is None
-    assert angles_in([]).radians is None
 
 
 @pytest.mark.parametrize(

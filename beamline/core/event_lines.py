@@ -1,0 +1,46 @@
+"""Lines of events from another process, or of a log: the event, or its values alone."""
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any
+
+import beamline.core.recon_events  # noqa: F401 - a kind is known once its class is defined
+from beamline.core.events import KINDS, SPREAD, Event
+from beamline.core.process import json_object
+
+LONGEST = 2**20
+"""Most bytes of a line of a log: a scan with 100,000 missing triggers takes 700 kB to say so."""
+LARGEST_LOG = 2**30
+"""Bytes of a log that are read: those of a week with ten lines a second."""
+
+
+def event_of(values: Mapping[str, Any]) -> Event:
+    """The event in a JSON line of another process. Raises ValueError if no kind of event has these values."""
+    given = {name: value for name, value in values.items() if name != "event"}
+    for each in KINDS.get(str(values.get("event")), ()):
+        spread = {item.name: item.metadata[SPREAD][1] for item in fields(each) if SPREAD in item.metadata}
+        own = {item.name for item in fields(each) if item.name not in spread}
+        rest = {name: value for name, value in given.items() if name not in own}
+        with suppress(TypeError):  # other fields, or the values are not those of the dataclass that is spread
+            taken = {name: made(**rest) for name, made in spread.items()} or rest
+            return each(**{name: value for name, value in given.items() if name in own}, **taken)
+    raise ValueError(f"no kind of event has the values {dict(values)}")
+
+
+def event_in(line: str | bytes) -> dict[str, Any] | None:
+    """The values of an event in a line of a log; None if the line is no event.
+
+    Only its kind and its time are looked at: fields may lack, be unknown, or have other types, as of another version.
+    """
+    with suppress(UnicodeDecodeError):
+        text = line.decode() if isinstance(line, bytes) else line
+        values = json_object(text) if len(text) <= LONGEST else None
+        if values is not None and isinstance(values.get("event"), str) and _is_time(values.get("time", 0.0)):
+            return values
+    return None
+
+
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) < math.inf

@@ -1,0 +1,115 @@
+"""Warnings of a scan while it is prepared: odd units, joined views, another axis, matter beyond the field, repairs."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from beamline.core.quantities import doubt
+from beamline.core.sinks import Note, Warn
+from beamline.monitor.field import beyond_the_field
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.references import uncorrected_current
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.registry import in_order
+from beamline.projections.selection import Selection, pixel_size
+from beamline.storage.readers.averaged import JOINED_DEG
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.light import without_air
+from recon.base.masks import areas
+from recon.prep.correct import Projections
+from recon.voxels.direct import has_direct_method
+from recon.voxels.field_edges import FieldEdges
+
+_SAME_AXIS = 0.05  # columns
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
+
+
+def warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
+    degrees = float(source.attributes.get(JOINED_DEG, 0.0))
+    blur = np.radians(degrees) * source.shape[1] / 2
+    if blur > _JOINED_BLUR:
+        warn(
+            f"--frames-per-view {source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
+            f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
+            "as the scan took at each angle, or leave it out."
+        )
+
+
+def warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
+    """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
+    size_mm = pixel_size(source, selection)
+    stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
+    for step in in_order(selection):  # options of the same names
+        stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
+    for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
+        if sentence:
+            warn(sentence)
+
+
+def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
+    """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
+    table = stated_poses(source, selection)
+    poses_axis = None if table is None else table.axis_col
+    if poses_axis is None or selection.axis_col is not None or abs(poses_axis - axis_col) <= _SAME_AXIS:
+        return
+    warn(
+        f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
+        f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
+    )
+
+
+def warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
+    """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
+    projections, geometry = prepared.projections, prepared.geometry
+    edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
+    if sides := edges.beyond():
+        light = ""
+        if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
+            light = without_air(source, edges.mean)
+        continued = edges.continued and has_direct_method(geometry)
+        warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
+        if unlevelled and (change := uncorrected_current(source, selection)):
+            warn(change)
+    elif ranges := edges.passing():
+        warn(passing_sentence(ranges, geometry.n_views))
+
+
+def cut_sentence(sides: dict[str, float], continued: bool) -> str:
+    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
+    fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
+    return (
+        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
+        "(scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice the views) "
+        "show the rest. The edge columns are not used as air. If they are air, and the beam is weaker than its flats, "
+        "give --air columns."
+    )
+
+
+def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
+    """A warning for `FieldEdges.passing`."""
+    words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
+    return (
+        f"Matter leaves the field {words} of {n_views}, and all of it is inside in others: the sample, or a part of "
+        "it, stands beside the rotation axis. What lies farther from the axis than the edge is not reconstructed, and "
+        "the rim is uncertain. Centre the sample on the axis, or move the camera until the axis is near its edge and "
+        "take a full turn."
+    )
+
+
+def report_defects(projections: Projections, warn: Warn) -> None:
+    """Report repaired pixels if there are more than one in a thousand."""
+    unseen = areas(projections.masked)
+    masked = float((projections.masked & ~unseen).mean())
+    if unseen.mean() > 1e-3:
+        warn(Note(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured."))
+    if masked > 1e-3:
+        warn(Note(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours."))
+    if projections.replaced > 1e-3:
+        replaced = f"{projections.replaced:.1%} of the pixels were zingers or not finite"
+        warn(Note(f"{replaced}: filled from their neighbours."))
+    if projections.floored > 1e-3:
+        warn(
+            f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
+            "least what the volume says, unless the darks are too high."
+        )

@@ -1,0 +1,162 @@
+"""Angles in the names of image files, and why they may be none."""
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import are_a_count
+
+_NUMBER = re.compile(
+    r"(?P<word>(?<![a-z])(?:angle|theta|ang|deg)(?:[ _=(]|-(?=[-+\u2212]))?)?"
+    r"(?P<mark>(?:minus|plus|neg|pos)[ _]?|[-+\u2013\u2212mnp])?"  # a hyphen, an en dash, a minus
+    r"(?P<value>(?P<whole>\d+)(?:[.,p](?P<part>\d+))?(?:e[-+]\d+)?)"
+    r"(?P<unit>[ _]?(?:deg|°|tilt))?",
+    re.IGNORECASE,
+)
+_MINUS = re.compile(r"minus|neg|[-\u2013\u2212mn]", re.IGNORECASE)
+_THOUSANDTHS = re.compile(r"_(?P<mark>)(?P<value>(?P<whole>\d{3})_(?P<part>\d{3}))(?=_\d+$)")
+_FOLLOWING = re.compile(r"[-_ ]?(\d{1,4})(?!\d)")  # more digits are of a date or a time
+_PRECEDING = re.compile(r"(?<!\d)(\d{1,4})[-_ ]?$")
+_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
+_FARTHEST = 3600.0  # degrees
+_TURN = 360.0  # degrees; a number with a sign but no word goes no further as an angle
+_EVEN, _ALIKE = 0.8, 0.3  # of the steps are alike, to so much of one: some images may be lost, angles are rounded
+_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some views at its end
+
+
+class NamedAngles(NamedTuple):
+    """The angles in the names of a series.
+
+    Attributes:
+        plain: the names without them.
+        radians: float64 [file]; None where the names state none, or may be read in two ways.
+        doubt: which ways these are; "" otherwise.
+    """
+
+    plain: list[str]
+    radians: NDArray[np.float64] | None = None
+    doubt: str = ""
+
+
+def angles_in(names: Sequence[str]) -> NamedAngles:
+    """Angles as a number beside `angle`, `theta`, `ang` or `deg`, or before `tilt`; as the one number that has a minus
+    in some names and none in others; or as three digits of degrees and three of thousandths before the number of the
+    frame (MARS and VENUS of ORNL: sample_012_500_0003.tiff).
+
+    Decimals follow a point, a comma or p; n, m, neg and minus are signs as a hyphen is.
+    """
+    stems = [name.rpartition("/")[2].rpartition(".")[0] for name in names]
+    numbers = [[*_NUMBER.finditer(stem)] for stem in stems]
+    chosen, words = _chosen(stems, numbers)
+    if not chosen or len(chosen) != len(stems):
+        return NamedAngles([*names])
+    degrees, doubt = _read(chosen)
+    if np.ptp(degrees) < _LEAST_SPAN or np.abs(degrees).max() > _FARTHEST:
+        return NamedAngles([*names])
+    others = [[each["value"] for each in row if each is not its] for row, its in zip(numbers, chosen, strict=True)]
+    another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
+    doubt = _doubt_of_series(chosen, np.unique(degrees), doubt, words=words, another=another)
+    if doubt:
+        doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
+    plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
+    return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
+
+
+def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
+    """The number of each name that may be its angle, fewer than names where some have none; and whether by a word."""
+    worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
+    if any(worded):
+        return [row[0] for row in worded if len(row) == 1], True
+    return [match for stem in stems if (match := _THOUSANDTHS.search(stem))] or _with_signs(numbers), False
+
+
+def _doubt_of_series(
+    chosen: list[re.Match[str]], distinct: NDArray[np.float64], doubt: str, *, words: bool, another: bool
+) -> str:
+    """Why the numbers of a series may be no angles; "" where they are.
+
+    Args:
+        distinct: degrees, ascending.
+        doubt: of their signs and decimals.
+        words: a word stands beside them.
+        another: another number differs from name to name, and counts no images.
+    """
+    counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
+    uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
+    if words and counted:
+        return "the number beside the word counts the images"
+    if not words and uneven:
+        return doubt or "the numbers that have signs are in no even steps within a turn"
+    if distinct.size < _DISTINCT * len(chosen):
+        return doubt or f"{len(chosen)} names give only {distinct.size} angles; are signs or decimals lost?"
+    return doubt
+
+
+def _without(name: str, angle: re.Match[str]) -> str:
+    folder, slash, stem = name.rpartition("/")
+    stem, dot, suffix = stem.rpartition(".")
+    return f"{folder}{slash}{(stem[: angle.start()] + stem[angle.end() :]).rstrip('_- =()')}{dot}{suffix}"
+
+
+def _with_signs(numbers: list[list[re.Match[str]]]) -> list[re.Match[str]]:
+    """The one number that has a minus in some names and none in others; empty where there is no such, or several."""
+    alike = len({len(row) for row in numbers}) == 1
+    columns = [[*column] for column in zip(*numbers, strict=True)] if alike else []
+    signed = [column for column in columns if 0 < sum(map(_is_minus, column)) < len(column)]
+    return signed[0] if len(signed) == 1 else []
+
+
+def _is_minus(number: re.Match[str]) -> bool:
+    return _MINUS.match(number["mark"] or "") is not None
+
+
+def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
+    """Degrees, and why they may be others; "" where they are sure."""
+    degrees = np.array([float(re.sub("[,p_]", ".", each["value"].lower())) for each in chosen])
+    before = [each.string[: each.start("mark" if each["mark"] else "value")] for each in chosen]
+    minus = np.array([*map(_is_minus, chosen)])
+    if minus.all():
+        if _separates(chosen, before, zero=0 in degrees):
+            minus[:] = False
+        elif (mark := _mark(chosen[0])) in "mn-\u2013":
+            what = mark if mark in "mn" else "hyphen"
+            return degrees, f"the {what} before the number may be a minus sign, or separate"
+    if doubt := _doubt_of_decimals(chosen, before):
+        return degrees, doubt
+    if len({re.sub(r"\d+", "", text) for text in before}) > 1:
+        return degrees, "names differ before the angle, as by a sign that was replaced"
+    return np.where(minus, -degrees, degrees), ""
+
+
+def _mark(number: re.Match[str]) -> str:
+    return number["mark"].rstrip("_ ").lower()
+
+
+def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
+    """Whether the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
+    stands before 0. A hyphen in some names only is a sign."""
+    wholes = [each["whole"] for each in chosen]
+    padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
+    return all(text[-1:].isalnum() for text in before) and (_mark(chosen[0]) in "mn" or (zero and padded))
+
+
+def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
+    """Why what stands beside the points of the numbers, or beside the numbers, may be no decimals, or some."""
+    parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
+    if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
+        return "one side of their point or comma counts the images"
+    following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
+    for beside in (following, [_PRECEDING.search(text) for text in before]):
+        halves = np.sort([int(each[1]) for each in beside if each])
+        if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
+            return "the number beside each counts no images; are the two a whole number and its decimals?"
+    return ""
+
+
+def _in_even_steps(ascending: NDArray[Any]) -> bool:
+    """Whether the steps of all numbers but a few are alike; some images may be lost."""
+    steps = np.diff(ascending)
+    return bool(steps.all() and np.mean(np.abs(steps - np.median(steps)) < _ALIKE * np.median(steps)) > _EVEN)

@@ -1,0 +1,285 @@
+"""NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it, and as `nxtomo` reads ours.
+
+What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import datasets, hdf5
+from beamline.storage.datasets import require_real
+from beamline.storage.readers.base import WHOLE, NotUsed, Quantity, ScanSource, count_in_blocks, frame_indices
+from beamline.storage.readers.fields import NXTOMO, UPRIGHT, stated_in
+from beamline.storage.readers.nexus import (
+    Places,
+    choose,
+    differing,
+    find,
+    read_energies,
+    read_energy,
+    read_geometry,
+    require_order,
+)
+from beamline.storage.structure import drawn_on
+from beamline.storage.writers import layout
+from drivers.base.frame import FrameKind
+from recon.base.arrays import Mask
+
+_S = TypeVar("_S", bound="NexusSource")
+_T = TypeVar("_T")
+
+
+def guarded(method: Callable[[_S], _T]) -> Callable[[_S], _T]:
+    """The method, with h5py's errors as DataError."""
+
+    @wraps(method)
+    def read(self: _S) -> _T:
+        with hdf5.readable(self.path):
+            return method(self)
+
+    return read
+
+
+class NexusSource(ScanSource):
+    """A scan with the structure of NXtomo; see ScanSource."""
+
+    def __init__(self, path: Path, file: h5py.File, own_angles: bool = True, data: str | None = None) -> None:
+        """Read the open file. `own_angles` False: the caller brings the angles, so the file's may be absent or without
+        units.
+
+        `data` is where the frames are, of several detectors; None: of the only one, or the file's default.
+        """
+        self.path, self._file, self._own_angles, self.n = path, file, own_angles, 0
+        self._mirrored_by, self._remarks = (False, False), dict[str, str]()
+        found = find(file)
+        self._places = places = choose(file, found, data)
+        self._check()
+        shape = places.data.shape
+        self.shape = (int(shape[1]), int(shape[2]))
+        self.dtype = places.data.dtype
+        definition = datasets.text_at(places.entry, "definition") or datasets.attribute(places.entry, "definition")
+        self.format = _format(definition, datasets.text_at(places.entry, "program_name"))
+        self.quantity = _quantity(datasets.text_at(file, "/entry/record/quantity"), self.dtype)
+        self.energy_kev = read_energy(places.entry)
+        # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
+        self.axis_col = datasets.scalar(file, "/entry/record/axis_col", {"pixel": 1.0})
+        self._read_stated(found if data is None else [])
+
+    def _read_stated(self, found: list[Places]) -> None:
+        """What the file states of the scan, and the state of its frames.
+
+        Args:
+            found: scans of the file, of which those that are not read are named.
+        """
+        geometry = read_geometry(self._places)
+        self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
+        self.pixel_size_mm, height = geometry.pixel_mm
+        self.row_pitch_mm = differing(height, self.pixel_size_mm)
+        self.pixel_mask = self._mask()
+        self.refresh()
+        self._find_unused(found, geometry.turned)
+        self.energies, self.currents = read_energies(self._places.entry, self.n), self._currents()
+
+    def _mask(self) -> Mask | None:
+        """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
+        item = datasets.dataset(self._places.detector, "pixel_mask")
+        if item is None or item.shape[-2:] != self.shape or item.dtype.kind not in "uib":
+            return None
+        if item.size != self.shape[0] * self.shape[1]:
+            return None
+        mask = np.asarray(datasets.values_of(item)).reshape(self.shape) != 0
+        upside_down, left_to_right = self._mirrored_by
+        return mask[:: -1 if upside_down else 1, :: -1 if left_to_right else 1]
+
+    def _check(self) -> None:
+        finer = datasets.dataset(self._places.detector, "image_key_control")
+        for item in (self._places.data, self._places.image_key, finer):
+            if item is not None:
+                require_real(item.dtype, f"{item.name} in {self.path}")
+        datasets.require_possible(self._places.data)
+        require_order(self._places)
+        lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
+        if lost:
+            raise DataError(
+                f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
+            )
+
+    @guarded
+    def refresh(self) -> int:
+        finer = datasets.dataset(self._places.detector, "image_key_control")
+        n = int(self._places.data.shape[0])
+        self._read_rows(self._places.image_key if finer is None else finer, n, n)
+        return n
+
+    def _read_rows(self, key: h5py.Dataset, n: int, most: float) -> None:
+        """Kind, angle and exposure of the first n frames. DataError: there are fewer of one of them, or more than
+        `most`."""
+        places = self._places
+        angles = datasets.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
+        keys = np.ravel(datasets.values_of(key))
+        sizes = (int(places.data.shape[0]), keys.size, angles.size)
+        if min(sizes) < n or max(sizes) > most:
+            raise DataError(
+                f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
+            )
+        known = np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW)  # which is never written
+        self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
+        self._judge_rows(n)
+        self.n, self.angles = n, angles[:n]
+        seconds = self._seconds(places.detector, "count_time")
+        self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
+
+    def _judge_rows(self, n: int) -> None:
+        """Correct the kinds of the first n frames by what else the file holds of them: here by nothing."""
+
+    @property
+    def frame_bytes(self) -> int:
+        return datasets.bytes_unpacked(self._places.data)
+
+    @property
+    @guarded
+    def attributes(self) -> dict[str, str | float | int]:
+        """Further metadata: sample, title, times."""
+        entry = self._places.entry
+        facts: dict[str, str | float | int] = {}
+        for name, where in TEXTS.items():
+            value = datasets.text_at(entry, where)[: datasets.NAME]
+            if value:
+                facts[name] = value
+        for name, where, units in NUMBERS:
+            number = datasets.scalar(entry, where, units)
+            if number is not None:
+                facts[name] = number
+        if "exposure_s" not in facts and np.isfinite(self.exposures).any():
+            facts["exposure_s"] = float(np.nanmedian(self.exposures))
+        facts |= self._remarks
+        if self._places.angle_problem:
+            facts["angles"] = f"unknown: {self._places.angle_problem}"
+        if self._places.data.is_virtual:
+            facts["parts"] = ", ".join(name for name, _ in drawn_on(self._places.data.id.get_create_plist()))
+        return facts
+
+    def _currents(self) -> NDArray[np.float64] | None:
+        item = datasets.dataset(self._places.entry, "control/data")
+        if item is None or item.dtype.kind not in "uif" or item.size < self.n:
+            return None
+        values = np.ravel(datasets.values_of(item))[: self.n].astype(np.float64)
+        return np.where(values > 0, values, np.nan)
+
+    def _find_unused(self, found: list[Places], turned: str) -> None:
+        """Fields, other scans in the file, and turns of the detector that are stated and not used."""
+        self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
+            shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
+            why = f"it is another scan of this file: --data-path {where}"
+            self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
+        if turned:
+            self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
+
+    @property
+    @guarded
+    def times(self) -> NDArray[np.float64] | None:
+        seconds = self._seconds(self._places.entry, "frame_log/time")
+        seconds[[*self.altered]] = np.nan
+        return seconds if np.isfinite(seconds).any() else None
+
+    @property
+    @guarded
+    def triggers(self) -> NDArray[np.int64]:
+        return self._logged("trigger", count_in_blocks(self.image_key))
+
+    @property
+    @guarded
+    def framestamps(self) -> NDArray[np.int64]:
+        return self._logged("framestamp", np.full(self.n, -1))
+
+    def _logged(self, name: str, default: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Whole numbers [frame] of the log, -1 where the record is altered."""
+        rows = self._column(f"frame_log/{name}", default)[: self.n].astype(np.int64)
+        rows[[*self.altered]] = -1
+        return rows
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        indices, (upside_down, left_to_right) = frame_indices(frames, self.n), self._mirrored_by
+        kept = range(self.shape[0])[rows]
+        if upside_down or left_to_right:
+            return self._mirrored(indices, kept, upside_down, left_to_right)
+        out = np.empty((indices.size, len(kept), self.shape[1]), self.dtype)
+        datasets.read_frames(self._places.data, indices, rows, out)
+        return out
+
+    def _mirrored(
+        self, indices: NDArray[np.int64], rows: range, upside_down: bool, left_to_right: bool
+    ) -> NDArray[Any]:
+        kept = [self.shape[0] - 1 - row for row in rows] if upside_down else list(rows)
+        first, end = (min(kept), max(kept) + 1) if kept else (0, 0)
+        block = np.empty((indices.size, end - first, self.shape[1]), self.dtype)
+        datasets.read_frames(self._places.data, indices, slice(first, end), block)
+        return block[:, [row - first for row in kept], :: -1 if left_to_right else 1]
+
+    def _item(self, group: h5py.Group, path: str) -> h5py.Dataset | None:
+        """A dataset as it is now; None without it."""
+        return datasets.dataset(group, path)
+
+    def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
+        item = self._item(self._places.entry, path)
+        if item is None:
+            return default
+        values = np.asarray(datasets.values_of(item))
+        return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
+
+    def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
+        """Seconds of each frame; NaN where the file states none."""
+        values = datasets.in_units(self._item(group, path), datasets.TIME_UNITS)
+        if values is None or 1 != values.size < self.n:
+            return np.full(self.n, np.nan)
+        return np.full(self.n, values[0]) if values.size == 1 else values[: self.n]
+
+    def close(self) -> None:
+        self._file.close()
+
+
+TEXTS = {
+    "sample": "sample/name",
+    "title": "title",
+    "definition": "definition",
+    "program": "program_name",
+    "start_time": "start_time",
+    "end_time": "end_time",
+    "instrument": "instrument/name",
+}
+NUMBERS = (
+    ("exposure_s", "record/exposure", datasets.TIME_UNITS),
+    ("period_s", "record/period", datasets.TIME_UNITS),
+    ("no_data", "record/no_data", {"": 1.0}),
+    ("saturation", "instrument/detector/saturation_value", {"": 1.0}),  # as NXdetector has it
+    ("saturation", "record/saturation", {"": 1.0}),
+    ("distance_mm", "instrument/detector/distance", datasets.LENGTH_UNITS),
+    ("source_distance_mm", "record/source_distance", datasets.LENGTH_UNITS),
+    ("sample_diameter_mm", "sample/diameter", datasets.LENGTH_UNITS),
+)
+
+
+def _format(definition: str, program: str) -> str:
+    if definition == layout.FLOAT_DEFINITION:
+        return "float_projections"
+    if program.startswith("GDA"):
+        return "diamond_nexus"
+    return "nxtomo" if definition == layout.NXTOMO else "nexus"
+
+
+def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
+    if said == "line_integrals":
+        return "line_integrals"
+    return (
+        "counts" if said == "counts" or (not said and dtype.kind in "iu") else "unknown"
+    )  # NXtomo: data are integers, as detected

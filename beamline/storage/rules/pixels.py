@@ -1,0 +1,132 @@
+"""Rules on what the values of pixels are: counts, transmission or line integrals, as the scan says, and measured."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.digest import LARGEST
+from beamline.storage.hdf5 import UnreadableError
+from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules import Finding
+from drivers.base.frame import FrameKind
+from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
+from recon.base.views import spread
+
+CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
+_SAMPLES = 4  # frames of a kind that are looked at
+SHAPES = 32  # views whose shape is looked at
+_FALLS = (
+    "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
+    "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
+)
+_DIMS = (
+    "The values are far above 1 at the edges of the views and fall where the sample is, as counts do; line integrals "
+    "are 0 there and rise. Say --quantity counts, with --darks and --flats; or divide them by the light without a "
+    "sample, and say --quantity transmission."
+)
+_NEGATIVE = (
+    "The values are 0 at the edges of the views and below 0 where the sample is, as the logarithm of transmission is; "
+    "line integrals are its negative, and rise there. Write them with the other sign."
+)
+_RISES = (
+    "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
+    "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
+)
+
+
+def quantity_stated(source: ScanSource) -> Iterator[Finding]:
+    """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
+    if source.quantity == "unknown":
+        note = source.attributes.get("quantity")
+        note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
+        yield Finding(
+            "error",
+            "quantity",
+            f"{note_text} whether pixels are counts, transmission or line integrals: say --quantity counts, "
+            "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
+        )
+
+
+def darks_measured(source: ScanSource) -> Iterator[Finding]:
+    """Darks are images of the camera: no two of its pixels read the same without light."""
+    darks = sample(source, FrameKind.DARK) if source.dtype.kind in "ui" else None
+    if darks is not None and darks.min() == darks.max():
+        yield Finding(
+            "info",
+            CONSTANT_DARKS,
+            f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
+            "light. If its darks were taken, give them with --darks.",
+        )
+
+
+def pixels_measured(source: ScanSource) -> Iterator[Finding]:
+    """Projections hold finite numbers that are not all the same."""
+    views = sample(source, FrameKind.PROJECTION)
+    if views is None:
+        return
+    finite = np.abs(views, dtype=np.float64) <= LARGEST
+    if not finite.any():
+        message = f"No finite pixel in the projections looked at: they are all NaN, infinite or beyond {LARGEST:g}."
+        yield Finding("error", "pixels", message)
+    elif float(views[finite].min()) == float(views[finite].max()):
+        yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
+    elif not finite.all():
+        yield Finding(
+            "warning",
+            "pixels",
+            f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
+        )
+    if source.quantity == "line_integrals" and (problem := _not_line_integrals(source)):
+        yield Finding("error", "quantity", problem)
+    elif source.quantity == "line_integrals" and look_like_counts(views):
+        yield Finding(
+            "warning",
+            "pixels",
+            f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
+            "If so, say --quantity counts, with darks and flats.",
+        )
+    elif source.quantity == "counts" and _rises(source):
+        yield Finding("error", "quantity", _RISES)
+
+
+def _falls(source: ScanSource) -> bool:
+    """The views look like transmission, which real numbers can be."""
+    views = sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
+    return views is not None and look_like_transmission(views)
+
+
+def _not_line_integrals(source: ScanSource) -> str:
+    """What the values are that are given as line integrals; "": they may be."""
+    views = sample(source, FrameKind.PROJECTION, SHAPES)
+    if views is None:
+        return ""
+    if source.dtype.kind == "f" and look_like_transmission(views):
+        return f"Transmission is given as line integrals. {_FALLS}"
+    if look_like_light(views):
+        return f"Light is given as line integrals. {_DIMS}"
+    return _NEGATIVE if look_negative(views) else ""
+
+
+def _rises(source: ScanSource) -> bool:
+    """The views look like line integrals, though they are to be divided by a beam of about 1."""
+    flats = sample(source, FrameKind.FLAT) if source.dtype.kind == "f" else None
+    if flats is None or not 0.5 < np.nanmedian(flats) < 2:
+        return False
+    views = sample(source, FrameKind.PROJECTION, SHAPES)
+    return views is not None and look_like_transmission(np.exp(-np.maximum(views, -1)))
+
+
+def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
+    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
+    rows = np.flatnonzero(source.image_key == kind)
+    if rows.size == 0:
+        return None
+    rows = spread(rows, count)
+    middle = source.shape[0] // 2
+    images = read_known(source, rows, slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    known = ~np.isin(rows, sorted(source.unreadable))
+    if not known.any():
+        raise UnreadableError(next(iter(source.unreadable.values())))
+    return images[known]
