@@ -166,7 +166,7 @@ class Acquisition:
                 self._supervision.pass_ended()
             ended_before = False
             passes = replace(passes, retakes=self._supervision.n_retakable(missing_views(self._done)))
-            if not (passes.to_come or passes.wide or passes.retakes):
+            if not (passes.to_come or passes.retakes):
                 return
             choice = next_pass(passes)
             if choice is Choice.ENOUGH and not self._stop.stopping:
@@ -227,14 +227,14 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind, or
-        these at the start alone, and only that its views are enough stops it.
+        """A stopped scan with projections still needs this block: only that its views are enough stops it, or there are
+        no darks or flats of this block's kind yet.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {taken.block.kind for taken in self._done if taken.frames}
-        needed = self._stop.enough or block.kind not in kinds
-        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and needed
+        no_reference = block.kind in REFERENCES and block.kind not in kinds
+        return FrameKind.PROJECTION in kinds and (self._stop.enough or no_reference)
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""

@@ -168,6 +168,8 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     ran = Ran(tmp_path, instrument, *PASSES[1:], *asks, live=live((1.0, 0.1, None)), heard=react)
     assert ran.error is None
     assert seen == [("asking", False), ("paused", False), ("goes on", False), ("asking", False)]
+    said = [event.data.get("message") for event in ran.of("state") if event.data["state"] == State.ASKING]
+    assert said == ["", "The scan asks again what to measure next"]
     assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
     ran.assert_good_file(12, "complete")
 
