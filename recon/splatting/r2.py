@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
 import numpy as np
 
-from recon.assess.time_model import PRESETS, best_steps
+from recon.assess.time_model import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
-from recon.base.choices import Quality
+from recon.base.choices import Quality, Start
+from recon.base.declared_types import Checked, Count, Natural, NonNegative
+from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count, first_volume, place
-from recon.splatting.settings import DensityPolicy, growth
+from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.voxels.methods import PnpDct
@@ -29,7 +31,7 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
 
 @dataclass(frozen=True, eq=False)
-class R2(FitMethod):
+class R2(Checked):
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
@@ -64,6 +66,43 @@ class R2(FitMethod):
         error_bars=(2.2, 0.1),
     )
 
+    steps: Natural | None = None
+    seconds: NonNegative | None = None
+    gaussians: Count | Gaussians | None = None
+    start: Start = "fbp"
+    early_stop: bool = False
+    finish: Natural | None = None
+    allow_negative: bool = False
+    fit: FitSettings = field(default_factory=FitSettings)
+
+    @property
+    def planned_steps(self) -> int | None:
+        """Number of steps that end the fit; None if only `seconds` do."""
+        return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
+
+    @property
+    def by_content(self) -> bool:
+        """Whether held-out views decide if the fit is worthwhile."""
+        given = self.steps is not None or self.seconds is not None or self.finish is not None
+        return not (given or self.early_stop or isinstance(self.gaussians, Gaussians))
+
+    @property
+    def least_steps(self) -> int | None:
+        return MODEL_STEPS if self.by_content else self.planned_steps
+
+    def as_candidate(self) -> Self:
+        """The fit that competes with methods on voxels: it is run, whatever they predict."""
+        return replace(self, steps=self.planned_steps) if self.by_content else self
+
+    def for_trial(self, share: float, of_steps: float) -> Self:
+        """The fit alone, of this share of the rows, with this share of the steps."""
+        steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
+        return replace(self.for_part(share, 1.0), steps=steps, finish=0)
+
+    @property
+    def finish_sweeps(self) -> int:
+        return FINISH_SWEEPS if self.finish is None else self.finish
+
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_fit(self, problem, control)
 
@@ -79,6 +118,15 @@ class R2(FitMethod):
             raise ValueError("a fit that follows a scan starts from a number of Gaussians, not from a model")
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
+    def for_part(self, share: float, of_time: float) -> Self:
+        """The fit of this share of a volume: its share of the Gaussians, in this share of the seconds."""
+        count, seconds = self.gaussians, self.seconds
+        return replace(
+            self,
+            gaussians=max(1, round(share * count)) if isinstance(count, int) else count,
+            seconds=None if seconds is None else of_time * seconds,
+        )
+
     def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
         """The fit from Gaussians that are placed here, within the seconds `left` afterwards."""
         field = Grid.of_field(geometry, geometry.sample_pitch)
@@ -87,6 +135,11 @@ class R2(FitMethod):
         volume = first_volume(projections, geometry, field)
         placed = place(volume, projections, geometry, self.gaussians, rng, kernel=self.fit.kernel)
         return replace(self, steps=best_steps(self.name), seconds=max(0.0, left()), gaussians=placed)
+
+    @property
+    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+        assert not isinstance(self.gaussians, Gaussians)
+        return self.fit, {"start": self.start, "gaussians": self.gaussians or 0}
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         preset = PRESETS[quality]
