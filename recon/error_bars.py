@@ -100,8 +100,8 @@ def error_bars(
         difference, made = refitted
     gradient = _gradient(volume.data)
     decide = Decisions(problem.seed, decided)
-    # The noise of FBP knows no edges.
-    limits = decide(_LIMITS, lambda: _limits(gradient, 1 if method.traits.direct else _CLASSES))
+    classes = 1 if method.traits.direct else _CLASSES  # the noise of FBP knows no edges
+    limits = decide(_LIMITS, lambda: _limits(gradient, classes))
     np.square(difference, out=difference)
     variance = _averaged(difference, gradient, limits)
     variance *= np.float32(factors[0] ** 2)
@@ -129,7 +129,8 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
     made_by = (FistaTv(), PnpDct()) if isinstance(method, FitMethod) else (method,)
-    return max(one.memory(geometry, grid, True) for one in made_by) + 4 * (2 * rays + 5 * voxels)
+    work = max(one.memory(geometry, grid, True) for one in made_by)
+    return work + 4 * (2 * rays + 5 * voxels)
 
 
 def alternating(geometry: Geometry) -> F32:
@@ -142,7 +143,8 @@ def alternating(geometry: Geometry) -> F32:
 
 def _alternating(method: Method, problem: ReconProblem) -> F32:
     """Half the difference of the FBPs of both halves of the views."""
-    signed = masked(problem.projections, problem.use.weights)[0] * alternating(problem.geometry)[:, None, None]
+    filled = masked(problem.projections, problem.use.weights)[0]
+    signed = filled * alternating(problem.geometry)[:, None, None]
     return direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
 
 

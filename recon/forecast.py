@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
 from recon.base.volume import Grid
@@ -166,7 +167,8 @@ class Timing:
         return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
     def _of_fit(self, method: FitMethod) -> Forecast:
-        pace = self.fit_pace(method.as_candidate())
+        usual = method.as_candidate()
+        pace = self.fit_pace(usual)
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})
         rendered = 2 * _RENDER * self._geometry.n_views * pace.each / method.fit.views_per_step
@@ -215,7 +217,8 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
     across = np.arange(width) - (width - 1) / 2
     lines = np.sqrt(np.maximum((0.35 * width) ** 2 - across**2, 0)) / width
     noise = np.random.default_rng(0).standard_normal((views.n_views, height, width), np.float32)
-    return ReconProblem(lines.astype(np.float32) + _NOISE * noise, views, box, DataUse(), 0, "cpu")
+    data: F32 = lines.astype(np.float32) + _NOISE * noise
+    return ReconProblem(data, views, box, DataUse(), 0, "cpu")
 
 
 def _work(geometry: Geometry, grid: Grid) -> float:

@@ -124,7 +124,8 @@ def _views_like(geometry: Geometry | None) -> Geometry:
     else:
         turn = 2 * np.pi if missing_arc(geometry) == 0 else np.pi
         pitch = geometry.pixel_pitch * geometry.detector_shape[1] / _SHAPE[1]  # the same field
-        views = Geometry.cone(np.linspace(0, turn, _VIEWS, endpoint=False), _SHAPE, pitch, geometry.sod, geometry.sdd)
+        angles = np.linspace(0, turn, _VIEWS, endpoint=False)
+        views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
         leaning = (geometry.roll != 0) | (geometry.tilt != 0) | geometry.centres.any(axis=1)
         # If only some views lean, the same holds here.

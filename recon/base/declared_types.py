@@ -104,7 +104,8 @@ def plain(value: Any) -> Any:
 
 def is_of_type(value: Any, kind: Any) -> bool:
     """Whether a value is of a declared type."""
-    return any(_fits(plain(value), each) for each in _alternatives(kind))
+    alternatives = _alternatives(kind)
+    return any(_fits(plain(value), each) for each in alternatives)
 
 
 def _alternatives(kind: Any) -> list[Any]:

@@ -128,7 +128,8 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     step = -(-max(data.shape) // _SIDE)
     slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
     parts = [np.asarray(part, np.float64) for part in slices]
-    low, high = matter_window(np.concatenate([part[np.isfinite(part)] for part in parts]))
+    values = np.concatenate([part[np.isfinite(part)] for part in parts])
+    low, high = matter_window(values)
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
     left = 0
     for part in parts:

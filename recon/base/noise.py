@@ -112,7 +112,8 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     reach = half + 0.5 + float(np.ptp(axis))
     off = reach * geometry.sample_pitch / geometry.sod
     bound = reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
-    few = power[np.abs(np.fft.fftfreq(count) * count)[:, None] > bound]
+    free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
+    few = power[free]
     return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf
 
 

@@ -179,7 +179,8 @@ class AirSums:
         if p.size < 2 * t.shape[1]:
             return air
         left = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
-        return np.asarray(air & (np.abs(left) <= _CLIPPED * max(median_deviation(left[air]), 1e-12)))
+        spread = median_deviation(left[air])
+        return np.asarray(air & (np.abs(left) <= _CLIPPED * max(spread, 1e-12)))
 
 
 def _around(values: F64, width: int) -> F64:

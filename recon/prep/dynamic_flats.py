@@ -67,7 +67,8 @@ class DynamicFlats:
         share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral is proportional to one over this
         targets, columns = [], []
         for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
-            first, second = _shifted(axis, min(_APART, view.shape[axis] - 1))
+            apart = min(_APART, view.shape[axis] - 1)
+            first, second = _shifted(axis, apart)
             step = max(1, 2 * view.size // _SAMPLED)
             weight = np.minimum(share[first], share[second])
             change = (self.components[:, *second] - self.components[:, *first]) * weight
@@ -144,7 +145,8 @@ def view_memory(flats: int, pixels: int) -> int:
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
     """The logarithm of a flat over the mean, without its level; 0 in unused pixels."""
-    shape = np.log(np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0)))
+    ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))
+    shape = np.log(ratio)
     return np.asarray(np.where(good, shape - shape[good].mean(), 0), np.float32)
 
 

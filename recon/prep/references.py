@@ -82,7 +82,8 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
     Args:
         darks: (exposure, image [row, col]), one or more, of different exposures.
     """
-    (first, image), *others = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
+    near = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
+    (first, image), *others = near
     if not others or first == exposure:
         return image
     second, other = others[0]
@@ -158,7 +159,8 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
-    return np.asarray(ndimage.binary_dilation(left | right[:, ::-1], np.ones((5, 5))))
+    found = left | right[:, ::-1]
+    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))))
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:

@@ -60,7 +60,8 @@ class Distortion:
     def seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
         """Position on the detector at which the lens shows (col, row)."""
         x, y = col - self.col, row - self.row
-        scale = np.polynomial.polynomial.polyval(np.hypot(x, y), self.factors)
+        r = np.hypot(x, y)
+        scale = np.polynomial.polynomial.polyval(r, self.factors)
         return self.col + x * scale, self.row + y * scale
 
 

@@ -235,7 +235,8 @@ def _by_operations(
         state.residual = _running(state.residual, backend.misfit(seen.image, target, weights))
         if share > 1:
             slope /= share
-        backend.add_lengths(seen.backward(slope), share * geometry.detector_shape[1] / 2, state.statistic)
+        centres = seen.backward(slope)
+        backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
         loss = loss + value / share  # type: ignore[operator]
     if box is not None:
         loss = loss + _smooth(problem, settings, weight, run, box.grid(problem.grid))
@@ -322,7 +323,8 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     fresh = change.keep.size
     if origin.size == 0:
         return  # all Gaussians are faint, as in empty views: later views may need them
-    grown = dict(zip(NAMES, (change.means, change.log_scales, p["quaternions"][origin], change.raw), strict=True))
+    parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
+    grown = dict(zip(NAMES, parts, strict=True))
     order = _order(grown)
     if state.mean is not None:
         for name, new in grown.items():

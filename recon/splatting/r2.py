@@ -143,7 +143,8 @@ class R2(Checked):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         preset = PRESETS[quality]
-        return replace(self, steps=preset.steps, gaussians=max(1, round(preset.share * default_count)))
+        count = max(1, round(preset.share * default_count))
+        return replace(self, steps=preset.steps, gaussians=count)
 
     def toy(self) -> Self:
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)

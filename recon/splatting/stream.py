@@ -247,7 +247,8 @@ class StreamingFit:
         if self._problem is None or self._state is None:
             return
         self._problem = replace(self._problem, geometry=replace(self._problem.geometry, axis_col=float(axis_col)))
-        shift = shift_with_axis(self._problem.geometry.angles, moved * self._template.sample_pitch)
+        theta = self._problem.geometry.angles
+        shift = shift_with_axis(theta, moved * self._template.sample_pitch)
         for parameters in (self._state.parameters, self._state.mean):
             if parameters is not None:
                 parameters["means"][:, :2] -= shift

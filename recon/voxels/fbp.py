@@ -238,7 +238,8 @@ def _shares_of(plan: FbpPlan, rows: F64, shares: F64) -> F32:
     seen = seen_by(plan.geometry, rows)
     if seen.all():
         return plan.share
-    return np.stack([slice_weights(plan.geometry, some, shares) for some in seen.T], axis=1).astype(np.float32)
+    weights = [slice_weights(plan.geometry, some, shares) for some in seen.T]
+    return np.stack(weights, axis=1).astype(np.float32)
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:

@@ -286,7 +286,8 @@ def towards_views(
 
 def noise_of_volume(problem: VoxelProblem) -> float:
     """Standard deviation that the noise of the views leaves in a volume after the steps of a round."""
-    data = np.random.default_rng(0).normal(0, 1, problem.data.shape).astype(np.float32)
+    rng = np.random.default_rng(0)
+    data = rng.normal(0, 1, problem.data.shape).astype(np.float32)
     if problem.weight is not None:
         np.divide(data, np.sqrt(problem.weight), out=data, where=problem.weight > 0)
         data[problem.weight == 0] = 0

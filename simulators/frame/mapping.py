@@ -52,7 +52,8 @@ def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[st
     kind = entry.get("kind") if isinstance(entry, Mapping) else entry
     if not isinstance(kind, str) or kind not in legal:
         raise SceneError(f"{where}: {unknown('kind', kind, legal)}")
-    return kind, ({key: value for key, value in entry.items() if key != "kind"} if isinstance(entry, Mapping) else {})
+    rest = {key: value for key, value in entry.items() if key != "kind"} if isinstance(entry, Mapping) else {}
+    return kind, rest
 
 
 def choose(where: str, choices: Mapping[str, type[Any]], entry: Any) -> Any:

@@ -135,10 +135,15 @@ def expose(scene: Scene, shot: Shot) -> NDArray[np.uint16]:
         shot: the conditions; the same shot gives the same frame.
     """
     chain = scene.chain
-    electrons = chain.apply(Domain.PHOTONS, _photons(scene, shot), shot) if shot.beam else np.zeros(shot.detector.shape)
+    if shot.beam:
+        photons = _photons(scene, shot)
+        electrons = chain.apply(Domain.PHOTONS, photons, shot)
+    else:
+        electrons = np.zeros(shot.detector.shape)
     electrons = chain.apply(Domain.ELECTRONS, electrons, shot)
     electrons /= shot.conversion
-    return digitise(chain.apply(Domain.COUNTS, electrons, shot), largest_count(shot.readout, shot.binning))
+    counts = chain.apply(Domain.COUNTS, electrons, shot)
+    return digitise(counts, largest_count(shot.readout, shot.binning))
 
 
 def _photons(scene: Scene, shot: Shot) -> Image:

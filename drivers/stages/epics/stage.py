@@ -179,7 +179,8 @@ class EpicsStage(LineStage):
         arrived = target is None or self._is_at_target(status)
         if status.done and not (arrived or self._stops.came_since):
             # It says that it is done, and is not there: look whether it stands.
-            until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, max(timeout, CREEP))
+            longest = max(timeout, CREEP)
+            until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, longest)
             status = self._status()
             arrived = self._is_at_target(status)
         counts, aim = self._counts_of(status), self._aim

@@ -111,7 +111,8 @@ class PiGcsAxis:
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
-        return PiAxisStatus(counts, homed, servo, f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}")
+        in_words = f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
+        return PiAxisStatus(counts, homed, servo, in_words)
 
     def limit_switch(self) -> str:
         """The limit switch that is on, in words; "" without one, or for a model with an unknown register."""

@@ -136,4 +136,5 @@ class PiGcsSettings(Wiring, StageFigures):
         if min(math.degrees(self.max_speed), math.degrees(self.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
         run_up = 1 if self.first_pulse is PiFirstPulse.STEP_AFTER else 0
-        return self.limits_with(self.acceleration, 2 * self.firmware_pulse, run_up=run_up, tolerance=self.tolerance)
+        spacing = 2 * self.firmware_pulse
+        return self.limits_with(self.acceleration, spacing, run_up=run_up, tolerance=self.tolerance)

@@ -253,7 +253,8 @@ class PM16CChannel:
         rate = self._line.ask(f"RTE?{c}", r"\d+", "an acceleration code")[0]
         speed = self._line.ask(f"SPDH?{c}", r"\d+", "pulses/s")[0]
         selected = self._line.ask(f"SPD?{c}", "([HML])SPD", "the selected speed")[1]
-        self.found.values = {"RTE": f"{int(rate):03d}", "SPDH": str(int(speed)), "SPD": selected, "SETCH": channels}
+        values = {"RTE": f"{int(rate):03d}", "SPDH": str(int(speed)), "SPD": selected, "SETCH": channels}
+        self.found.values = values
 
     def _restore(self) -> None:
         """Set back what opening and moves have changed; not while a motor moves, which then refuses it."""

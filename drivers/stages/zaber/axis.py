@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import re
 from dataclasses import dataclass
 
 from drivers.base.clock import Clock
@@ -107,7 +108,8 @@ class ZaberAxis:
             self._must_have_checksum = True
         number = self._get_if_known("device.id") or self.ask("get deviceid", WHOLE).data
         identity = Identity(number, self.ask("get system.serial", WHOLE).data, self.ask("get version", NUMBER).data)
-        self.flags_at_opening = tuple(flag for flag in self.standing("opening").flags if flag != INTERRUPTED)
+        flags = self.standing("opening").flags
+        self.flags_at_opening = tuple(flag for flag in flags if flag != INTERRUPTED)
         self.found.values = {setting: self.get(setting) for setting in KEPT}
         if checksums is not None:
             self.found.values[CHECKSUM] = checksums
@@ -130,7 +132,8 @@ class ZaberAxis:
 
     def status(self) -> ZaberAxisStatus:
         reply = self.ask_axis("get pos", WHOLE)
-        return ZaberAxisStatus(int(reply.data), reply.busy, self._flags("warnings") if reply.flag else (), reply.raw)
+        flags = self._flags("warnings") if reply.flag else ()
+        return ZaberAxisStatus(int(reply.data), reply.busy, flags, reply.raw)
 
     def standing(self, purpose: str) -> ZaberAxisStatus:
         """The status; refuses `purpose` while the axis moves."""
@@ -204,4 +207,5 @@ class ZaberAxis:
         state = "A move was started before; the stage may be turning" if self._commanded else "Nothing has moved"
         identity = next(self._ids)
         request, meaning = encode(self._device, axis, identity, words), f"the reply to message {identity:02d}"
-        return reply_of(self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state))
+        match: re.Match[str] = self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state)
+        return reply_of(match)

@@ -155,7 +155,8 @@ class AsdPocs(VoxelMethod):
             sweeps.run(x, self.relaxation * self.decay**k, problem.nonnegative, problem.rng)
             combine(1.0, x, -1.0, before, before)
             swept = math.sqrt(dot(before, before))
-            error = math.sqrt(replace_by_residual(problem.data, projector.forward_lines(x), problem.weight)) / scale
+            model = projector.forward_lines(x)
+            error = math.sqrt(replace_by_residual(problem.data, model, problem.weight)) / scale
             if k == 0:
                 step = self.alpha * swept
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:

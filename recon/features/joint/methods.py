@@ -102,7 +102,8 @@ class _History:
 
     def tell(self, sweep: int, residual: float) -> None:
         """Record and report a sweep of the fit."""
-        reached = Progress(sweep, self.sweeps, self.control.now() - self.began, residual, residual, 0, self.n_views)
+        seconds = self.control.now() - self.began
+        reached = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
         self.of_sweeps = (*self.of_sweeps, reached)
         self.control.tell(reached)
 

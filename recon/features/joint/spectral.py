@@ -204,5 +204,6 @@ def weights_by_views(
     weights = trials.common(after=_HEAVIER)
     components = np.arange(len(weights))
     if trials.going:
-        weights = trials.heaviest(weights, np.where((components > 0) | alike, 2.0, 1.0), _HEAVIER, after=0)
+        factor = np.where((components > 0) | alike, 2.0, 1.0)
+        weights = trials.heaviest(weights, factor, _HEAVIER, after=0)
     return weights

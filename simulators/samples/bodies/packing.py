@@ -178,7 +178,8 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
         elif p.kind[i] == ELLIPSOID:
             reach = np.linalg.norm(np.linalg.solve(p.matrix[i].T, axis.T), axis=0)
         else:
-            reach = -(axis @ p.vertices[p.first_vertex[i] : p.first_vertex[i + 1]].T).min(axis=1)
+            corners = p.vertices[p.first_vertex[i] : p.first_vertex[i + 1]]
+            reach = -(axis @ corners.T).min(axis=1)
         gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
         if not gap > 1e-9 * sod:
             raise CannotExposeError(

@@ -136,7 +136,8 @@ class GcsAxis(MovedAxis):
         if not self.build.low <= degrees <= self.build.high:
             raise GcsError(7)
         self._target = degrees
-        self._begin(round(degrees * self.per_degree) + self._zero, self.velocity)
+        counts = round(degrees * self.per_degree) + self._zero
+        self._begin(counts, self.velocity)
         for place, act in ((self.build.stall_at, self._stalled), (self.build.switch_at, self._ran_into_switch)):
             way = self.move.direction * ((place or 0) - self.move.start)
             if place is not None and 0 < way < abs(self.move.target - self.move.start):

@@ -105,7 +105,8 @@ def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 
     """A velocity or acceleration in degrees, above 0."""
 
     def do(box: PiGcsBox, arguments: list[str]) -> None:
-        setattr(box.axis, attribute, _number(box.axis_of(arguments, 1)[0], 1e-9, highest(box.axis.build), error))
+        value = _number(box.axis_of(arguments, 1)[0], 1e-9, highest(box.axis.build), error)
+        setattr(box.axis, attribute, value)
 
     return do
 

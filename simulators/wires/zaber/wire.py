@@ -80,7 +80,8 @@ class PacketReader:
         body, colon, checksum = line[1:].partition(b":")
         if colon and checksum.decode("ascii").upper() != lrc(body):
             return None
-        command = _command(body.decode("ascii"))
+        text = body.decode("ascii")
+        command = _command(text)
         if command.id and not (command.id == "--" or int(command.id) <= 99):
             return Malformed(Command(command.address, command.axis, "", command.words), "BADMESSAGEID")
         if any(len(word) > LONGEST_WORD for word in command.words):
