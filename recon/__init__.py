@@ -28,10 +28,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_held_out import axis_by_views
-    from recon.features.iterative.methods import AsdPocs as AsdPocs
-    from recon.features.iterative.methods import Cgls as Cgls
-    from recon.features.iterative.methods import Sart as Sart
-    from recon.features.iterative.methods import Sirt as Sirt
+    from recon.features.iterative.methods import AsdPocs, Cgls, Sart, Sirt
     from recon.features.joint.energy_fit import EnergyViews
     from recon.features.joint.learnt_motion import register_energies
     from recon.features.joint.methods import TimeSeries

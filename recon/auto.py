@@ -25,7 +25,7 @@ from recon.base.method import (
     Traits,
 )
 from recon.base.volume import Grid
-from recon.splatting.finish import FIRST_SHARE, Candidates, beyond_voxels, level_of
+from recon.splatting.finish import FIRST_SHARE, beyond_voxels, level_of
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
@@ -141,7 +141,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
     None if nothing can be held out or projected, with the reason.
     """
     geometry, (rows, cols) = problem.geometry, problem.geometry.detector_shape
-    data, weights = problem.projections, problem.use.weights
+    data = problem.projections
     if geometry.n_views < LEAST_VIEWS:
         return None, f"{geometry.n_views} views are too few to hold any out"
     if not geometry.is_cone:
@@ -151,25 +151,15 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         return _of_rows(problem, taken, *slab_of(geometry, problem.grid, taken.start, taken.stop))
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
-    middle = _middle_rows(problem, height)
-    if middle is not None:
-        return middle
-    filled = masked(data, weights)[0]
+    some = masked(data[:: max(1, len(data) // 8)])[0]
+    if (middle := middle_of_cone(geometry, problem.grid, some, height)) is not None:
+        return _of_rows(problem, *middle)
+    filled = masked(data, problem.use.weights)[0]
     views = geometry.binned(2)
     coarse = replace(
         problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse()
     )
     return coarse, "binned 2 x 2"
-
-
-def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
-    """The middle rows of a cone, so many, and the box that holds their rays; None if they have little matter."""
-    some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
-    middle = middle_of_cone(problem.geometry, problem.grid, some, height)
-    if middle is None:
-        return None
-    rows, views, box = middle
-    return _of_rows(problem, rows, views, box)
 
 
 def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) -> tuple[ReconProblem, str]:
@@ -261,7 +251,8 @@ class Auto:
         if fit is not None:
             listen = control.on_progress if control.decide is None else None  # in a slab only slices are counted
             tried = trials_of(fit, problem, replace(control, on_progress=listen), self.least_gain)
-            residuals = [_residuals_in(tried, method) for method in self.candidates]
+            of_voxels = {Fbp: tried.direct, FistaTv: tried.smooth, PnpDct: tried.patches}
+            residuals = [of_voxels.get(type(method), tried.fit) for method in self.candidates]
             at = cheapest_not_led(residuals, self.least_gain)
             if at is not None:
                 decide.preset(tried.prior)
@@ -305,12 +296,6 @@ def _judged_beside(method: Method) -> bool:
         case PnpDct():
             return method.patch_threshold is None
     return isinstance(method, Fbp)
-
-
-def _residuals_in(tried: Candidates, method: Method) -> F64 | None:
-    """What the method leaves of views held out; None: it was not tried."""
-    of_voxels = {Fbp: tried.direct, FistaTv: tried.smooth, PnpDct: tried.patches}
-    return of_voxels.get(type(method), tried.fit)
 
 
 def _ended_early(fit: FitMethod, seconds: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
@@ -152,7 +152,8 @@ def _refitted(
     method: Method, problem: ReconProblem, volume: Volume, decided: Mapping[str, Sequence[Any]], control: RunControl
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
-    refit = _refit(method)
+    assert isinstance(method, IterativeMethod)
+    refit: IterativeMethod = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     data, known = masked(problem.projections, problem.use.weights)
@@ -182,17 +183,6 @@ def _refitted(
     more -= less
     more *= np.float32(0.5 / _EXTRA)
     return more, follow
-
-
-class _Refit(IterativeMethod, Method, Protocol):
-    """A method that continues from a volume."""
-
-
-def _refit(method: Method) -> _Refit:
-    """The method of the refits, with fewer iterations."""
-    assert isinstance(method, IterativeMethod)
-    refit: _Refit = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
-    return refit
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:

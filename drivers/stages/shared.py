@@ -1,4 +1,4 @@
-"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
+"""Shared code of the stages: lines, positions by their travel, stops, waits until they stand, settings to restore.
 
 Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
 program that is killed leaves its speed in the controller, and the next one would take it for the original.
@@ -10,12 +10,15 @@ import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import RotationStage, StageLimits
+from drivers.serial.line import LineRules, Probe, SerialLine
+from drivers.stages.settings import Wiring
 from drivers.stages.travel import Travel
 
 
@@ -120,6 +123,19 @@ class Stops:
             raise problem
 
 
+def line_to(wiring: Wiring, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
+    return SerialLine(
+        url,
+        LineRules(probe, **rules),
+        clock,
+        device=name,
+        timeout=wiring.timeout,
+        baudrate=wiring.baudrate,
+        transcript=wiring.transcript,
+    )
+
+
 POLL = 0.02  # s between two status queries of a moving stage
 STOP_MARGIN = 2.0  # s beyond the longest deceleration after which a stop has failed
 Status = TypeVar("Status")
@@ -174,6 +190,15 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
         advice="Wait for the move to end, or stop it",
         state=f"The move under way goes on; it is at {counts} counts",
     )
+
+
+@dataclass
+class StageOutput:
+    """Implements `drivers.base.protocols.DigitalOutput` by what an open stage's controller is told and asked."""
+
+    name: str
+    set: Callable[[bool], None]
+    get: Callable[[], bool | None]
 
 
 class LineStage(RotationStage):

@@ -78,3 +78,14 @@ class Stop:
     def cut(self, done: int, planned: int) -> bool:
         """Whether a stop left some of the `planned` steps or iterations undone; 0: no number is planned."""
         return self.stopped and not 0 < planned <= done
+
+
+class GoesOn:
+    """A `go_on` (step, residual) that keeps its last answer in `going`."""
+
+    def __init__(self, go_on: Callable[[int, float], bool]) -> None:
+        self._go_on, self.going = go_on, True
+
+    def __call__(self, step: int, residual: float) -> bool:
+        self.going = self._go_on(step, residual)
+        return self.going

@@ -16,11 +16,7 @@ def thread_count() -> int:
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """As `numba.njit(**options)`; the function is compiled, or read from numba's cache, when it is first used."""
-
-    def decorate(function: Callable[..., Any]) -> _Kernel:
-        return _Kernel(function, options)
-
-    return decorate
+    return lambda function: _Kernel(function, options)
 
 
 class _Kernel:

@@ -61,11 +61,6 @@ class Background:
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
-    @property
-    def may_be_matter(self) -> bool:
-        """Whether the background is positive: weak matter all around the sample would look the same."""
-        return self.level > 0
-
     def remove(self, views: F32, factor: int = 1) -> None:
         """Subtract the surfaces from views [view, row, col], whose pixels are binned by a factor, in place."""
         for view, terms in zip(views, self.coefficients, strict=True):

@@ -21,16 +21,18 @@ from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.adam import adam_all, add_lengths
 from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
-from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
+from recon.kernels.cpu.losses import ABSOLUTE, CpuProjectionLoss, DataTerm
 from recon.kernels.fused_step import FusedStep, StepModel, StepPlan
 
 Array = TypeVar("Array")
 
 
 class SplatView(Protocol[Array]):
-    """One rendered view: its image [row, col] and its backward pass."""
+    """One rendered view and its backward pass."""
 
-    image: Array
+    @property
+    def image(self) -> Array:
+        """[row, col]."""
 
     def backward(self, gradient: Array) -> Array:
         """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
@@ -184,8 +186,10 @@ class Cpu:
             self._scratch = ((n, detector_shape), Scratch.of(n, detector_shape))
         return self._scratch[1]
 
-    def projection_loss(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE) -> CpuLoss:
-        return CpuLoss(shape, ssim_weight, term)
+    def projection_loss(
+        self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
+    ) -> CpuProjectionLoss:
+        return CpuProjectionLoss(shape, ssim_weight, term=term)
 
     def misfit(self, image: F32, target: F32, weights: F32 | None) -> float:
         off = image - target if weights is None else weights * (image - target)
@@ -205,27 +209,15 @@ class CpuPass:
         self._backend, self.active, self._raw, self._unit = backend, active, (quaternions, raw), unit
         self.into = Gradients.zeros(raw.shape[0])
 
-    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> CpuView:
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> RenderedView:
         scratch = self._backend.scratch(len(self.active.densities), geometry.detector_shape)
-        return CpuView(render_view(self.active, geometry, view, faint, cut, model, scratch=scratch), self.into)
+        return render_view(self.active, self.into, geometry, view, faint, cut, model, scratch)
 
     def box(self, grid: Grid, faint: float, cut: float) -> CpuBox:
         return CpuBox(self, grid, faint, cut)
 
     def gradients(self) -> tuple[F32, F32, F32, F32]:
         return self.into.to_raw(*self._raw, self._unit)
-
-
-class CpuView:
-    """A view with the numba kernels."""
-
-    def __init__(self, rendered: RenderedView, into: Gradients) -> None:
-        self._rendered, self._into, self.image = rendered, into, rendered.image
-
-    def backward(self, gradient: F32) -> F32:
-        centres = np.empty((len(self._into.densities), 2), np.float32)
-        self._rendered.backward(gradient, self._into, centres)
-        return centres
 
 
 class CpuBox:
@@ -240,19 +232,3 @@ class CpuBox:
         self._layout.backward(
             gradient, into.means, into.log_scales, into.rotations, into.densities, means_too=means_too
         )  # fmt: skip
-
-
-class CpuLoss:
-    """The fused loss with the numba kernels."""
-
-    def __init__(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm) -> None:
-        self._loss = losses_cpu.CpuProjectionLoss(shape, ssim_weight, term=term)
-        self._slope = np.empty(shape, np.float32)
-
-    def target_maps(self, target: F32, weights: F32 | None = None) -> F32:
-        return self._loss.target_maps(target, weights)
-
-    def __call__(
-        self, image: F32, target: F32, target_maps: F32, weights: F32 | None = None
-    ) -> tuple[float, F32]:  # fmt: skip
-        return self._loss(image, target, target_maps, self._slope, weights), self._slope

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, GoesOn
 from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -234,16 +234,9 @@ def level_of(beyond: F32) -> F32:
 
 def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
-    ended = False
-
-    def first(sweep: int, residual: float) -> bool:
-        nonlocal ended
-        ended = not problem.go_on(sweep, residual)
-        return not ended
-
-    parts = Subsets.of(problem, SUBSETS)
+    first, parts = GoesOn(problem.go_on), Subsets.of(problem, SUBSETS)
     x = ordered_fista(replace(problem, go_on=first), x, weight, parts, sweeps=sweeps, tv_steps=TV_STEPS)
-    if ended or not strength:
+    if not (first.going and strength):
         return x
     further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
     return pnp_dct(further, x, strength, steps=PnpDct.iterations)

@@ -93,10 +93,6 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     return FinishPlan(sweeps, before + sweeps * sweep, trials)
 
 
-def _ignore(progress: Progress) -> None:
-    pass
-
-
 def planned_finish(method: FitMethod, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
     """The finish of a method in its share of the remaining seconds, of which all steps take `steps`.
 
@@ -125,7 +121,7 @@ class LastRound:
     seconds: float
     began: float
     before: Sequence[Progress] = ()
-    on_progress: Callable[[Progress], None] = _ignore
+    on_progress: Callable[[Progress], None] = lambda progress: None
 
     name: ClassVar[str] = "the last round"
     label: ClassVar[str] = "Last round of a fit whose views came one by one"

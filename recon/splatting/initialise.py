@@ -9,8 +9,7 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from recon.base.choices import Filter
-from recon.base.choices import Start as Start
+from recon.base.choices import Filter, Start
 from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
@@ -138,7 +137,8 @@ def first_volume(
     ramp. The device is that of `direct` and of the sweeps.
     """
     projections = without_wild_pixels(projections)
-    if (sweeps := start_method(geometry, start)) is not None:
+    if _swept(geometry, start):
+        sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
         return solve(sweeps, Projector(geometry, grid, device=device), projections)
     ramp: Filter = "ram-lak" if start == "published" else "hann"
     if geometry.is_cone:
@@ -169,11 +169,6 @@ def mean_change(
     unit = density_unit(lines)
     matter = np.count_nonzero(lines > MATTER * unit)
     return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
-
-
-def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
-    """The sweeps that make the first volume; None if FBP or FDK makes it."""
-    return OsSirtTv(iterations=START_SWEEPS, momentum=True) if _swept(geometry, start) else None
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.assess.time_model import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
-from recon.base.choices import Quality
+from recon.base.choices import Quality, Start
 from recon.base.declared_types import Checked, Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
@@ -20,7 +20,7 @@ from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import Start, default_count, first_volume, place
+from recon.splatting.initialise import default_count, first_volume, place
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit

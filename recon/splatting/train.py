@@ -152,10 +152,6 @@ class _Length:
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
-    def is_over(self, spent: float) -> bool:
-        """Whether the seconds are spent."""
-        return self.seconds is not None and spent >= self.seconds
-
     def plan(self, plan: FinishPlan, spent: float) -> None:
         """Reserve time for the finish."""
         self.sweeps, finishing, self.trials = plan
@@ -239,7 +235,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
     volume, model = run.model()
     made_by, sweeps = method.name, 0
     if at < fit_at and not run.stopped:
-        volume, made_by = _of_voxels(run, at)
+        on_voxels = _ON_VOXELS[at](allow_negative=method.allow_negative)
+        volume = on_voxels.run(views.fitted, replace(control, decide=decide)).volume
+        made_by = on_voxels.name
     elif at == fit_at:
         volume, sweeps = _finished(run, volume, model)
     settings, state = run.settings, run.state
@@ -313,7 +311,7 @@ def _steps(run: _Run) -> None:
     done = 0
     while length.steps is None or state.step < length.steps:
         spent = now() - begin
-        if done and (run.stopped or length.is_over(spent)):
+        if done and (run.stopped or (length.seconds is not None and spent >= length.seconds)):
             break
         fit.step(state, run.fitting, run.settings, length.fraction(state.step, spent))
         done += 1
@@ -344,13 +342,6 @@ def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
     if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
         expected = state.step + max(0.0, remaining) / step
         run.settings = in_steps(run.method.fit, min(expected, length.steps or expected))
-
-
-def _of_voxels(run: _Run, at: int) -> tuple[Volume, str]:
-    """The volume of a method on voxels, and its name."""
-    method = _ON_VOXELS[at](allow_negative=run.method.allow_negative)
-    made = method.run(run.views.fitted, replace(run.control, decide=run.decide))
-    return made.volume, method.name
 
 
 def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]:

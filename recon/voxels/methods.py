@@ -9,6 +9,7 @@ from functools import cache, partial
 from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
+from recon.base.decisions import GoesOn
 from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
 from recon.base.geometry import Geometry
@@ -192,20 +193,14 @@ class PnpDct(VoxelMethod):
         return min(self.iterations, PnpDct.iterations)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        ended, sweeps = False, 0 if x.any() else self.first_sweeps
-
-        def first(sweep: int, residual: float) -> bool:
-            nonlocal ended
-            ended = not problem.go_on(sweep, residual)
-            return not ended
-
+        first, sweeps = GoesOn(problem.go_on), 0 if x.any() else self.first_sweeps
         trial = cache(partial(HeldOutTrial.of, problem))
         weight: NoiseBalance | float
         if sweeps:
             x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         else:
             weight = choose_weight(problem, x, self.first_sweeps, trial)
-        if ended:
+        if not first.going:
             return x
         share = self.patch_threshold
         if share is None:

@@ -111,51 +111,24 @@ if "simulators.wires" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("simulators.wires")
 
 
-class _Ports:
-    """The simulated ports of this process: the devices plugged in, and the open ports."""
-
-    def __init__(self) -> None:
-        self._wires: dict[str, Wire] = {}
-        self._open: dict[str, Wire] = {}
-        self._lock = threading.Lock()
-
-    def plug(self, name: str, wire: Wire) -> None:
-        with self._lock:
-            self._wires[name] = wire
-            self._open.pop(name, None)
-
-    def open(self, name: str) -> Wire:
-        with self._lock:
-            if name in self._open:
-                raise SerialException(f"could not open port {SCHEME}{name}: it is open already")
-            if name not in self._wires:
-                known = ", ".join(SCHEME + known for known in sorted(self._wires)) or "none"
-                raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
-            self._open[name] = self._wires[name]
-            return self._wires[name]
-
-    def find(self, name: str) -> Wire | None:
-        with self._lock:
-            return self._wires.get(name)
-
-    def close(self, name: str, wire: Wire) -> None:
-        with self._lock:
-            if self._open.get(name) is wire:
-                del self._open[name]
-
-
-_PORTS = _Ports()  # pyserial gives its handler only the URL, so the names are kept here
+# pyserial gives its handler only the URL, so that the devices plugged in, and the open ports, are kept here by name.
+_WIRES: dict[str, Wire] = {}
+_OPEN: dict[str, Wire] = {}
+_LOCK = threading.Lock()
 
 
 def register(name: str, wire: Wire) -> str:
     """Plug a simulated device in; returns the URL that opens it. It replaces a device of the same name."""
-    _PORTS.plug(name, wire)
+    with _LOCK:
+        _WIRES[name] = wire
+        _OPEN.pop(name, None)
     return SCHEME + name
 
 
 def plugged(url: str) -> Wire | None:
     """The simulated device of a URL, for drivers that exchange no bytes; None if nothing is plugged in there."""
-    return _PORTS.find(url[len(SCHEME) :])
+    with _LOCK:
+        return _WIRES.get(url[len(SCHEME) :])
 
 
 class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no types
@@ -168,7 +141,15 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
         if self.is_open:
             raise SerialException("port is already open")
         self._name = self.port[len(SCHEME) :]
-        self._wire = _PORTS.open(self._name)
+        with _LOCK:
+            if self._name in _OPEN:
+                raise SerialException(f"could not open port {SCHEME}{self._name}: it is open already")
+            if self._name not in _WIRES:
+                known = ", ".join(SCHEME + known for known in sorted(_WIRES)) or "none"
+                raise SerialException(
+                    f"could not open port {SCHEME}{self._name}: no such simulated port; there are {known}"
+                )
+            self._wire = _OPEN[self._name] = _WIRES[self._name]
         self._wire.transmit()  # opening a port drops earlier bytes, as an operating system does
         self._received = bytearray()
         self.is_open = True
@@ -176,7 +157,9 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
     def close(self) -> None:
         if self.is_open:
             self.is_open = False
-            _PORTS.close(self._name, self._wire)
+            with _LOCK:
+                if _OPEN.get(self._name) is self._wire:
+                    del _OPEN[self._name]
 
     @property
     def in_waiting(self) -> int:

@@ -198,7 +198,7 @@ def without_background(
         return "", None
     seen = _described(fitted, levelled)
     # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
-    if order is None and fitted.may_be_matter and fitted.level + levelled > 0:
+    if order is None and fitted.level > 0 and fitted.level + levelled > 0:
         return (
             f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: the "
             f"surface is not taken off. If that is air, give --air surface:{fitted.order}."

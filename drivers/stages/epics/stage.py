@@ -129,11 +129,11 @@ class EpicsStage(LineStage):
             self._standing("a move")
             self._refuse_unless_it_would_go()
             self._target, self._searching = None, False
-            self._write(".VELO", math.degrees(speed))
-            self._write(".ACCL", speed / self.limits.acceleration)
+            self._channel.write(".VELO", math.degrees(speed))
+            self._channel.write(".ACCL", speed / self.limits.acceleration)
             place = target * 360 / self.limits.counts_per_turn
             self._last = f"{self._channel.name}.VAL = {place:.10g}"
-            self._write(".VAL", place)
+            self._channel.write(".VAL", place)
             (refused,) = self._read(".LVIO")
             if refused.value:
                 raise DeviceRefused(
@@ -158,7 +158,7 @@ class EpicsStage(LineStage):
             self._standing("a search for the reference")
             self._refuse_unless_it_would_go()
             self._last = f"{self._channel.name}{self._settings.search.field} = 1"
-            self._write(self._settings.search.field, 1)
+            self._channel.write(self._settings.search.field, 1)
         self._target, self._searching = None, True
 
     def moving(self) -> bool:
@@ -275,9 +275,6 @@ class EpicsStage(LineStage):
         for suffix, value in zip(suffixes, values, strict=True):
             refuse_invalid(self.name, self._channel.name + suffix, value, "Whether it moves is not known")
         return values
-
-    def _write(self, suffix: str, value: float) -> None:
-        self._channel.write(suffix, value)
 
     def _standing(self, purpose: str) -> None:
         status = self._status()

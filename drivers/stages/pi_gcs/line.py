@@ -9,9 +9,10 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line import Probe, line_to
+from drivers.serial.line import Probe
 from drivers.serial.line_reader import Framing
 from drivers.stages.settings import Wiring
+from drivers.stages.shared import line_to
 
 STOPPED = 10
 NOT_ALLOWED_TO_MOVE = 5
@@ -231,20 +232,3 @@ class GcsLine:
 
     def _state(self) -> str:
         return "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
-
-
-class GcsOutput:
-    """Implements `drivers.base.protocols.DigitalOutput` on the line of an open stage.
-
-    `DIO?` reads the inputs [from memory: of GCS controllers in general], so that an output cannot be read back.
-    """
-
-    def __init__(self, line: GcsLine, number: int, name: str) -> None:
-        self.name = name
-        self._line, self._number = line, number
-
-    def set(self, high: bool) -> None:
-        self._line.set(f"DIO {self._number} {int(high)}")
-
-    def get(self) -> None:
-        return None

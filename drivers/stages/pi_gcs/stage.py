@@ -14,9 +14,9 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
-from drivers.stages.pi_gcs.line import EVENTS, MOTION, STOPPED, GcsLine, GcsOutput, advice, meaning
+from drivers.stages.pi_gcs.line import EVENTS, MOTION, STOPPED, GcsLine, advice, meaning
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings, is_spent_by, window_of
-from drivers.stages.shared import POLL, LineStage, found_at_opening, refuse_another, until_standing
+from drivers.stages.shared import POLL, LineStage, StageOutput, found_at_opening, refuse_another, until_standing
 
 
 class PiGcsStage(LineStage):
@@ -133,10 +133,14 @@ class PiGcsStage(LineStage):
             **self._travel.described(),
         }
 
-    def digital_output(self, number: int) -> GcsOutput:
+    def digital_output(self, number: int) -> StageOutput:
         if number == self._settings.trigger_line:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
-        return GcsOutput(self._line, number, f"{self.name} output {number}")
+        return StageOutput(
+            f"{self.name} output {number}",
+            lambda high: self._line.set(f"DIO {number} {int(high)}"),
+            lambda: None,  # `DIO?` reads the inputs [from memory: of GCS controllers in general]
+        )
 
     def _release(self) -> None:
         with closing(self._line):

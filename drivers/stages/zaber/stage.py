@@ -14,7 +14,7 @@ from dataclasses import replace
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.shared import LineStage, found_at_opening, refuse_another, until_standing
+from drivers.stages.shared import LineStage, StageOutput, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
@@ -93,20 +93,6 @@ class ZaberPulses:
 
 def _nowhere(counts: int) -> None:
     """Does nothing: a chained train may be set up at any place of the stage."""
-
-
-class ZaberOutput:
-    """A digital output of an open stage's device. Implements `drivers.base.protocols.DigitalOutput`."""
-
-    def __init__(self, axis: ZaberAxis, number: int, name: str) -> None:
-        self.name = name
-        self._axis, self._number = axis, number
-
-    def set(self, high: bool) -> None:
-        self._axis.ask(f"io set do {self._number} {int(high)}")
-
-    def get(self) -> bool:
-        return self._axis.ask(f"io get do {self._number}", "[01]").data == "1"
 
 
 STANDING_IN_PLACE = 10.0  # s beyond twice the time of a short move after which it has failed
@@ -246,10 +232,16 @@ class ZaberStage(LineStage):
             **self._travel.described(),
         }
 
-    def digital_output(self, number: int) -> ZaberOutput:
+    def digital_output(self, number: int) -> StageOutput:
         if number == self._pulses.settings.output:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
-        return ZaberOutput(self._axis, number, f"{self.name} output {number}")
+
+        def set_to(high: bool) -> None:
+            self._axis.ask(f"io set do {number} {int(high)}")
+
+        return StageOutput(
+            f"{self.name} output {number}", set_to, lambda: self._axis.ask(f"io get do {number}", "[01]").data == "1"
+        )
 
     def _release(self) -> None:
         with contextlib.suppress(DeviceError):
@@ -274,7 +266,7 @@ class ZaberStage(LineStage):
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
         if status.flags:
-            self._axis.forget_flags()
+            self._axis.ask_axis("warnings clear")
         self._told = frozenset()
 
     def _send_stop(self, hard: bool) -> str:

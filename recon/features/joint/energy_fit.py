@@ -109,7 +109,7 @@ def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid
     return rows, slab_of(views.geometry, grid, rows.start, rows.stop)[1]
 
 
-class _StoppedError(Exception):
+class StoppedError(Exception):
     """`stop` interrupted a step."""
 
 
@@ -204,13 +204,13 @@ class EnergyFit:
         """Write minus the gradient of the views of a subset at z into `out`. Returns their weighted sum of squares.
 
         Raises:
-            _StoppedError: `stop` said so.
+            StoppedError: `stop` said so.
         """
         out[...] = 0
         squares, image = 0.0, np.empty(self.z.shape[1:], np.float32)
         for part in subset:
             if self._begun and self.stop():
-                raise _StoppedError
+                raise StoppedError
             image[...] = 0
             for share, component in zip(self._u[part.energy], self.z, strict=True):
                 combine(1.0, image, float(share), component, image)
@@ -236,7 +236,7 @@ class EnergyFit:
             for at, number in enumerate(order):
                 try:
                     squares += self.descent(self.subsets[number], descent)
-                except _StoppedError:
+                except StoppedError:
                     nonnegative_mix(self.z, self._back, self._to)  # momentum may have gone below 0
                     return
                 self._begun = True

@@ -43,11 +43,6 @@ def levels(cols: int) -> list[tuple[int, int]]:
     return [(width, _TURNS[min(n, len(_TURNS) - 1)]) for n, width in enumerate(widths)]
 
 
-def motion_sweeps(cols: int) -> int:
-    """Number of sweeps of `learnt_motion`."""
-    return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
-
-
 class OfMoments(NamedTuple):
     """Views of a changing sample, each assigned to one of some moments.
 
@@ -126,7 +121,7 @@ def learnt_motion(
     views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
-    motion, follow = None, motion_sweeps(cols)
+    motion, follow = None, SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
     for wide, turns in levels(cols):
         some = _binned(alone, wide)
         grid = Grid.matching(some.geometry)

@@ -44,7 +44,8 @@ class TimeSeries(Checked):
     weight: NonNegative | None = None
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        _require_own_grid(problem)
+        if problem.grid != Grid.matching(problem.geometry):
+            raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
         n, times = problem.geometry.n_views, problem.use.times
         times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
@@ -72,7 +73,8 @@ class TimeSeries(Checked):
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+        views = 4 * geometry.n_views * math.prod(geometry.detector_shape)
+        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * views
 
 
 @dataclass
@@ -112,16 +114,6 @@ class _History:
         if not self.of_sweeps:  # it was stopped before
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
-
-
-def _require_own_grid(problem: ReconProblem) -> None:
-    if problem.grid != Grid.matching(problem.geometry):
-        raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
-
-
-def _bytes_of(geometry: Geometry) -> int:
-    """Bytes of all line integrals."""
-    return 4 * geometry.n_views * math.prod(geometry.detector_shape)
 
 
 def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:

@@ -22,7 +22,7 @@ from recon.base.arrays import F32, F64
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
-from recon.features.joint.energy_fit import EnergyViews, trial_rows
+from recon.features.joint.energy_fit import EnergyViews, StoppedError, trial_rows
 from recon.features.joint.motion import conjugate_gradients
 from recon.features.joint.spectral import Materials
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
@@ -32,10 +32,6 @@ _IN_TIME = 0.03  # τ
 SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # of conjugate gradients
 TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
 """Steps of all trials, at most."""
-
-
-class _StoppedError(Exception):
-    """`stop` interrupted a step."""
 
 
 @dataclass
@@ -96,7 +92,7 @@ class Proportions:
     def _each_kind(self) -> Iterator[tuple[Projector, NDArray[np.intp], F64]]:
         for kind in self._kinds:
             if self.stop():
-                raise _StoppedError
+                raise StoppedError
             yield kind
 
     def shown(self, factors: F32) -> F32:
@@ -147,7 +143,7 @@ class Proportions:
             go_on: asked before each step. False ends it.
         """
         found = factors.copy()
-        with suppress(_StoppedError):
+        with suppress(StoppedError):
             mean = float(np.vdot(self.explained(self.shown(self.ones())).sum(0), self.matter))
             weight = np.float32(smooth * mean / max(len(factors) * float(np.vdot(self.matter, self.matter)), 1e-30))
 
@@ -169,7 +165,7 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
     """
     factors, tried, worse = first, list[tuple[float, F64]](), 0
     best = np.full(judge.data.shape[0], np.inf)
-    with suppress(_StoppedError):
+    with suppress(StoppedError):
         for trial in range(_TRIALS):
             smooth = _HEAVIEST / _LIGHTER**trial
             factors = fit.solved(smooth, factors, go_on, _TRIAL_STEPS)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
+from recon.base.decisions import GoesOn
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
@@ -166,16 +167,10 @@ def fit_series(
     learnt, unseen = _motion(coarse, OfMoments(energies, past, weights), motion, go_on, stop)
     smooth = None if learnt is not None else smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
-    going = True
-
-    def heard(sweep: int, residual: float) -> bool:
-        nonlocal going
-        going = go_on(sweep, residual)
-        return going
-
+    heard = GoesOn(go_on)
     volumes, residual = fitted(fit, weights, sweeps, heard)
     made = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
-    return made if smooth is None or not going or stop() else _as_factors(made, fit, smooth, go_on)
+    return made if smooth is None or not heard.going or stop() else _as_factors(made, fit, smooth, go_on)
 
 
 def _refuse_gaps(times: F64, knots: F64) -> None:
@@ -249,15 +244,9 @@ def smooth_factors(
     rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
-    going = True
-
-    def heard(sweep: int, residual: float) -> bool:
-        nonlocal going
-        going = go_on(sweep - sweeps - TRIAL_STEPS, residual)
-        return going
-
+    heard = GoesOn(lambda sweep, residual: go_on(sweep - sweeps - TRIAL_STEPS, residual))
     free, residual = fitted(fit, weights, sweeps, heard)
-    if not going or stop():
+    if not heard.going or stop():
         return None
     problem = _of_factors(views.select(np.arange(held_out.size), rows), free, grid, stop)
     seen, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))

@@ -109,6 +109,7 @@ class RenderedView:
     Attributes:
         image: line integrals [row, col].
         active: the Gaussians about the view's centre; neither they nor `scratch` may change before `backward`.
+        into: what `backward` adds to.
         camera: the view.
         length: see `RayModel.length`.
         scratch: holds the table of footprints.
@@ -118,15 +119,17 @@ class RenderedView:
 
     image: F32
     active: Active
+    into: Gradients
     camera: RayCamera
     length: float
     scratch: Scratch
     exact: NDArray[np.intp]
     rays: CpuRays | None
 
-    def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
-        """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
-        a, table = self.active, self.scratch.table
+    def backward(self, gradient: F32) -> F32:
+        """Add an image gradient [row, col] to `into`; returns the gradient on centres [n, 2] in pixels."""
+        a, into, table = self.active, self.into, self.scratch.table
+        centres = np.empty((len(into.densities), 2), np.float32)
         under = moments(table, gradient, self.scratch.moments, a.kernel)
         added = into.means, into.log_scales, into.rotations, into.densities
         if self.camera.is_wide:
@@ -138,7 +141,7 @@ class RenderedView:
                 length=self.length, kernel=a.kernel,
             )  # fmt: skip
         if self.rays is None:
-            return
+            return centres
         some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
         self.rays.backward(gradient, some.means, some.log_scales, some.rotations, some.densities, moved)
         centres[self.exact] = moved
@@ -146,43 +149,41 @@ class RenderedView:
         into.log_scales[self.exact] += some.log_scales
         into.rotations[self.exact] += some.rotations
         into.densities[self.exact] += some.densities
+        return centres
 
 
 def render_view(
     active: Active,
+    into: Gradients,
     geometry: Geometry,
     view: int,
     faint: float,
     sigmas: float,
-    model: RayModel | None = None,
-    *,
-    image: F32 | None = None,
-    scratch: Scratch | None = None,
+    model: RayModel,
+    scratch: Scratch,
 ) -> RenderedView:
-    """Render the line integrals of one view into `image` [row, col]; `faint` in the same unit.
+    """Render the line integrals of one view; `faint` in the same unit.
 
-    `image` and `scratch` are overwritten (None: new ones). A view that shares `scratch` must have run `backward` before
-    the next one is rendered.
+    `scratch` is overwritten. A view that shares it must have run `backward` before the next one is rendered.
     """
-    chosen, shape, a = model or RayModel(), geometry.detector_shape, seen_from(active, geometry, view)
-    picture = np.empty(shape, np.float32) if image is None else image
-    buffers = Scratch.of(len(a.densities), shape) if scratch is None else scratch
-    projection, length = camera(geometry, view), chosen.length(geometry)
+    shape, a = geometry.detector_shape, seen_from(active, geometry, view)
+    picture = np.empty(shape, np.float32)
+    projection, length = camera(geometry, view), model.length(geometry)
     footprints(
-        a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, buffers.table,
-        length=length, exact_above=chosen.exact_above, kernel=a.kernel,
+        a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, scratch.table,
+        length=length, exact_above=model.exact_above, kernel=a.kernel,
     )  # fmt: skip
     if projection.is_wide:
-        widen(buffers.table, a.means, projection, faint, sigmas, a.kernel)
-    render(buffers.table, picture, buffers.layers, a.kernel)
+        widen(scratch.table, a.means, projection, faint, sigmas, a.kernel)
+    render(scratch.table, picture, scratch.layers, a.kernel)
     exact, rays = np.empty(0, np.intp), None
-    if geometry.is_cone and chosen.exact_above < math.inf:
-        exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
+    if geometry.is_cone and model.exact_above < math.inf:
+        exact = np.flatnonzero(scratch.table[:, HU] == INEXACT)
     if exact.size:
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
         rays = CpuRays(some, projection, shape, faint, sigmas, a.kernel)
         rays.add_to(picture)
-    return RenderedView(picture, a, projection, length, buffers, exact, rays)
+    return RenderedView(picture, a, into, projection, length, scratch, exact, rays)
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:

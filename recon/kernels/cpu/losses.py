@@ -200,6 +200,7 @@ class CpuProjectionLoss:
         self._halves = np.zeros((-(-rows // TASK_ROWS), 3, self._width + 2 * MARGIN), np.float32)
         self._partials = np.empty((3, rows, self._width), np.float32)
         self._sums = np.empty(rows, np.float64)
+        self._slope = np.empty((rows, self._width), np.float32)
 
     def _wide(self, image: F32) -> F32:
         if image.shape[1] == self._width:
@@ -217,16 +218,14 @@ class CpuProjectionLoss:
         return out
 
     def __call__(
-        self, image: F32, target: F32, target_maps: F32, gradient: F32, weights: F32 | None = None
-    ) -> float:  # fmt: skip
-        """The loss; `gradient` [row, col] receives its derivative with respect to `image`.
+        self, image: F32, target: F32, target_maps: F32, weights: F32 | None = None
+    ) -> tuple[float, F32]:  # fmt: skip
+        """The loss, and its derivative with respect to `image` [row, col], which the next call may overwrite.
 
         `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
         """
         pixels = image.size
         x, y, cols = self._wide(image), self._wide(target), self._cols
-        whole = gradient.shape == x.shape and gradient.flags.c_contiguous
-        slope = gradient if whole else np.empty_like(x)
         w, seen = None, x
         if weights is not None:
             w = self._wide(weights)
@@ -238,11 +237,11 @@ class CpuProjectionLoss:
         share = 1.0 if weights is None else float(weights.mean(dtype=np.float64))
         weight = self.ssim_weight / pixels
         _combine(
-            x, y, w, cols, self._partials, self.window, self.term, 1.0 / pixels, weight, self._halves, slope, self._sums
-        )
-        if not whole:
-            gradient[...] = slope[:, :cols]
-        return float(self._sums.sum()) / pixels + self.ssim_weight * (share - ssim)
+            x, y, w, cols, self._partials, self.window, self.term, 1.0 / pixels, weight, self._halves, self._slope,
+            self._sums,
+        )  # fmt: skip
+        loss = float(self._sums.sum()) / pixels + self.ssim_weight * (share - ssim)
+        return loss, np.ascontiguousarray(self._slope[:, :cols])
 
 
 @njit(**OPTIONS)

@@ -11,9 +11,10 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from drivers.base.clock import Clock
+from drivers.stages.pi_gcs.settings import PiFirstPulse
 from simulators.devices.motion import MovedAxis, TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.output import Firmware, FirstPulse, PiOutput, WiredOutput
+from simulators.wires.pi_gcs.output import Firmware, PiOutput, WiredOutput
 
 REFERENCE_VELOCITY = 5.0  # degrees/s
 
@@ -36,7 +37,7 @@ class PiAxisBuild:
         referenced: its zero is the reference switch already; else its zero is where it was found.
         reference_switch, limit_switches: it has them.
         reference_fails: a reference move ends with error 45.
-        first_pulse: see `FirstPulse`.
+        first_pulse: see `PiFirstPulse`.
         pulse_width: s that the firmware holds a pulse.
         rising: the camera in the trigger output takes rising edges, else falling ones.
         servo_period: s; positions are compared and read once a period. 0 compares at every instant.
@@ -55,7 +56,7 @@ class PiAxisBuild:
     reference_switch: bool = True
     limit_switches: bool = True
     reference_fails: bool = False
-    first_pulse: FirstPulse = FirstPulse.AT_THRESHOLD
+    first_pulse: PiFirstPulse = PiFirstPulse.AT_THRESHOLD
     pulse_width: float = 50e-6
     rising: bool = True
     servo_period: float = 0.0

@@ -111,17 +111,14 @@ def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 
     return do
 
 
-def _reference(kind: str) -> Action:
+def _act(act: Callable[[GcsAxis], None]) -> Action:
+    """What the axis does at once, without a value."""
+
     def do(box: PiGcsBox, arguments: list[str]) -> None:
         box.axis_of(arguments)
-        box.axis.reference(kind)
+        act(box.axis)
 
     return do
-
-
-def _brake(box: PiGcsBox, arguments: list[str]) -> None:
-    box.axis_of(arguments)
-    box.axis.brake()
 
 
 def _halt(box: PiGcsBox, arguments: list[str] | None = None) -> None:
@@ -229,9 +226,9 @@ COMMANDS: dict[str, Action] = {
     "SAI?": lambda box, arguments: [box.name],
     "SVO": _switch(lambda box, on: box.axis.switch_servo(on)),
     "SVO?": _of_axis(lambda box: f"{box.axis.servo():d}"),
-    "FRF": _reference("FRF"),
-    "FNL": _reference("FNL"),
-    "FPL": _reference("FPL"),
+    "FRF": _act(lambda axis: axis.reference("FRF")),
+    "FNL": _act(lambda axis: axis.reference("FNL")),
+    "FPL": _act(lambda axis: axis.reference("FPL")),
     "FRF?": _of_axis(lambda box: f"{box.axis.referenced:d}"),
     "TRS?": _of_axis(lambda box: f"{box.axis.build.reference_switch:d}"),
     "LIM?": _of_axis(lambda box: f"{box.axis.build.limit_switches:d}"),
@@ -250,7 +247,7 @@ COMMANDS: dict[str, Action] = {
     "DEC?": _of_axis(lambda box: _plain(box.axis.deceleration)),
     "SPA": _set_parameter,
     "SPA?": _tell_parameter,
-    "HLT": _brake,
+    "HLT": _act(GcsAxis.brake),
     "STP": _halt,
     "DIO": _put_output,
     "CTO": _set_trigger,

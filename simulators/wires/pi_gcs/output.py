@@ -14,21 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Set
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
+from drivers.stages.pi_gcs.settings import PiFirstPulse
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 
 SLACK = 1e-6  # counts: largest error of a position by the decimals on the wire
-
-
-class FirstPulse(StrEnum):
-    """Where the first pulse comes. The manuals do not say, so the simulation offers each possibility."""
-
-    AT_THRESHOLD = "at_threshold"
-    STEP_AFTER = "step_after"
-    GRID = "grid"
-    """At whole steps from position 0; the window only selects."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +30,7 @@ class Window:
     start: float
     stop: float
     zero: float = 0.0
-    rule: FirstPulse = FirstPulse.AT_THRESHOLD
+    rule: PiFirstPulse = PiFirstPulse.AT_THRESHOLD
 
     @property
     def sign(self) -> int:
@@ -80,7 +71,7 @@ def crossings(window: Window, progress: TrainProgress, begin: float, end: float)
             return
         if ahead(window.start) > 0:
             progress = _entered(window, window.start, sign)
-            if window.rule is FirstPulse.AT_THRESHOLD:
+            if window.rule is PiFirstPulse.AT_THRESHOLD:
                 yield Crossing(window.start, True, progress)
             else:
                 yield Crossing(window.start, False, progress)
@@ -99,7 +90,7 @@ def crossings(window: Window, progress: TrainProgress, begin: float, end: float)
 
 
 def _entered(window: Window, position: float, sign: int) -> TrainProgress:
-    if window.rule is not FirstPulse.GRID:
+    if window.rule is not PiFirstPulse.GRID:
         return TrainProgress(True, position, 0)
     steps = (position - window.zero) / window.step
     nearest = math.ceil(sign * steps - SLACK / window.step)
@@ -124,14 +115,14 @@ class Firmware:
     """Properties that no command changes.
 
     Attributes:
-        first_pulse: see `FirstPulse`.
+        first_pulse: where it comes. The manuals do not say, so each possibility is offered.
         width: s that a pulse is held.
         period: s of a servo cycle; positions are compared once in it. 0 compares at every instant.
         lost: pulses, counted from 0 since power-on, that never reach the cable.
         rising: the camera at the cable's end takes rising edges, else falling ones.
     """
 
-    first_pulse: FirstPulse
+    first_pulse: PiFirstPulse
     width: float
     period: float
     lost: Set[int]

@@ -17,7 +17,7 @@ from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
-from simulators.wires.pi_gcs.output import FirstPulse, PiOutput
+from simulators.wires.pi_gcs.output import PiOutput
 from simulators.wires.wire import BytesWire
 
 OUTPUTS = 4
@@ -62,7 +62,7 @@ class PiGcsBuild:
             counts_per_turn=settings.counts_per_turn,
             low=_degrees(settings.low) - 1,
             high=_degrees(settings.high) + 1,
-            first_pulse=FirstPulse(settings.first_pulse),
+            first_pulse=settings.first_pulse,
             pulse_width=settings.firmware_pulse,
             rising=settings.active_high,
             max_velocity=_degrees(settings.max_speed),

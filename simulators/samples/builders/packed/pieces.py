@@ -69,13 +69,6 @@ _Seconds = Annotated[float, Field(ge=0, le=1e6)]
 _Over = Annotated[float, Field(gt=0, le=1e6)]
 
 
-class ChangeInTime(Protocol):
-    """A change of a sample with time."""
-
-    def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
-        """The pieces at this time since the camera was connected. ValueError: pieces that do not change so."""
-
-
 @dataclass(frozen=True)
 class Settle:
     """All matter sinks towards the lowest point, and holes shrink as much: a foam that loses gas and liquid.

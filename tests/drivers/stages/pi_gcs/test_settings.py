@@ -8,7 +8,7 @@ import pytest
 
 from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from simulators.wires.pi_gcs.output import FirstPulse
+from drivers.stages.pi_gcs.settings import PiFirstPulse
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 
@@ -17,10 +17,10 @@ def rig() -> Rig:
     return Rig()
 
 
-@pytest.mark.parametrize("rule", list(FirstPulse))
+@pytest.mark.parametrize("rule", list(PiFirstPulse))
 @pytest.mark.parametrize(("first", "step", "n"), [(250, 25, 10), (500, 5, 1), (-500, -100, 6), (375, 125, 30)])
 def test_wherever_the_firmware_puts_the_first_pulse_a_train_is_at_its_counts(
-    rule: FirstPulse, first: int, step: int, n: int
+    rule: PiFirstPulse, first: int, step: int, n: int
 ) -> None:
     bench = Rig(first_pulse=rule).bench(first_pulse=rule.value, low=math.radians(-20))
     bench.stage.arm(TriggerTrain(first, step, n))
@@ -34,20 +34,20 @@ def test_wherever_the_firmware_puts_the_first_pulse_a_train_is_at_its_counts(
 )
 def test_the_wrong_rule_shows_in_the_number_of_pulses(rule: str, says: str, expected: int) -> None:
     """That is how it is found out at an instrument: one too many, or one too few."""
-    bench = Rig(first_pulse=FirstPulse(rule)).bench(first_pulse=says)
+    bench = Rig(first_pulse=PiFirstPulse(rule)).bench(first_pulse=says)
     bench.stage.arm(bench.train(2.0, 1.0, 3))
     bench.go(20.0)
     assert len(bench.pulses()) == expected
 
 
 def test_a_train_off_the_grid_is_refused_where_the_firmware_has_one() -> None:
-    stage = Rig(first_pulse=FirstPulse.GRID).open(first_pulse="grid")
+    stage = Rig(first_pulse=PiFirstPulse.GRID).open(first_pulse="grid")
     with pytest.raises(DeviceRefused, match="100 counts"):
         stage.arm(TriggerTrain(250, 100, 3))
 
 
 def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_before_it() -> None:
-    rig = Rig(first_pulse=FirstPulse.STEP_AFTER)
+    rig = Rig(first_pulse=PiFirstPulse.STEP_AFTER)
     bench = rig.bench(first_pulse="step_after")
     bench.go(3.0)
     with pytest.raises(DeviceRefused, match=r"2\.5000 deg.*1\.0000 deg"):
