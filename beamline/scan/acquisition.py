@@ -150,6 +150,9 @@ class Acquisition:
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         blocks = [*([unfinished] if unfinished.n_to_take else []), *(wide if choice is Choice.WIDE else [])]
+        if not self._done:  # no references came first, and the choice may
+            self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
+            self._supervision.states.enter(_state_of(views))
         while True:
             again = passes.done[-1] in passes.done[:-1]
             for block in blocks:
@@ -227,14 +230,15 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind, or
-        these at the start alone, and only that its views are enough stops it.
+        """A stopped scan still needs these darks or flats: it took views, and has none of the kind, or its views are
+        enough, so that it is complete. Such a one may have taken all views in earlier files: then it needs those that
+        it has none of.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {taken.block.kind for taken in self._done if taken.frames}
-        needed = self._stop.enough or block.kind not in kinds
-        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and needed
+        reasons = FrameKind.PROJECTION in kinds, block.kind not in kinds, self._stop.enough
+        return block.kind in REFERENCES and sum(reasons) >= 2  # any two of them
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
