@@ -92,7 +92,7 @@ def choose(
     Args:
         offered: with known gains.
         remaining: by all that the plan still has, as of `remaining_gain`.
-        seconds, dose: that the scan has taken; the seconds include what must follow the views.
+        seconds, dose: that the scan has taken, with what follows the passes in any case: wide views, references.
     """
     if wish.quality_db is not None and remaining.mean <= wish.quality_db:
         return Choice.ENOUGH, (
@@ -129,7 +129,9 @@ def next_is_sure(
 
 
 def _excess(option: PassOption, wish: Wish, seconds: float, dose: float) -> str:
-    """Which limit of the wish an option would exceed, in words; "" if none."""
+    """Which limit of the wish an option would exceed, in words; "" if none. Wide views come in any case."""
+    if option.choice is Choice.WIDE:
+        return ""
     seconds, percent = seconds + option.seconds, 100 * (dose + option.dose)
     if wish.seconds is not None and seconds > wish.seconds:
         return f"{option.choice} would end the scan after {seconds:.0f} s; the wish allows {wish.seconds:g} s"

@@ -17,7 +17,7 @@ class Choice(StrEnum):
     AGAIN = "again"  # the angles of the last pass once more, in place of the last pass still to come
     WIDE = "wide"  # the wide views of the plan, now
     RETAKE = "retake"  # views that were flagged, or gave no frame, now
-    ENOUGH = "enough"  # no further view
+    ENOUGH = "enough"  # no further pass; wide views of the plan still come, as they set the density
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Passes:
             case Choice.WIDE:
                 return replace(self, wide=())
             case Choice.ENOUGH:
-                return replace(self, to_come=(), wide=())
+                return replace(self, to_come=())
         return self  # retakes are of no pass
 
 

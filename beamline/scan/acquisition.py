@@ -169,7 +169,7 @@ class Acquisition:
                 self._supervision.pass_ended()
             ended_before = False
             passes = replace(passes, retakes=self._supervision.n_retakable(missing_views(self._done)))
-            if not (passes.to_come or passes.wide or passes.retakes):
+            if not (passes.to_come or passes.retakes):
                 return
             choice = next_pass(passes)
             if choice is Choice.ENOUGH and not self._stop.stopping:

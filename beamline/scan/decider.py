@@ -34,8 +34,8 @@ class Decider:
         seconds_of: duration of a block, from where the stage stands.
         now: the instrument's clock, s.
         began: time of the first frame.
-        added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of what must follow
-            the views.
+        added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of the references
+            that follow the views.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
         why_no_law: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
@@ -151,11 +151,11 @@ class Decider:
         return ErrorLaw(passes.n_frames, *values)
 
     def _spent(self, passes: Passes) -> tuple[float, float]:
-        """Seconds and share of the dose that the scan has taken; the seconds include what must follow the views."""
+        """Seconds and share of the dose that the scan has taken, with what follows the passes in any case."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        frames = passes.n_frames + retaken + wide - sum(block.n_to_take for block in passes.wide)
-        return self.now() - self.began + self.added_seconds, frames * frame_dose(self.timeline)
+        seconds = self.now() - self.began + self.added_seconds + sum(map(self.seconds_of, passes.wide))
+        return seconds, (passes.n_frames + retaken + wide) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait until this is so, but `wait` s at most, and not beyond a stop."""

@@ -7,7 +7,7 @@ file joins them all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from beamline.config.load import NO_LIVE, Config, changed, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
-from beamline.plan.passes import Choice
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
@@ -30,9 +29,9 @@ from beamline.storage.parts import (
     files_with_frames,
     is_joined,
     join,
-    plan_in,
     views_in,
     views_planned,
+    wide_planned,
 )
 from beamline.storage.recover import Recovered, recover, require_ours
 from beamline.storage.run_record import alive
@@ -58,7 +57,7 @@ class ResumableRun:
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files, or decided against.
         planned: views of the whole plan.
-        wide: triggers of the wide views in these files, likewise.
+        wide: triggers of the wide views in these files; wide_missing: how many the plan still has.
         choices: after each pass that ended in them, oldest first.
         choice_due: the last one ended, and nothing was chosen yet.
         seconds: that they took, from the first frame of each to its last one.
@@ -77,6 +76,7 @@ class ResumableRun:
     left_out: tuple[str, ...] = ()
     end_references: frozenset[FrameKind] | None = None
     wide: frozenset[int] = frozenset()
+    wide_missing: int = 0
     choices: tuple[str, ...] = ()
     choice_due: bool = False
     seconds: float = 0.0
@@ -86,9 +86,12 @@ class ResumableRun:
         """The run in one line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
-            kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.end_references))
+            kinds = ["wide views"] if self.wide_missing else []
+            kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
             all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
-            return f"Preparing: {self.run} has all {all_views}, its missing {kinds} of the end are taken now"
+            return (
+                f"Preparing: {self.run} has all {all_views}, its missing {' and '.join(kinds)} of the end are taken now"
+            )
         if self.choices:  # some views were decided against, or are taken twice
             return f"Preparing: {self.run} lacks {missing} of the views that it was to take, which are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
@@ -199,24 +202,16 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     with ExitStack() as opened, hdf5.readable(run):
         each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         missing, choices, due = still_to_take(each)
-        wide, end_references = _wide_stored(each, choices), None if missing else end_references_missing(each)
-    if not missing and not end_references:
+        wide = frozenset[int]().union(*(views_in(file, kind=FrameKind.ALIGNMENT) for file in each))  # written as such
+        wide_missing = wide_planned(each[0]) - len(wide)
+        end_references = None if missing else end_references_missing(each)
+    if not (missing or wide_missing or end_references):
         _refuse_whole(run, parts, closed)
     last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
-        end_references, wide, choices, due, seconds,
+        end_references, wide, wide_missing, choices, due, seconds,
     )  # fmt: skip
-
-
-def _wide_stored(files: Sequence[h5py.File], choices: Sequence[str]) -> frozenset[int]:
-    """Triggers of the wide views that need not be taken: those in the files, or all where the views were enough."""
-    if Choice.ENOUGH in choices:
-        plan = plan_in(files[0])
-        first, n = len(plan["angles_deg"]), plan.get("wide_views", 0) * len(plan.get("wide_places_mm", ()))
-        return frozenset(range(first, first + n))
-    kind = FrameKind.ALIGNMENT  # as which wide views are written
-    return frozenset[int]().union(*(views_in(file, kind=kind) for file in files))
 
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:

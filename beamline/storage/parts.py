@@ -90,6 +90,12 @@ def views_planned(file: h5py.File) -> int | None:
     return None if angles is None else len(angles)
 
 
+def wide_planned(file: h5py.File) -> int:
+    """Number of planned wide views of the scan."""
+    plan = plan_in(file)
+    return int(plan.get("wide_views", 0)) * len(plan.get("wide_places_mm", ()))
+
+
 def plan_in(file: h5py.File) -> dict[str, Any]:
     """The plan of the scan; empty if the file does not hold it."""
     return json_object(file["/entry/record/plan"].asstr()[()]) or {}

@@ -46,8 +46,8 @@ class ErrorLaw:
             noise = min(factor * self.noise, 1 - self.offset)
             offset = self.offset * (max(1 - factor, 0) if wide else 1)
             gaps_and_noise = 1 - noise - self.offset + noise * self.n_views / (self.n_views + again)
-            square = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
-            return -10 * math.log10(square) or 0.0  # never -0.0
+            error_ratio = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
+            return -10 * math.log10(error_ratio) or 0.0  # never -0.0
 
         half_range = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
         return Gain(decibels(1.0), decibels(1 - half_range), decibels(1 + half_range))

@@ -65,11 +65,11 @@ def measured_law(
     """
     n = len(data)
     if geometry.is_cone:
-        raise ValueError("the error of a volume is not measured: the beam is a cone")
+        raise ValueError("the beam is a cone, of which no law of the error is measured")
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
-            f"the error of a volume is not measured: {n} views and {len(open_beam)} frames of the open beam are there, "
-            f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed"
+            f"{n} views and {len(open_beam)} frames of the open beam are there, "
+            f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed to measure the law of the error"
         )
     sample = sample_radius(data, geometry)
     slab = _Slab.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
@@ -78,7 +78,7 @@ def measured_law(
     method = _TotalVariation(slab.chosen_weight())
     volumes = [slab.volume(method, slab.views, used) for used in (half, most)]
     if not volumes[1].any():
-        raise ValueError("the error of a volume is not measured: these views show no matter")
+        raise ValueError("these views show no matter, so that no law of the error is measured")
     copy, second_copy = slab.copies(volumes[1], rng)
     copied = [slab.volume(method, copy, used) for used in (half, most)]
     errors = [slab.square_error(volume, volumes[1]) for volume in copied]

@@ -61,8 +61,8 @@ def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list
     state, done, to_come, steps = State(1), blocks[:1], blocks[1:], list[Step]()
     while True:
         passes = Passes(done, to_come, () if state.wide else wide, _retakes(number, state))
-        if not (passes.to_come or passes.wide or passes.retakes):
-            return steps, state
+        if not (passes.to_come or passes.retakes):
+            return steps, state._replace(wide=bool(wide))
         law = scores.law(number, seed, state)
         offered, remaining = options(passes, law, timeline, seconds_of), remaining_gain(passes, law)
         choice, _ = choose(offered, wish, remaining, 0.0, 0.0)
@@ -79,7 +79,7 @@ def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list
             case Choice.RETAKE:
                 state = state._replace(retaken=True)
             case Choice.ENOUGH:
-                return steps, state
+                return steps, state._replace(wide=bool(wide))
 
 
 def _retakes(number: int, state: State) -> int:

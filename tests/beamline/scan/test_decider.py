@@ -37,9 +37,11 @@ def law(
 class Scan:
     """A decider in a scan that is stood still; `moments` happen one after the other while it waits."""
 
-    def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, **more: Any) -> None:
+    def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, wide: int = 0, **more: Any) -> None:
         instrument = FakeInstrument()
-        plan = replace(instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25)
+        plan = replace(
+            instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25, wide_views=wide, wide_places=(1.0,)[:wide]
+        )
         self.timeline = instrument.worked_out(plan)
         self.moments: list[Callable[[], object]] = []
         self.waited, self.why_no_law = 0, ""
@@ -70,7 +72,8 @@ class Scan:
         self.waited, self.decide.number = 0, n - 1
         blocks = pass_blocks(self.timeline.views, 0)
         done, to_come = blocks[: n - again], blocks[n - again : len(blocks) - again]
-        return self.decide(Passes(done + done[-1:] * again, to_come, (), retakes))
+        wide = tuple(block for block in self.timeline.blocks if block.aside)
+        return self.decide(Passes(done + done[-1:] * again, to_come, wide, retakes))
 
     def of(self, name: str) -> list[dict[str, Any]]:
         return [event.data for event in self.events if event.event == name]
@@ -130,6 +133,16 @@ def test_the_seconds_of_a_wish_are_those_since_the_first_frame_and_what_follows(
     for added, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
         scan = Scan(Wish(seconds=10.5 + takes), added_seconds=added)
         assert scan.after(1, law(12)) is choice
+
+
+def test_wide_views_count_as_taken_as_they_come_in_any_case() -> None:
+    scan = Scan(wide=5)
+    views, wide = pass_blocks(scan.timeline.views, 0)[1], next(block for block in scan.timeline.blocks if block.aside)
+    takes = scan.decide.seconds_of(views) + scan.decide.seconds_of(wide)
+    for wish in (Wish(seconds=10 + takes), Wish(dose=29 / 53)):
+        for less, choice in ((0.999, Choice.ENOUGH), (1.001, Choice.NEXT)):
+            tried = Wish(seconds=wish.seconds and less * wish.seconds, dose=wish.dose and less * wish.dose)
+            assert Scan(tried, wide=5).after(1, law(12)) is choice
 
 
 @pytest.mark.parametrize(("retaken", "choice"), [(0, Choice.NEXT), (2, Choice.ENOUGH)])

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import h5py
 import pytest
 from click.testing import CliRunner
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from beamline.cli.main import main
@@ -61,7 +61,7 @@ def expected(sizes: Sequence[int], answers: Sequence[Choice]) -> list[list[int]]
                 sets.append(wide)
                 wide = []
             case Choice.ENOUGH:
-                return sets
+                break
     return [*sets, wide]  # what nobody chose
 
 
@@ -196,6 +196,7 @@ CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choi
 @pytest.mark.parametrize("mode", ["fly", "step"])
 @settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
+@example(script=[Choice.ENOUGH], cuts=[FIRST + 6])  # in the wide views
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
     chooser = Scripted(script)
@@ -228,6 +229,22 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         assert so_far == [sum(map(len, sets[: i + 1])) for i in range(len(ends))]
         assert len(ends) in (len(decisions), len(decisions) + 1)
         assert [finding for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
+
+
+def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop, instrument, words = StopRequest(), FakeInstrument(), ("scan.flats.at=start", "scan.darks.at=start")
+    with killed(monkeypatch):
+        ran = Ran(tmp_path, FakeInstrument(at={FIRST + VIEWS + 1: stop.abort}), *WORDS, *words, stop=stop)
+    instrument.clock.sleep(1e4)
+    with open_for_resume(ran.folder) as series:
+        assert series.in_words.endswith("has all 12 views, its missing wide views of the end are taken now")
+        run_scan(series.config, series, instrument=instrument.connected())
+    frames = frames_of(ran.folder / "joined.h5")
+    assert [frame.trigger for frame in frames[FIRST:]] == list(range(VIEWS + WIDE))
+    with pytest.raises(NothingMissing), open_for_resume(ran.folder):
+        ...
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_what_can_be_measured_next_is_shown_and_chosen(browser: Browser, tmp_pat
             rows = [row.text for row in find("#passes tbody tr")]
             assert rows == [
                 "next: the next pass of the plan +0.80 (0.60 to 1.00) +0.53 90 s 12.5 % 2.00 GB recommended next",
-                "enough: no further view +0.00 - 0 s 0.0 % 0 MB enough",
+                "enough: no further pass +0.00 - 0 s 0.0 % 0 MB enough",
                 "1 next program +0.80 - <b>most a second",
             ]
             find("#passes button")[1].click()
