@@ -230,15 +230,15 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs these darks or flats: it took views, and has none of the kind, or its views are
-        enough, so that it is complete. Such a one may have taken all views in earlier files: then it needs those that
-        it has none of.
+        """A stopped scan still needs this block: wide views, where only that its views are enough stops it. References
+        of a kind that it has none of, where it took views or they are enough (they may be in earlier files); any
+        others, where it took views that are enough.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {taken.block.kind for taken in self._done if taken.frames}
         reasons = FrameKind.PROJECTION in kinds, block.kind not in kinds, self._stop.enough
-        return block.kind in REFERENCES and sum(reasons) >= 2  # any two of them
+        return sum(reasons) >= 2 if block.kind in REFERENCES else self._stop.enough  # any two of them
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""

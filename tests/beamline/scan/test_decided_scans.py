@@ -212,12 +212,13 @@ def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_t
     assert "next would end the scan after" in chosen["reason"]
 
 
-def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_the_last_references(
+def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_what_follows_the_passes(
     tmp_path: Path,
 ) -> None:
     """Of a scan without references at its start, which is paused when it asks for the second time."""
     stop, events = StopRequest(), list[Event]()
     words = (*PASSES, "scan.decide=ask", "scan.wait_s=300", "scan.darks.at=none", "scan.flats.at=end")
+    words = (*words, "scan.wide_views=2", "sample.diameter_mm=0.9")
 
     def stop_when_asked(event: Event) -> None:
         if event.data.get("state") == State.ASKING:
@@ -246,7 +247,8 @@ def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_th
     with open_for_resume(ran.folder) as series:
         done = run_scan(series.config, series, [react], instrument=instrument.connected(), live=words_of)
     assert seen == ["asking", "paused", "asking"] and done.status == "complete"
-    assert [event.data["n"] for event in events if event.event == "block_started"] == [2]
+    kinds = [event.data["kind"] for event in events if event.event == "block_started"]
+    assert kinds == ["wide_view", "wide_view", "flat"]
     with h5py.File(ran.folder / "joined.h5") as file:
         assert [json.loads(line)["number"] for line in file[layout.DECISIONS].asstr()[()]] == [1]
     with pytest.raises(NothingMissing), open_for_resume(ran.folder):
