@@ -150,6 +150,9 @@ class Acquisition:
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
         blocks = [*([unfinished] if unfinished.n_to_take else []), *(wide if choice is Choice.WIDE else [])]
+        if not self._done:  # no references came first, and the choice may
+            self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
+            self._supervision.states.enter(_state_of(views))
         while True:
             again = passes.done[-1] in passes.done[:-1]
             for block in blocks:
@@ -227,14 +230,15 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan with projections still needs this block: only that its views are enough stops it, or there are
-        no darks or flats of this block's kind yet.
+        """A stopped scan still needs this block: wide views, where only that its views are enough stops it. References
+        of a kind that it has none of, where it took views or they are enough (they may be in earlier files); any
+        others, where it took views that are enough.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {taken.block.kind for taken in self._done if taken.frames}
-        no_reference = block.kind in REFERENCES and block.kind not in kinds
-        return FrameKind.PROJECTION in kinds and (self._stop.enough or no_reference)
+        reasons = FrameKind.PROJECTION in kinds, block.kind not in kinds, self._stop.enough
+        return sum(reasons) >= 2 if block.kind in REFERENCES else self._stop.enough  # any two of them
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""

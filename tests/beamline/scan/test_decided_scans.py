@@ -22,7 +22,7 @@ from beamline.scan import preflight
 from beamline.scan.control import State, Verb, ask, state_of
 from beamline.scan.live_process import LiveCommand
 from beamline.scan.preflight import scan_info
-from beamline.scan.resume import open_for_resume
+from beamline.scan.resume import NothingMissing, open_for_resume
 from beamline.scan.run import run_scan
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import ScanInfo
@@ -210,3 +210,46 @@ def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_t
     (chosen,) = [event.data for event in events if event.event == "next_chosen"]
     assert (chosen["number"], chosen["n_views"], chosen["choice"]) == (3, 9, "enough")
     assert "next would end the scan after" in chosen["reason"]
+
+
+def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_what_follows_the_passes(
+    tmp_path: Path,
+) -> None:
+    """Of a scan without references at its start, which is paused when it asks for the second time."""
+    stop, events = StopRequest(), list[Event]()
+    words = (*PASSES, "scan.decide=ask", "scan.wait_s=300", "scan.darks.at=none", "scan.flats.at=end")
+    words = (*words, "scan.wide_views=2", "sample.diameter_mm=0.9")
+
+    def stop_when_asked(event: Event) -> None:
+        if event.data.get("state") == State.ASKING:
+            stop.stop()
+
+    ran = Ran(tmp_path, FakeInstrument(), *words, stop=stop, live=live((1.0, 0.1, None)), heard=stop_when_asked)
+    assert isinstance(ran.error, ScanStopped) and written(ran) == ([3], [])
+    seen: list[str] = []
+
+    def react(event: Event) -> None:
+        events.append(event)
+        state = event.data.get("state")
+        if event.event != "state" or state not in (State.ASKING, State.PAUSED):
+            return
+        part = ran.folder / "part-2"
+        wait_until(lambda: state_of(part) is state)
+        seen.append(state)
+        ask(ran.folder, Verb.RESUME if state is State.PAUSED else Verb.PAUSE if len(seen) == 1 else Choice.ENOUGH)
+
+    def words_of(scan: Path, output: Path) -> list[str]:
+        """A live reconstruction that has the law of the views of the earlier part at once."""
+        return [word.replace("while sum(", "while False and sum(") for word in live((1.0, 0.1, None))(scan, output)]
+
+    instrument = FakeInstrument()
+    instrument.clock.sleep(1000.0)
+    with open_for_resume(ran.folder) as series:
+        done = run_scan(series.config, series, [react], instrument=instrument.connected(), live=words_of)
+    assert seen == ["asking", "paused", "asking"] and done.status == "complete"
+    kinds = [event.data["kind"] for event in events if event.event == "block_started"]
+    assert kinds == ["wide_view", "wide_view", "flat"]
+    with h5py.File(ran.folder / "joined.h5") as file:
+        assert [json.loads(line)["number"] for line in file[layout.DECISIONS].asstr()[()]] == [1]
+    with pytest.raises(NothingMissing), open_for_resume(ran.folder):
+        ...
