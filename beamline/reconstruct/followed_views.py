@@ -192,11 +192,12 @@ class PassLaws:
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
             return
-        if axis_col is None:
-            self._warn("No gain by further views is predicted before the rotation axis is known.")
-        if axis_col is None or cursor.taken < end:
+        if axis_col is not None and cursor.taken < end:
             return
         self._end = end
+        if axis_col is None:  # and a scan that waits for the law takes no view that might show it
+            self._no_law(ends.size, 0, "the rotation axis is not known yet")
+            return
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)
         images = {
@@ -207,6 +208,7 @@ class PassLaws:
         }
         rows = np.array([*images], np.int64)
         if not rows.size or correction is None:
+            self._no_law(ends.size, 0, "none of the views can be used")
             return
         views_at_ends = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
         try:
@@ -214,11 +216,14 @@ class PassLaws:
             open_beam = correction.open_beam(_NOISE_FLATS)
             law, gained = measured_law(np.stack([*images.values()]), geometry, views_at_ends, self._rng, open_beam)
         except (ValueError, DataError, MemoryError) as error:
-            why = str(error) or "the memory does not suffice"
-            self._warn(f"No gain by further views is predicted: {why}.")
-            without = ends.size, rows.size, math.nan, math.nan, math.nan, math.nan
-            self._sink(LawMeasured(*without, reason=why, time=self._clock.now()))
+            self._no_law(ends.size, rows.size, str(error) or "the memory does not suffice")
             return
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
         self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))
+
+    def _no_law(self, number: int, n_views: int, why: str) -> None:
+        self._warn(f"No gain by further views is predicted: {why}.")
+        self._sink(
+            LawMeasured(number, n_views, math.nan, math.nan, math.nan, math.nan, reason=why, time=self._clock.now())
+        )

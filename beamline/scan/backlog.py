@@ -92,7 +92,7 @@ def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: flo
         pause.release(Cause.BACKLOG)
 
 
-class Progress:
+class FrameProgress:
     """Data of the `frame` event: frames written, rate, time left."""
 
     def __init__(self, timeline: Timeline) -> None:

@@ -4,7 +4,7 @@ Noise on the trigger line exposes frames too, and times of triggers are no longe
 frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
 begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
 the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
-Frames that neither confirms belong to no trigger. All functions are pure. A Flight keeps the frames of a train that
+Frames that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that
 wait for their trigger.
 """
 
@@ -108,7 +108,7 @@ def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFra
 
 
 @dataclass
-class Flight:
+class FlownTrain:
     """A pulse train under way.
 
     Attributes:

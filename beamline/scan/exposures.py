@@ -14,7 +14,7 @@ from beamline.core.events import Sink, Warned
 from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
-from beamline.scan.braking import Braking, Flight
+from beamline.scan.braking import Braking, FlownTrain
 from beamline.scan.control import State
 from beamline.scan.ledger import EXTRA, Ledger, Train, settle
 from beamline.scan.moves import POLL, arrive, go, looked_again, stand
@@ -133,7 +133,7 @@ class Exposures:
         self._supervision.states.enter(State.ACQUIRING)
         seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
         angles = block.angles[first : first + train.n]
-        flight = Flight(Ledger(self._expected(block, angles, before, self._clock.now())), train, first, seconds)
+        flight = FlownTrain(Ledger(self._expected(block, angles, before, self._clock.now())), train, first, seconds)
         cut_short = True
         try:
             try:
@@ -165,7 +165,7 @@ class Exposures:
         first = (before + after) / 2 + block.taxi / block.speed + ramp
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
-    def _until_standing(self, block: Block, flight: Flight) -> Iterator[Exposed]:
+    def _until_standing(self, block: Block, flight: FlownTrain) -> Iterator[Exposed]:
         """Frames while the stage turns; after a stop, all frames until the stage stands. After a pause only the frames
         exposed before the stop was sent: they equal those of a scan without a pause.
 
@@ -203,7 +203,7 @@ class Exposures:
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
 
-    def _brake(self, flight: Flight) -> None:
+    def _brake(self, flight: FlownTrain) -> None:
         """Slow down within a train, wait until the stage stands, and ask where."""
         train, limits = flight.train, self._stage.limits
         flight.stop_sent, flight.paused = self._clock.now(), not self._stop.stopping

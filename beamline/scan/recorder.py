@@ -25,7 +25,7 @@ from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import Monitor, look_past_failures
 from beamline.plan.plan import Timeline
-from beamline.scan.backlog import CHECKED_FRAMES, Progress, hold_for_backlog, hold_for_space, room
+from beamline.scan.backlog import CHECKED_FRAMES, FrameProgress, hold_for_backlog, hold_for_space, room
 from beamline.scan.flagged import FlaggedFrames
 from beamline.scan.references import ReferenceLog
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -82,7 +82,7 @@ class Recorder:
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
         self._sink, self.flagged = sink, flagged or FlaggedFrames(sink)
-        self._progress = Progress(timeline)
+        self._progress = FrameProgress(timeline)
         self._stop, self._pause = stop or StopRequest(), pause or PauseRequest()
         self._monitor_off = False
         self._unjudged: list[int] = []  # frames that the monitor did not look at

@@ -253,16 +253,22 @@ def test_a_selection_of_views_stands_for_all(laws: Laws, follow: Callable[..., F
 
 
 def test_a_pass_without_a_view_that_can_be_used_has_no_law(laws: Laws, follow: Callable[..., Followed]) -> None:
-    follow(flags=alarms(*range(4, 14))).seconds(14)
+    scan = follow(flags=alarms(*range(4, 14)))
+    scan.seconds(14)
     assert not laws.asked
+    assert [law["reason"] for law in scan.of("error_law")] == ["none of the views can be used"]
 
 
-def test_before_the_axis_is_known_there_is_no_law(laws: Laws, follow: Callable[..., Followed]) -> None:
+def test_before_the_axis_is_known_there_is_no_law_and_the_scan_is_told_at_once(
+    laws: Laws, follow: Callable[..., Followed]
+) -> None:
     scan = follow(passes=(7, 24), changes={"selection": Selection()})
     for n in (7, 1):
         scan.seconds(n)
     (warning,) = scan.of("warning")
     assert "rotation axis" in warning["message"] and not laws.asked
+    (none,) = scan.of("error_law")
+    assert (none["number"], none["reason"]) == (1, "the rotation axis is not known yet")
     scan.seconds(16)
     assert laws.sizes == [[3, 20]]
 
