@@ -195,7 +195,7 @@ class StopRequest:
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self.stopping = self.aborting = self.by_person = self._enough = False
+        self.stopping = self.aborting = self.by_person = False
         self.reason, self._now, self._requested_at = "", now, 0.0
 
     def refuse_abort(self) -> None:
@@ -214,22 +214,12 @@ class StopRequest:
         self._requested_at = self._requested_at or self._now()
         self.stopping = True
 
-    def stop_as_enough(self, reason: str) -> None:
-        """Stop as by `stop`, but without hurry, because the views suffice (`beamline.plan.passes.Choice.ENOUGH`)."""
-        self._enough = self._enough or not self.stopping
-        self.stop(reason, by_itself=True)
-
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
         self.reason, self.by_person = reason, True
         self._requested_at = self._requested_at or self._now()
         self.aborting = True
         self.stopping = True
-
-    @property
-    def enough(self) -> bool:
-        """Whether only `stop_as_enough` asked for the stop."""
-        return self._enough and not (self.aborting or self.by_person)
 
     @property
     def seconds(self) -> float:

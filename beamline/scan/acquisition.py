@@ -117,6 +117,7 @@ class Acquisition:
         if monochromator is not None and energy is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
             monochromator.move_to(energy)
+        enough = False  # the views
         for block in self._timeline.blocks:
             self._stop.refuse_abort()
             if not block.n_to_take:
@@ -132,14 +133,15 @@ class Acquisition:
             if block.kind is FrameKind.WIDE_VIEW:
                 yield from self._wide(block)
             elif block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
-                yield from self._pass_by_pass(block, self._supervision.next_pass)
+                enough = yield from self._pass_by_pass(block, self._supervision.next_pass)
             else:
                 yield from self._block(BlockTally(block))
-            if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
+            if block.kind is FrameKind.PROJECTION and not (enough or self._stop.stopping):
                 yield from self._retake(block)
 
-    def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Iterator[Frame]:
-        """The views in passes, and what is chosen after each. What nobody chose is left to the plan.
+    def _pass_by_pass(self, views: Block, next_pass: Callable[[Passes], Choice]) -> Generator[Frame, None, bool]:
+        """The views in passes, and what is chosen after each; whether they are enough. What nobody chose is left to the
+        plan.
 
         A scan that goes on begins with what is left of the pass that it was in, and with views that earlier ones lack.
         Where that pass had ended, it does not end anew, and the choice comes next.
@@ -157,25 +159,25 @@ class Acquisition:
             again = passes.done[-1] in passes.done[:-1]
             for block in blocks:
                 if self._stop.stopping:
-                    return
+                    return False
                 taken = BlockTally(block, again)
                 yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(taken)
                 self.recovered += recover(self._done, taken.rows)
             if choice is Choice.RETAKE:
                 yield from self._retake(views)
             if self._stop.stopping:
-                return
+                return False
             if not ended_before:
                 self._supervision.pass_ended()
             ended_before = False
             passes = replace(passes, retakes=self._supervision.n_retakable(missing_views(self._done)))
             if not (passes.to_come or passes.retakes):
-                return
+                return False
             choice = next_pass(passes)
-            if choice is Choice.ENOUGH and not self._stop.stopping:
-                self._stop.stop_as_enough("the views suffice")
+            if choice is Choice.ENOUGH:
+                return True
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
-                return
+                return False
             before, passes = passes, passes.after(choice)
             blocks = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
 
@@ -230,15 +232,12 @@ class Acquisition:
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)
 
     def _still_needed(self, block: Block) -> bool:
-        """A stopped scan still needs this block: wide views, where only that its views are enough stops it. References
-        of a kind that it has none of, where it took views or they are enough (they may be in earlier files); any
-        others, where it took views that are enough.
+        """A stopped scan still needs this block: references of a kind that it has none of, where it took views.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {taken.block.kind for taken in self._done if taken.frames}
-        reasons = FrameKind.PROJECTION in kinds, block.kind not in kinds, self._stop.enough
-        return sum(reasons) >= 2 if block.kind in REFERENCES else self._stop.enough  # any two of them
+        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
     def _warm_up(self) -> None:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
@@ -284,7 +283,7 @@ class Acquisition:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{discrepancies(self._done)}")
         if self._refused:
             raise ReferencesError(self._refused)
-        if self._stop.stopping and not self._stop.enough:
+        if self._stop.stopping:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before the first frame: {self._stop.reason}.")
             raise ScanStopped(

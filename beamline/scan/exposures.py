@@ -232,8 +232,7 @@ class Exposures:
                 break
             if math.isfinite(angle):
                 if angle != stands_at and not (
-                    go(self._stage, angle, self._clock, self._stop, until_stop=not owed)
-                    and self._rest(self._settle, owed)
+                    go(self._stage, angle, self._clock, self._stop) and self._rest(self._settle, owed)
                 ):
                     break
                 stands_at = angle

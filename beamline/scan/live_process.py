@@ -101,9 +101,9 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
-    new stop, or ASK_LIVE_AFTER after the scan's stop (unless its views were enough). Also with a `useless` file, which
-    is broken or has no projections."""
-    last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
+    new stop, or ASK_LIVE_AFTER after the scan's stop. Also with a `useless` file, which is broken or has no
+    projections."""
+    last = ASK_LIVE_AFTER if stop.stopping else 0.0
     return lambda: useless or stop.aborting or (stop.stopping and stop.seconds >= last)
 
 

@@ -13,11 +13,13 @@ from beamline.core.process import ChildProcess
 from beamline.core.recon_events import LawMeasured
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
+from beamline.plan.passes import Choice
 from beamline.scan import live_process
 from beamline.scan import measurement as module
 from beamline.scan.live_plan import LivePlan
 from beamline.scan.live_process import LiveReconstruction, follow_command
 from beamline.scan.run import run_scan
+from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
 from tests.clock import wait_until
@@ -249,22 +251,11 @@ import json, sys, time
 time.sleep(0.5)
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=True)
 """
-    stop = StopRequest()
-    instrument = FakeInstrument(at={10: lambda: stop.stop_as_enough("enough")})
-    ran = Ran(tmp_path, instrument, stop=stop, live=script(fits))
-    assert ran.error is None and len(ran.of("recon_done")) == 1 and stop.enough
-    stop.abort()
-    assert not stop.enough
-    twice = StopRequest()
-    twice.stop_as_enough("by the decision")
-    twice.stop_as_enough("again")
-    assert twice.enough and twice.reason == "by the decision"
-    asked = StopRequest()
-    asked.stop()
-    asked.stop_as_enough("too late")
-    assert not asked.enough
-    twice.stop()
-    assert not twice.enough  # a person stops it
+    stop, words = StopRequest(), ("scan.angles={scheme: interlaced, views: 12, passes: 4}", "scan.period_s=2")
+    with choosing(monkeypatch, Scripted([Choice.ENOUGH])):
+        ran = Ran(tmp_path, FakeInstrument(), *words, stop=stop, live=script(fits))
+    assert ran.error is None and len(ran.of("recon_done")) == 1 and ran.result.n_frames == 10
+    assert not stop.stopping  # what follows the scan, another energy or its reconstruction, is not stopped either
 
 
 def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path) -> None:

@@ -1,10 +1,12 @@
 """A scan in passes: what is chosen after each is taken, nothing else, and the file says it."""
 
+import signal
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import h5py
 import pytest
@@ -14,14 +16,17 @@ from hypothesis import strategies as st
 
 from beamline.cli.main import main
 from beamline.core.errors import DataError, ScanStopped
-from beamline.core.stop import StopRequest
+from beamline.core.events import Event
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.plan.passes import Choice, Passes
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
+from beamline.scan.control import State
 from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, recover_run
 from beamline.scan.run import run_scan
+from beamline.scan.supervision import Supervision
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import open_scan
@@ -188,6 +193,41 @@ def test_a_stop_in_the_wide_views_of_one_place_does_not_move_the_sample_to_the_n
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + 3: stop.stop}), *WORDS, *MODES["fly"][0], stop=stop)
     wide = [frame.trigger for frame in frames_of(ran.folder / "scan.h5") if frame.kind is FrameKind.WIDE_VIEW]
     assert wide == [VIEWS]
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pause waits with a closed shutter. The first Ctrl-C is a stop, which is the reason and ends them at once."""
+    words, pass_views, sizes = MODES[mode]
+    first, seen = FIRST + sizes[0], list[bool]()
+
+    def resume(event: Event) -> None:
+        if event.data.get("state") == State.PAUSED:
+            seen.append(instrument.is_open)
+            supervisions[-1].pause.resume()
+
+    supervisions, instrument = list[Supervision](), FakeInstrument(at={first: lambda: supervisions[-1].pause.pause()})
+
+    def supervised(*given: Any, **more: Any) -> Supervision:
+        supervisions.append(Supervision(*given, **more))
+        return supervisions[-1]
+
+    monkeypatch.setattr("tests.beamline.chosen.Supervision", supervised)
+    with choosing(monkeypatch, Scripted([Choice.ENOUGH]), pass_views):
+        ran = Ran(tmp_path / "paused", instrument, *WORDS, *words, heard=resume)
+    assert ran.error is None and seen == [False]
+    triggers = [frame.trigger for frame in frames_of(ran.result.path)[FIRST:]]
+    assert triggers == [*range(sizes[0]), *range(VIEWS, VIEWS + WIDE), 0, 1]
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted([Choice.ENOUGH]), pass_views), stop_signals(stop):
+        at = {first: lambda: signal.raise_signal(signal.SIGINT)}
+        ran = Ran(tmp_path / "stopped", FakeInstrument(at=at), *WORDS, *words, stop=stop)
+    assert not stop.aborting and f"Stopped after {sizes[0]} of 12 projections: Ctrl-C was pressed." in str(ran.error)
+    assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
+    with open_for_resume(ran.folder) as series:
+        assert series.in_words.endswith("to take, its missing wide views and flats of the end are taken now")
 
 
 CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
