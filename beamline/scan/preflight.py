@@ -290,7 +290,6 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "settle_s": plan.settle,
         "warm_up_s": plan.warm_up,
         **({"frames_per_view": plan.frames_per_view} if plan.frames_per_view > 1 else {}),
-        **({"pass_views": plan.pass_views} if plan.pass_views else {}),
         **({"wide_views": plan.wide_views, "wide_places_mm": plan.wide_places} if plan.wide_places else {}),
         "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},

@@ -6,10 +6,10 @@ Every command that meets such a run says the same, by `next_step`.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -160,18 +160,21 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
         return frozenset(range(views_planned(files[0]) or 0)) - views, (), False
     due = str(n_ended) not in chosen and n_ended > 0 and not since_pass_end
     choices = tuple(chosen.get(str(number), Choice.NEXT) for number in range(1, n_ended + 1 - due))
-    passes = _passes_of(plan_in(files[0]), choices)
+    passes = _passes_of(files[0], choices)
     missing = triggers_to_take(*passes.done) - views | triggers_to_take(*passes.to_come)
     if choices[-1:] == (Choice.AGAIN,) and not due:
         missing |= triggers_to_take(passes.done[-1]) - since_pass_end
     return missing, choices, due
 
 
-def _passes_of(plan: Mapping[str, Any], choices: Iterable[str]) -> Passes:
-    """The passes of a plan as a file holds it, after these choices."""
-    angles = np.radians(plan["angles_deg"])
+def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:
+    """The passes of a plan as a file holds it, after these choices. How many views a pass of a step scan has, its
+    configuration says."""
+    plan, config = plan_in(file), file["/entry/record/config"].asstr()[()]
+    angles, stated = np.radians(plan["angles_deg"]), re.search(r"^  pass_views: (\d+)", config, re.MULTILINE)
     steps = np.diff(angles)
     turns = np.flatnonzero(steps * steps[:1] < 0)  # where a fly scan begins its next sweep
     sweep = int(turns[0]) + 1 if turns.size else 0
-    size = plan.get("pass_views", 0) * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else sweep
+    pass_views = int(stated[1]) if stated else 0
+    size = pass_views * plan.get("frames_per_view", 1) if plan.get("mode") == Mode.STEP else sweep
     return passes_at_start(Block(FrameKind.PROJECTION, Mode.STEP, 0, angles, 0.0, 0.0), size, choices)

@@ -42,7 +42,7 @@ WIDE = 4  # at two angles on either side
 WORDS = ("scan.wide_views=2", "sample.diameter_mm=0.9", "scan.settle_s=0", "scan.period_s=2")
 MODES = {
     "fly": (("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 4}"), 0, [3, 3, 3, 3]),
-    "step": (("scan.mode=step",), 5, [5, 5, 2]),
+    "step": (("scan.mode=step", "scan.pass_views=5"), 5, [5, 5, 2]),
     "one": (("scan.mode=step",), 0, [12]),
 }
 
@@ -111,6 +111,12 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         assert next_step(ran.folder / "scan.h5") == ""  # it has what it was to take
         so_far = [passes.n_frames for passes in chooser.asked]
         assert so_far == [values["n_views"] for values in decisions]
+
+
+def test_the_passes_of_a_step_scan_change_no_plan_so_that_older_parts_of_a_run_have_the_same(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(), *MODES["step"][0])
+    with open_scan(ran.result.path) as source:
+        assert "pass_views" not in source.plan
 
 
 def test_without_a_chooser_nothing_is_in_the_file(tmp_path: Path) -> None:
