@@ -192,11 +192,13 @@ class PassLaws:
         ends = self._views.source.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
             return
-        if axis_col is not None and cursor.taken < end:
+        references_follow = correction is None and cursor.behind
+        if (cursor.frames if references_follow or axis_col is None else cursor.taken) < end:
             return
         self._end = end
-        if axis_col is None:  # and a scan that waits for the law takes no view that might show it
-            self._no_law(ends.size, 0, "the rotation axis is not known yet")
+        if references_follow or axis_col is None:  # a scan that waits for the law takes no frame that might show it
+            missing = "darks or flats are not there" if references_follow else "the rotation axis is not known"
+            self._no_law(ends.size, 0, f"{missing} yet")
             return
         usable = {row for row in self._views.usable().frames.tolist() if row < end}
         parts = cursor.batches if cursor.newest is None else (*cursor.batches, cursor.newest)

@@ -16,6 +16,7 @@ from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit
+from beamline.reconstruct.followed_views import Cursor
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -271,6 +272,31 @@ def test_before_the_axis_is_known_there_is_no_law_and_the_scan_is_told_at_once(
     assert (none["number"], none["reason"]) == (1, "the rotation axis is not known yet")
     scan.seconds(16)
     assert laws.sizes == [[3, 20]]
+
+
+def test_where_flats_come_after_the_views_there_is_no_law_and_the_scan_is_told_at_once(
+    laws: Laws, follow: Callable[..., Followed]
+) -> None:
+    """With a known axis. The flats are rows 2 and 3, which come last here."""
+    order = [*FRAMES[:2], *FRAMES[4:], *FRAMES[2:4]]
+    scan = follow([replace(frame, index=i) for i, frame in enumerate(order)], (12, 22, 32))
+    for n in (11, 1, 10):
+        scan.seconds(n)
+    assert [(law["number"], law["reason"]) for law in scan.of("error_law")] == [
+        (n, "darks or flats are not there yet") for n in (1, 2)
+    ]
+    assert len(scan.of("warning")) == 1 and not laws.asked
+
+
+def test_a_law_waits_for_views_of_its_pass_that_may_show_the_axis(
+    laws: Laws, follow: Callable[..., Followed], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The end of a pass is read after the number of frames: the file may have grown in between."""
+    scan = follow(changes={"selection": Selection()})
+    monkeypatch.setattr(scan.follower, "_cursor", Cursor(frames=13))
+    scan.follower.source.pass_ends = np.array([14])
+    scan.follower.measure_law()
+    assert not scan.of("error_law")
 
 
 def test_a_resumed_run_has_the_passes_of_all_parts(laws: Laws, follow: Callable[..., Followed], tmp_path: Path) -> None:
