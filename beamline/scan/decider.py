@@ -33,7 +33,7 @@ class Decider:
         wait: real s for the law of a pass, and again for the operator's answer, at most; pauses do not count.
         seconds_of: duration of a block, from where the stage stands.
         now: the instrument's clock, s.
-        began: time of the first frame.
+        began: time of the first frame; inf: none came yet, where a scan that goes on chooses first.
         added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of the references
             that follow the views.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
@@ -154,7 +154,7 @@ class Decider:
         """Seconds and share of the dose that the scan has taken, with what follows the passes in any case."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        seconds = self.now() - self.began + self.added_seconds + sum(map(self.seconds_of, passes.wide))
+        seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.wide))
         return seconds, (passes.n_frames + retaken + wide) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:

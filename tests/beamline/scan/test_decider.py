@@ -1,6 +1,7 @@
 """The decider asks the law, or the operator, after each pass; where neither answers the plan goes on."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -105,6 +106,13 @@ def test_what_came_of_a_prediction_stands_beside_it() -> None:
     scan.after(3, law(36, error=0.5, gained=1.0))
     assert scan.chosen["gained"] == 1.0
     assert scan.chosen["predicted"] == scan.of("next_chosen")[1]["options"][0]["gain"]
+
+
+def test_a_choice_before_the_first_frame_of_a_later_part_counts_the_seconds_of_earlier_ones() -> None:
+    scan = Scan(Wish(seconds=100.0), added_seconds=99.0)
+    scan.decide.began = math.inf
+    assert scan.after(1, law(12)) is Choice.ENOUGH
+    assert "next would end the scan after" in scan.chosen["reason"]
 
 
 def test_where_the_next_pass_is_sure_the_stage_does_not_wait_and_the_outcome_comes_later() -> None:
