@@ -14,12 +14,10 @@ from click.testing import CliRunner, Result
 from beamline.cli.main import main
 from beamline.config.load import config_folder, load
 from beamline.features.doctor.examine import needs
-from beamline.plan.passes import Choice
 from beamline.scan.preflight import dry_run
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from simulators.devices.camera import SimulatedOrcaQuest
-from tests.beamline.chosen import Scripted, choosing
 
 pytest.importorskip("xraylib")
 ENERGIES = (8.32, 8.345, 8.3485, 8.352)
@@ -93,19 +91,6 @@ def test_each_energy_has_a_scan(config: Path, tmp_path: Path) -> None:
     assert not any((noise[0] == other).all() for other in noise[1:])  # each energy has noise of its own
     listed = beamline("runs", tmp_path / "runs").stdout
     assert all(f"{series.name}/{path.parent.name}" in listed for path in scans), listed
-
-
-def test_views_that_are_enough_end_the_scan_of_their_energy_alone(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with choosing(monkeypatch, Scripted([Choice.ENOUGH]), pass_views=5):
-        done = beamline("scan", config, "-o", tmp_path, "--set", f"scan.energies={list(ENERGIES[:2])}")
-    assert done.exit_code == 0, done.output
-    n_views = list[int]()
-    for path in sorted(tmp_path.glob("*/*/scan.h5"), key=lambda path: path.stat().st_mtime):
-        with open_scan(path) as source:
-            n_views.append(int((source.image_key == 0).sum()))
-    assert n_views == [5, VIEWS]
 
 
 @pytest.mark.parametrize("at", [22 + 2, *(pytest.param(at, marks=pytest.mark.slow) for at in (3, 22 + 14))])

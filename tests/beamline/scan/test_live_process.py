@@ -255,7 +255,7 @@ print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=T
     with choosing(monkeypatch, Scripted([Choice.ENOUGH])):
         ran = Ran(tmp_path, FakeInstrument(), *words, stop=stop, live=script(fits))
     assert ran.error is None and len(ran.of("recon_done")) == 1 and ran.result.n_frames == 10
-    assert not stop.stopping  # what follows the scan, another energy or its reconstruction, is not stopped either
+    assert not stop.stopping
 
 
 def test_a_law_that_the_live_reconstruction_measures_is_passed_on(tmp_path: Path) -> None:
