@@ -69,21 +69,24 @@ def warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepar
         if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
             light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        warn(f"{cut_sentence(sides, continued)} {light}".rstrip())
+        warn(f"{cut_sentence(sides, continued, not geometry.ordinary.all())} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(source, selection)):
             warn(change)
     elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))
 
 
-def cut_sentence(sides: dict[str, float], continued: bool) -> str:
-    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP."""
+def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
+    """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP,
+    `wide`: there are wide views."""
     fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
+    advice = (
+        "Wide views (scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice "
+        "the views) show the rest. "
+    )
     return (
-        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. Wide views "
-        "(scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice the views) "
-        "show the rest. The edge columns are not used as air. If they are air, and the beam is weaker than its flats, "
-        "give --air columns."
+        f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. {'' if wide else advice}The "
+        "edge columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
     )
 
 

@@ -54,7 +54,9 @@ def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
     low, high = FieldEdges.of(lines, geometry), FieldEdges.of(lines + np.float32(0.3), geometry)
     assert set(low.beyond()) == set(high.beyond()) == {"left", "right"}
     for edges, continues in ((low, False), (high, True)):
-        assert edges.continued == continues == ("FBP continues" in cut_sentence(edges.beyond(), edges.continued))
+        sentences = [cut_sentence(edges.beyond(), edges.continued, wide) for wide in (False, True)]
+        assert [edges.continued == continues == ("FBP continues" in sentence) for sentence in sentences] == [True, True]
+        assert ["scan.wide_views" in sentence for sentence in sentences] == [True, False]
     _, (line,) = prepare(scan(90.0), SELECTION)
     assert "FBP continues the views, with" in line and "The edge columns are not used as air" in line
 
