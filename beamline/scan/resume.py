@@ -23,7 +23,7 @@ from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
-from beamline.storage.interrupted import still_to_take
+from beamline.storage.interrupted import n_still_to_take, still_to_take
 from beamline.storage.parts import (
     end_references_missing,
     files_with_frames,
@@ -289,7 +289,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
             if changed:
                 join(parts, run / JOINED)
             with hdf5.open_hdf5(run / JOINED) as file:
-                frames, missing = int(file[layout.COMMITTED][()]), len(still_to_take([file])[0])
+                frames, missing = int(file[layout.COMMITTED][()]), n_still_to_take(file)
                 done.append(Recovered(run / JOINED, changed, frames, 0, missing))
         end_record(parts_of(run)[-1])
     return done, left_out

@@ -167,6 +167,13 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
     return missing, choices, due
 
 
+def n_still_to_take(file: h5py.File) -> int | None:
+    """How many views `still_to_take` has for a file; None: not known, as what it chose is damaged."""
+    with suppress(*hdf5.ALTERED):
+        return len(still_to_take([file])[0])
+    return None
+
+
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:
     """The passes of a plan as a file holds it, after these choices. How many views a pass of a step scan has, its
     configuration says."""

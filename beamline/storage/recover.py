@@ -21,7 +21,7 @@ from beamline.core.files import no_file, refuse_existing, run_of, whole_file
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.disk_file import GrowingFile
-from beamline.storage.interrupted import still_to_take
+from beamline.storage.interrupted import n_still_to_take
 from beamline.storage.parts import copy_rows, gaps_in, is_whole, require_joined, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
@@ -168,7 +168,7 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                     made[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
                 planned, dropped = views_planned(made), max(0, len(file[layout.DATA]) - committed)
                 alone = planned is not None and run_of(path.resolve().parent) == path.resolve().parent
-                missing = len(still_to_take([made])[0]) if alone else None
+                missing = n_still_to_take(made) if alone else None
                 altered = tuple(altered_rows(made, 0, frames).tolist())
     except hdf5.ALTERED as error:
         if isinstance(error, OSError) and error.filename == str(target):

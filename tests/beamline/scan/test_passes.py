@@ -1,5 +1,6 @@
 """A scan in passes: what is chosen after each is taken, nothing else, and the file says it."""
 
+import os
 import signal
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
@@ -321,6 +322,22 @@ def test_views_that_the_scan_decided_against_are_not_missing(
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
     _, part, joined = recover_run(ran.folder)[0]
     assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))
+
+
+def test_a_scan_that_died_is_recovered_also_where_a_choice_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = StopRequest()
+    with choosing(monkeypatch, Scripted([Choice.NEXT])), killed(monkeypatch):
+        ran = Ran(tmp_path, FakeInstrument(at={FIRST + 4: stop.abort}), *WORDS[2:], *MODES["fly"][0], stop=stop)
+    file = ran.folder / "scan.h5"
+    content, times = file.read_bytes(), file.stat()
+    file.write_bytes(content.replace(b'"choice": "next"', b'"choice": "nixt"'))
+    os.utime(file, (times.st_atime, times.st_mtime))
+    ((recovered,), _), saved = recover_run(ran.folder), frames_of(file)
+    assert (recovered.changed, recovered.missing) == (True, None) and recovered.frames == len(saved) > FIRST + 3
+    with pytest.raises(DataError, match="nixt"), open_for_resume(ran.folder):
+        ...
 
 
 def stopped(stop: StopRequest, passes: Passes) -> None:
