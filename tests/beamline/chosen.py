@@ -19,7 +19,11 @@ Chooser = Callable[[Passes], Choice | None]
 
 @contextmanager
 def choosing(patch: pytest.MonkeyPatch, choose: Chooser, pass_views: int = 0) -> Iterator[None]:
-    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded; None is no answer."""
+    """Scans in the block decide: `choose` is asked after each pass, and each answer is recorded; None is no answer.
+
+    Args:
+        pass_views: also in the configuration of the scans, by which their files are read.
+    """
     recorders: list[Recorder] = []
     pass_numbers = [0]  # of the newest pass of each scan, from 1; a resumed one counts on
 

@@ -36,7 +36,7 @@ from tests.beamline.ran import small
 
 VIEWS, FRAMES, SECONDS = 200, 207, 0.002  # s a frame, of real time
 FIRST, PASS = 5, 50  # row of the first view, and views of a pass
-WORDS = (f"scan.angles.views={VIEWS}", "scan.period_s=0.05")
+WORDS = (f"scan.angles.views={VIEWS}", f"scan.pass_views={PASS}", "scan.period_s=0.05")
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process that is forked is killed")
 
