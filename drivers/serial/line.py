@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import serial
 from serial.tools import list_ports
@@ -319,3 +319,24 @@ class SerialLine:
 
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
         return kind(self._device, problem, wire=self._transcript.recent(), **parts)
+
+
+class LineSettings(Protocol):
+    """Settings of a line: the timeout of a reply in s, the baud rate, and the file of its bytes, if any."""
+
+    @property
+    def timeout(self) -> float: ...
+    @property
+    def baudrate(self) -> int: ...
+    @property
+    def transcript(self) -> Path | None: ...
+
+
+def line_to(wiring: LineSettings, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
+    connection: dict[str, Any] = {
+        "timeout": wiring.timeout,
+        "baudrate": wiring.baudrate,
+        "transcript": wiring.transcript,
+    }
+    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **connection)

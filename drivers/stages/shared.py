@@ -1,4 +1,4 @@
-"""Shared code of the stages: lines, positions by their travel, stops, waits until they stand, settings to restore.
+"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
 
 Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
 program that is killed leaves its speed in the controller, and the next one would take it for the original.
@@ -17,8 +17,6 @@ from typing import Any, TypeVar
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.serial.line import LineRules, Probe, SerialLine
-from drivers.stages.settings import Wiring
 from drivers.stages.travel import Travel
 
 
@@ -121,19 +119,6 @@ class Stops:
             ) from problem
         if problem is not None:
             raise problem
-
-
-def line_to(wiring: Wiring, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
-    return SerialLine(
-        url,
-        LineRules(probe, **rules),
-        clock,
-        device=name,
-        timeout=wiring.timeout,
-        baudrate=wiring.baudrate,
-        transcript=wiring.transcript,
-    )
 
 
 POLL = 0.02  # s between two status queries of a moving stage

@@ -9,10 +9,9 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line import Probe
+from drivers.serial.line import Probe, line_to
 from drivers.serial.line_reader import Framing
 from drivers.stages.settings import Wiring
-from drivers.stages.shared import line_to
 
 STOPPED = 10
 NOT_ALLOWED_TO_MOVE = 5

@@ -14,10 +14,10 @@ from typing import TypeVar
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.serial.line import Probe
+from drivers.serial.line import Probe, line_to
 from drivers.stages.pm16c.settings import TriggerPoints
 from drivers.stages.settings import Wiring
-from drivers.stages.shared import FoundSettings, line_to, while_it_moves
+from drivers.stages.shared import FoundSettings, while_it_moves
 
 PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"

@@ -20,9 +20,9 @@ from drivers.stages.shared import LineStage, found_at_opening, until_standing
 class HomeSearch:
     """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
 
-    Begin it by `find_home` of the channel, then call `go_on` each time the motor has come to rest, until it returns
-    False. From memory, to be checked at an instrument: the direction of the search and the switch's kind are set on the
-    controller's panel. The speed is the selected one. A search that has found the switch may end some counts beyond it.
+    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
+    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
+    speed is the selected one. A search that has found the switch may end some counts beyond it.
 
     Args:
         home: the count that the reference gets.
@@ -32,6 +32,10 @@ class HomeSearch:
         self._channel, self._name, self._home = channel, name, home
         self._found: int | None = None
         self._cancelled = False
+
+    def begin(self, speed: int) -> None:
+        """Start to search at `speed` pulses/s."""
+        self._channel.find_home(speed)
 
     def cancel(self) -> None:
         """End the search: no further step. Call it before the stop is sent, from any thread."""
@@ -119,7 +123,7 @@ class PM16CStage(LineStage):
             )
         search = HomeSearch(self._channel, self.name, self._home)
         with self._stops.none_while("the search"):
-            self._channel.find_home(self._settings.search_rate)
+            search.begin(self._settings.search_rate)
         self._target, self._search = self._home, search
 
     def moving(self) -> bool:

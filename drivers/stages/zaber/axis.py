@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
-from drivers.serial.line import Probe
-from drivers.stages.shared import FoundSettings, line_to, while_it_moves
+from drivers.serial.line import Probe, line_to
+from drivers.stages.shared import FoundSettings, while_it_moves
 from drivers.stages.zaber.packet import (
     INTERRUPTED,
     REASONS,
@@ -134,6 +134,10 @@ class ZaberAxis:
         reply = self.ask_axis("get pos", WHOLE)
         flags = self._flags("warnings") if reply.flag else ()
         return ZaberAxisStatus(int(reply.data), reply.busy, flags, reply.raw)
+
+    def forget_flags(self) -> None:
+        """Clear the flags of past events."""
+        self.ask_axis("warnings clear", TEXT)
 
     def standing(self, purpose: str) -> ZaberAxisStatus:
         """The status; refuses `purpose` while the axis moves."""

@@ -266,7 +266,7 @@ class ZaberStage(LineStage):
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
         if status.flags:
-            self._axis.ask_axis("warnings clear")
+            self._axis.forget_flags()
         self._told = frozenset()
 
     def _send_stop(self, hard: bool) -> str:
