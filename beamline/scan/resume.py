@@ -23,7 +23,7 @@ from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
-from beamline.storage.interrupted import n_still_to_take, still_to_take
+from beamline.storage.interrupted import n_still_to_take, still_to_take, wide_taken
 from beamline.storage.parts import (
     end_references_missing,
     files_with_frames,
@@ -202,7 +202,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     with ExitStack() as opened, hdf5.readable(run):
         each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         missing, choices, due = still_to_take(each)
-        wide = frozenset[int]().union(*(views_in(file, kind=FrameKind.ALIGNMENT) for file in each))  # written as such
+        wide = wide_taken(each)
         wide_missing = wide_planned(each[0]) - len(wide)
         end_references = None if missing else end_references_missing(each)
     if not (missing or wide_missing or end_references):

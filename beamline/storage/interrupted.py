@@ -28,6 +28,7 @@ from beamline.storage.parts import (
     to_join,
     views_in,
     views_planned,
+    wide_planned,
 )
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import superblock
@@ -133,9 +134,10 @@ def _died(sure: bool) -> str:
 
 
 def _lacks_views(run: Path) -> bool:
-    """Whether the files of a run, all closed, lack views that it was to take."""
+    """Whether the files of a run, all closed, lack views that it was to take, wide ones included."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
-        return bool(still_to_take([opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)])[0])
+        files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
+        return bool(still_to_take(files)[0]) or wide_planned(files[0]) > len(wide_taken(files))
     return False
 
 
@@ -172,6 +174,11 @@ def n_still_to_take(file: h5py.File) -> int | None:
     with suppress(*hdf5.ALTERED):
         return len(still_to_take([file])[0])
     return None
+
+
+def wide_taken(files: Sequence[h5py.File]) -> frozenset[int]:
+    """Triggers of the wide views in the files of a scan, as of `views_in`."""
+    return frozenset[int]().union(*(views_in(file, kind=FrameKind.ALIGNMENT) for file in files))  # written as such
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:

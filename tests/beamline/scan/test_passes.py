@@ -235,6 +235,7 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
     with open_for_resume(ran.folder) as series:
         assert series.in_words.endswith("to take, its missing wide views and flats of the end are taken now")
+    assert "--resume" in next_step(ran.folder / "scan.h5")
 
 
 CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
