@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from beamline.storage.recover import Recovered
 
 CHOICES = tuple(Choice)
-_LOOKS = 10  # a tenth of a second apart: the log of events may be written a moment after the state
+_LOOKS = 50  # a tenth of a second apart: the log of events may be written a moment after the state
 _EXIT_CODES = "Exit code: 0 the scan has obeyed, 2 no scan runs there or it does not answer, 5 disk error."
 
 
@@ -48,26 +48,33 @@ def _send(run: Path | None, word: str) -> None:
     if run is not None and not run.is_dir():
         raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
     run = run or _only(runs)
+    before = len(_decisions(run)) if word in CHOICES else 0
     state = tell(run, Choice(word) if word in CHOICES else Verb(word))
     if word in CHOICES:
-        _require_chosen(run, word)
+        _require_chosen(run, word, before)
     click.echo(f"{run}: {state}")
 
 
-def _require_chosen(run: Path, choice: str) -> None:
-    """Raise ConfigError where the scan does not take this choice: it was not on offer, or another one came first."""
+def _decisions(run: Path) -> list[Mapping[str, Any]]:
+    """What the scan of the newest part of a run has chosen so far, oldest first."""
     from beamline.core.event_lines import event_in
     from beamline.core.files import EVENTS, parts_of
 
-    last: Mapping[str, Any] = {}
+    with (parts_of(run)[-1] / EVENTS).open("rb") as log:
+        return [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
+
+
+def _require_chosen(run: Path, choice: str, before: int) -> None:
+    """Raise ConfigError where the scan, after its first `before` decisions, does not take this choice: it was not on
+    offer, or another one came first."""
     for _ in range(_LOOKS):
-        with (parts_of(run)[-1] / EVENTS).open("rb") as log:
-            decisions = [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
-        last = decisions[-1] if decisions else {}
-        if last.get("choice") == choice:
+        newer = _decisions(run)[before:]
+        if choice in [decision.get("choice") for decision in newer]:
             return
         time.sleep(0.1)
-    instead = f"it took {last.get('choice')}: {last.get('reason')}" if last else "it has chosen nothing so far"
+    instead = (
+        f"it took {newer[-1].get('choice')}: {newer[-1].get('reason')}" if newer else "it has chosen nothing since"
+    )
     raise ConfigError(f"the scan in {run} does not take {choice}, which was not on offer or came too late; {instead}.")
 
 

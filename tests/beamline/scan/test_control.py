@@ -103,7 +103,8 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
             with (run / "events.jsonl").open("a") as log:
                 log.write(f"{event.to_json()}\n")
 
-        threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
+        if chosen.count(choice) == 1:  # a second time it changes nothing
+            threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
         file.put(RunRecord(State.TAXI))
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
@@ -115,6 +116,10 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
         file.put(RunRecord(State.ASKING))
         assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
+        file.put(RunRecord(State.ASKING))
+        monkeypatch.setattr("beamline.cli.control._LOOKS", 5)
+        twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
+        assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
         file.put(RunRecord(State.ASKING))
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr
