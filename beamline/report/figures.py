@@ -150,7 +150,7 @@ def panels(
     gap: float = GAP,
     right: float = GAP,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure with a fixed grid of panels [row][column], with equal room for their labels.
+    """A figure with a fixed grid of panels [row, column], with equal room for their labels.
 
     A layout that measures labels takes as long as all that is drawn.
 

@@ -39,7 +39,7 @@ class SliceSheet:
     """
 
     def __init__(self, down: str = "y") -> None:
-        self._at, self._down = 0, down
+        self._at, self._down, self._window = 0, down, (0.0, 1.0)
         self._shown: dict[str, F32] = {}
         self._drawn: set[tuple[str, str]] = set()
 
@@ -48,7 +48,7 @@ class SliceSheet:
         if family and (family, method) in self._drawn:
             return
         if not self._shown:
-            self._at = bright_centre(volume)[0]
+            self._at, self._window = bright_centre(volume)[0], matter_window(volume)
         self._drawn.add((family, method))
         self._shown[label] = volume[self._at].copy()
 
@@ -57,8 +57,8 @@ class SliceSheet:
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
 
     def png(self, labels: Sequence[str]) -> bytes:
-        """PNG of these slices, four beside one another, in the grey window of the first."""
-        low, high = matter_window(self._shown[labels[0]])
+        """PNG of these slices, four beside one another, in the grey window of matter in the first volume."""
+        low, high = self._window
         rows, cols = self._shown[labels[0]].shape
         head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // COLUMNS)
         # One image: a panel for each slice takes ten times as long to draw.

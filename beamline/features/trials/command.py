@@ -176,9 +176,9 @@ class StudyRequest:
         heading(METHOD),
         "--filter",
         type=NameChoice(get_args(Filter)),
-        default="shepp-logan",
+        default="hann",
         show_default=True,
-        help="Filter of the FBP of all views; hann where these are few or noisy.",
+        help="Filter of each FBP, of the rows and of all views.",
     )
     draws: int = set_by(
         "--draws",

@@ -42,7 +42,7 @@ _COSTS: dict[str, Callable[[Outcome], float]] = {
     "dose (frames)": lambda outcome: outcome.trial.frames,  # those that several views share are counted once
 }  # that a picture shows, by the label of their axis
 _NEAR = 1.0  # dB below the best figure: a tenth more error
-_SHOWN_DB = 12.0  # below the best; worse trials are not drawn
+_SHOWN_DB = 12.0  # below the best; worse trials are drawn at the lower edge
 _WIDTH = 120  # characters
 
 
@@ -198,10 +198,15 @@ def _draws(table: TrialTable) -> Iterator[str]:
 def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Picture]]:
     """Quality against each cost, and the slices of baselines or of all rows, by file name."""
     if any(math.isfinite(outcome.quality(table.by)) for outcome in table.compared):
-        caption = "Each point is a trial, a colour a method. The line is the best quality at each time."
+        caption = (
+            "Each point is a trial, a colour a method. The line is the best quality at each time. A triangle at the "
+            f"lower edge is more than {_SHOWN_DB:g} dB below the best. Trials without a finite quality are not drawn."
+        )
         yield "quality.png", Picture("Quality against its costs", caption, quality_plot(table))
     if labels := slices.labels():
-        caption = "The same slice by each method with its usual settings, all in the grey window of the first."
+        caption = (
+            "The same slice by each method with its usual settings, all in the grey window of matter of the first."
+        )
         yield "slices.png", Picture("Slices", caption, slices.png(labels))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
@@ -212,12 +217,15 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
 def quality_plot(table: TrialTable) -> bytes:
     """Quality against time, memory and dose as PNG: a colour a method, and a line along the front of time."""
     shown = [outcome for outcome in table.compared if math.isfinite(outcome.quality(table.by))]
+    floor = max(outcome.quality(table.by) for outcome in shown) - _SHOWN_DB
     figure = new_figure((WIDTH, 4.2))
     panels = figure.subplots(1, len(_COSTS), sharey=True)
     for axes, (label, cost) in zip(panels, _COSTS.items(), strict=True):
         for n, method in enumerate(dict.fromkeys(outcome.trial.method for outcome in shown)):
-            points = [(cost(o), o.quality(table.by)) for o in shown if o.trial.method == method]
-            axes.plot(*zip(*points, strict=True), "os^vD"[n // 10 % 5], ms=4, color=f"C{n % 10}", label=method)
+            points = np.array([(cost(o), o.quality(table.by)) for o in shown if o.trial.method == method])
+            low, look = points[:, 1] < floor, {"ms": 4, "color": f"C{n % 10}"}
+            axes.plot(*points[~low].T, "osPXD"[n // 10 % 5], **look, label=method)
+            axes.plot(points[low, 0], np.full(low.sum(), floor), "v", **look)
         values = [cost(outcome) for outcome in shown]
         if min(values) > 0 and max(values) > 4 * min(values):
             axes.set_xscale("log")
@@ -226,8 +234,7 @@ def quality_plot(table: TrialTable) -> bytes:
     front = [(outcome.seconds, outcome.quality(table.by)) for outcome in _marked(table)]
     if front:
         panels[0].step(*zip(*front, strict=True), where="post", color="black", lw=1.1, alpha=0.5)
-    finite = [outcome.quality(table.by) for outcome in shown]
-    panels[0].set_ylim(bottom=max(min(finite), max(finite) - _SHOWN_DB) - 0.5)
+    panels[0].set_ylim(bottom=max(min(outcome.quality(table.by) for outcome in shown), floor) - 0.5)
     panels[0].set_ylabel(_QUALITY[table.by])
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     return png(figure)

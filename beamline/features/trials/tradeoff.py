@@ -32,7 +32,7 @@ def planned_study(
     study: Study,
     warn: Warn,
     settings: Mapping[str, Mapping[str, Plain]] | None = None,
-    ramp: Filter = "shepp-logan",
+    ramp: Filter = "hann",
     draws: int = 3,
 ) -> Planned:
     """Read and correct the views, and choose those of each row.
@@ -40,7 +40,7 @@ def planned_study(
     Args:
         scan: the study chooses from its views.
         settings: of its methods, by name; methods left out have their own.
-        ramp: filter of the FBP of all views.
+        ramp: filter of each FBP, of the rows and of all views.
         draws: how often random views are drawn.
 
     Raises:
@@ -48,7 +48,8 @@ def planned_study(
     """
     data, table = opened_scan(scan, "study", study.title, warn, held_out=False)
     choices = study.rows(ViewSet(data.geometry.angles, data.geometry.period, scan.seed, draws))
-    n_views, given = data.geometry.n_views, settings or {}
+    n_views, given = data.geometry.n_views, dict(settings or {})
+    given[BASELINE] = {"filter": ramp, **given.get(BASELINE, {})}
 
     def trial(method: str, choice: ViewChoice) -> Trial:
         own = dict(given.get(method, {}))
@@ -60,7 +61,7 @@ def planned_study(
         outcomes=tuple(Outcome(each, "not run", message=reason) for each, reason in outcomes),
         by="psnr_all",
         question=study.question,
-        notes=[_note(n_views, ramp), *_notes_on_methods(given, scan.seconds)],
+        notes=[_note(n_views), *_notes_on_methods({m: given.get(m, {}) for m in scan.methods}, scan.seconds)],
         scan={**table.scan, "views to choose from": str(n_views)},
     )
     if not table.todo:
@@ -74,15 +75,14 @@ def planned_study(
     left_out = len(table.outcomes) - len(table.todo)
     started = StudyStarted(scan.source.path, len(table.todo), left_out, study.name)
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
-    fbp = Trial("method", BASELINE, n_views, settings={"filter": ramp}, choice=whole)
-    others = (trial(method, whole) for method in scan.methods if method != BASELINE)
+    references = tuple(trial(method, whole) for method in dict.fromkeys((BASELINE, *scan.methods)))
     data = replace(data, prepared=replace(data.prepared, held_out=None))
-    return Planned(data, table, started, (fbp, *others))
+    return Planned(data, table, started, references)
 
 
-def _note(n_views: int, ramp: Filter) -> str:
+def _note(n_views: int) -> str:
     return (
-        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method (fbp: {ramp}): "
+        f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings: "
         "they say what fewer views lose, not which method is better. That volume has noise, too, which rows share as "
         "far as they share its views. SNR and CNR are not those of beamline recon; a smoother volume has more."
     )
@@ -158,7 +158,6 @@ def _fits(method: str, n_views: int, gaussians: int, depth: Depth) -> list[Trial
         ("start", {"start": "tv"}),
         ("loss", {"fit.ssim_weight": 0.0}),
         *(("loss", {"fit.loss": loss}) for loss in ("l2", "poisson")),
-        ("rectification", {"fit.rays.rectified": False}),
     ]
     return [
         Trial(group, method, n_views, 2 if group == "binning" else 1, {**usual, **changed})

@@ -25,7 +25,7 @@ class ViewChoice:
 
     Attributes:
         label: in tables.
-        groups: [view][window]: each view is the mean of these views of the scan; None: left out.
+        groups: [view, window]: each view is the mean of these views of the scan; None: left out.
         family: choices of the same family are draws of the same kind; empty: it stands alone.
         reason: why it is left out.
     """

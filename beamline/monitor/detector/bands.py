@@ -64,7 +64,7 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class BandsState:
-    """Profiles [kind][axis]: of projections and of flats, their rows and their columns."""
+    """Profiles [kind, axis]: of projections and of flats, their rows and their columns."""
 
     projection: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))
     flat: tuple[Profile, Profile] = field(default_factory=lambda: (Profile(), Profile()))

@@ -7,6 +7,7 @@ import io
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.machine import machine
+from beamline.features.trials import table as module
 from beamline.features.trials.table import sentences, to_html, write_table
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
 from beamline.features.trials.trial import LEAST_GAIN, Outcome, Trial, TrialTable
@@ -105,7 +107,6 @@ CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
     "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "kernel": {"fit.kernel"},
-    "rectification": {"fit.rays.rectified"},
     "iterations": {"iterations"},
 }  # fmt: skip
 
@@ -194,3 +195,15 @@ def test_the_page_shows_words_of_others_as_words_and_marks_the_front() -> None:
     assert "a <b>" not in page and "a &lt;b&gt;.h5" in page
     assert f"<strong>{BASE.label}</strong>" in page and f"<strong>{FIT.label}" not in page
     assert "1 of 2 trials" in page
+
+
+def test_a_trial_far_below_the_best_is_drawn_at_the_lower_edge(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(module, "png", lambda figure: drawn.append(figure) or b"")
+    outcomes = [
+        Outcome(Trial("method", method, 10), "done", 1.0 + at, 10**8, {"psnr": db})
+        for at, (method, db) in enumerate((("fbp", 30.0), ("sirt", 25.0), ("cgls", 1.0)))
+    ]
+    module.quality_plot(TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, ""))
+    points = {line.get_marker(): line.get_ydata().tolist() for line in drawn[0].axes[0].lines if line.get_ydata().size}
+    assert points["v"] == [18.0] and {30.0, 25.0} <= {db for values in points.values() for db in values}
