@@ -14,7 +14,6 @@ from beamline.config.models import Config
 from beamline.core.errors import ConfigError
 from beamline.core.stop import StopRequest
 from beamline.features.doctor.examine import examine
-from beamline.features.files.nexus import nexus_findings
 from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
 from beamline.scan.preflight import dry_run
@@ -103,7 +102,6 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(
     assert len(told) == (asked != "null") and all(i < frames[0] for i in told)
     with h5py.File(run.folder / "scan.h5") as file:
         in_file(file, written)
-        assert not nexus_findings(file)
 
 
 @pytest.mark.parametrize(("name", "asked"), [("filter", "Al 1 mm"), ("monochromator", "8.34")])
