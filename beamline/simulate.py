@@ -6,14 +6,12 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beamline.core.files import write_whole
 from beamline.core.flag import PixelBox
 from beamline.storage.volumes.files import whole_volume
-from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
     from simulators.effects.chain import Label
@@ -84,11 +82,7 @@ def volumes_beside(folder: Path) -> ReadVolume:
     """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
     from simulators.samples.sample import Stored
 
-    meshes = in_folders("beamline.storage", "MESHES")
-
     def read_beside(file: str, dataset: str | None) -> Stored:
-        if module := meshes.get((folder / file).suffix.lower()):
-            return Stored(import_module(module).read_mesh(folder / file))
         return Stored(*whole_volume(folder / file, dataset))  # a full path stays itself
 
     return read_beside

@@ -66,7 +66,6 @@ def predicts_best(
     part: ReconProblem,
     methods: Sequence[Method],
     control: RunControl,
-    order: Sequence[int] | None = None,
     least_gain: float = LEAST_GAIN,
 ) -> TrialsVerdict:
     """Which method predicts held-out views (one of eight) as well as the best, and is the first to do so.
@@ -76,7 +75,6 @@ def predicts_best(
 
     Args:
         methods: the simplest and cheapest first.
-        order: in which they are tried; None: the same.
         least_gain: as of `cheapest_not_led`.
 
     Raises:
@@ -88,12 +86,11 @@ def predicts_best(
     refused: list[str] = []
     decided: dict[str, Sequence[Any]] = {}
 
-    for done, at in enumerate(order or range(len(methods)), 1):
+    for at, method in enumerate(map(_candidate, methods)):
         if control.stop():
             break
-        method = _candidate(methods[at])
         device, decide = part.device if method.traits.device else "cpu", Decisions(part.seed, decided)
-        tell = _of_trial(control, f"{method.name}, {done} of {len(methods)}")
+        tell = _of_trial(control, f"{method.name}, {at + 1} of {len(methods)}")
         run = RunControl(control.should_stop, tell, now=control.now, decide=decide)
         try:
             made = method.run(replace(trial, device=device), run)
@@ -105,7 +102,7 @@ def predicts_best(
         decided.update(prior_decisions(decide.made))
         residuals[at] = _residuals(made, method, judge)
         last = float(residuals[at].mean())
-        control.tell(Progress(done, len(methods), control.now() - begin, last, last, 0, n, unit="methods tried"))
+        control.tell(Progress(at + 1, len(methods), control.now() - begin, last, last, 0, n, unit="methods tried"))
     tried = sorted(residuals)
     listed = "; ".join(f"{methods[at].name} {residuals[at].mean():.4g}" for at in tried)
     if len(tried) + len(refused) < len(methods):

@@ -90,10 +90,15 @@ class Timing:
         self._scale = _work(geometry, grid) / _work(self._part.geometry, self._part.grid)
         self._trial_share = choice_sweeps(geometry) / CHOICE_SWEEPS
         self._trial = part_of(geometry, grid, voxels, TRIAL_ROWS)
-        self._paces: dict[str, Pace] = {}
+        self._paces, self._known = dict[str, Pace](), dict[str, Forecast]()
 
     def of(self, method: Method) -> Forecast:
         """The forecast of a method, see `forecast`."""
+        if (key := repr(method)) not in self._known:
+            self._known[key] = self._of(method)
+        return self._known[key]
+
+    def _of(self, method: Method) -> Forecast:
         candidates = candidates_of(method)
         if len(candidates) > 1:
             return self._of_choice(candidates)
@@ -104,16 +109,6 @@ class Timing:
         if isinstance(method, FitMethod):
             return self._of_fit(method)
         return Forecast(self.trial_seconds(method), {method.name: self.pace(method).total})
-
-    def whole_pace(self, method: Method) -> Pace:
-        """All seconds beside the steps, without trials of a finish, and those of each step."""
-        if method.traits.direct:
-            return Pace(self.direct_seconds(method), 0.0, 0)
-        if isinstance(method, FitMethod):
-            pace = self.fit_pace(method)
-            return pace._replace(fixed=pace.fixed + self._smooth.fixed + FINISH_SWEEPS * self._smooth.each)
-        pace = self.pace(method)
-        return pace._replace(fixed=pace.fixed + self.trial_seconds(method))
 
     def direct_seconds(self, method: Method) -> float:
         """Seconds of a direct method, whose kernels depend on the number of columns."""

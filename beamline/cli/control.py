@@ -14,13 +14,15 @@ import click
 
 from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
 from beamline.core.errors import INTERRUPTED, ConfigError
-from beamline.core.events import Done, Sink
+from beamline.core.events import DeviceRead, Done, Sink
 from beamline.core.stop import terminated_like_interrupted
+from beamline.core.text import one_line
 from beamline.plan.passes import Choice
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
+    from beamline.config.load import Config
     from beamline.storage.recover import Recovered
 
 CHOICES = tuple(Choice)
@@ -248,14 +250,19 @@ def print_schema() -> None:
     is_flag=True,
     help="Show the configuration with simulated devices, as `beamline scan --rehearse` would run it.",
 )
+@click.option(
+    "--connect",
+    is_flag=True,
+    help="Also connect each device, and print who it is and how it stands; no other program may use it meanwhile.",
+)
 @json_option
-def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool) -> None:
+def check(file: Path, overrides: tuple[str, ...], rehearse: bool, connect: bool, as_json: bool) -> None:
     """Validate CONFIG. Nothing moves.
 
     Prints the timeline of the scan: speed, taxi, angular step in counts, motion blur and rolling-shutter skew in
     pixels, duration, bytes to write and free disk space.
 
-    Exit code: 0 valid, 2 wrong configuration or violated limit.
+    Exit code: 0 valid, 2 wrong configuration or violated limit, 3 a device does not answer.
     """
     from beamline.config.load import load
     from beamline.scan.preflight import doubts, dry_run, refuse_violations
@@ -268,6 +275,27 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool)
         if not as_json:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)
+        if not as_json:
+            click.echo(f"\n{file} is valid: no limit is violated.")
+        if connect:
+            _read_devices(loaded, as_json, sink)
         sink(Done(worked.data(), time=SystemClock().now()))
-    if not as_json:
-        click.echo(f"\n{file} is valid: no limit is violated.")
+
+
+def _read_devices(config: Config, as_json: bool, sink: Sink) -> None:
+    """Print what each device says. Raises DeviceError at the end if one does not answer."""
+    from beamline.instrument.states import SHOWN, device_states
+
+    clock, silent = SystemClock(), list[str]()
+    with terminated_like_interrupted():
+        for state in device_states(config, clock):
+            sink(DeviceRead({"name": state.name, "fault": state.fault, **state.values}, time=clock.now()))
+            silent += [state.name] if state.fault else []
+            if not as_json:
+                said = state.fault or ", ".join(
+                    f"{name} {one_line(str(value))}" for name, value in state.values.items() if name in SHOWN
+                )
+                click.echo(f"{state.name:<14}{said}")
+    if silent:
+        advice = "Nothing has moved. Each line above says what to do"
+        raise DeviceError("devices", f"{' and '.join(silent)} cannot be used", advice=advice)

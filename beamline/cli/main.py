@@ -196,6 +196,9 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Resolve a command as click does; the error for an unknown name suggests the nearest one."""
+        if args[:1] == ["doctor"]:  # its name in version 1.0
+            click.echo("`beamline doctor` is now `beamline check CONFIG --connect`.", err=True)
+            args = ["check", "--connect", *(word for word in args[1:] if word != "--session")]
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:

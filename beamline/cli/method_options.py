@@ -151,11 +151,9 @@ _OF_ONE_VOLUME = {
 """Options that several volumes, in time or of materials, do not go with."""
 
 _FINISHED = {"follow": "it is for a finished scan"}
-_BY_BUDGET = {"budget": "--budget chooses it"}
-_NOT_KEPT = {"budget": "a run within a budget keeps no checkpoints", **_FINISHED}
-_PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
+_PLANNED = {"quality": "--quality chooses it"}
 _BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
-NOT_WITH_SLABS = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
+NOT_WITH_SLABS = {"follow": "such a run holds everything in memory"}
 NOT_WITH_ERROR_BARS = dict.fromkeys(
     ("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits"
 )
@@ -186,7 +184,6 @@ _FINISH = option(
 _ITERATIONS = option(
     "--iterations",
     setting="iterations",
-    excludes=_BY_BUDGET,
     type=click.IntRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
@@ -262,7 +259,7 @@ method_options = together(
         excludes={"quality": "give one of them", **_BY_SECONDS},
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
-        help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
+        help="Time from line integrals to volume: auto leaves out the methods whose forecast is longer.",
     ),
     option(
         "--quality",
@@ -275,7 +272,7 @@ method_options = together(
     option(
         "--start",
         setting="start",
-        excludes={**_BY_BUDGET, **_FINISHED},
+        excludes=_FINISHED,
         type=NameChoice(get_args(Start)),
         help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
         "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
@@ -283,14 +280,12 @@ method_options = together(
     option(
         "--loss",
         setting="fit.loss",
-        excludes=_BY_BUDGET,
         type=NameChoice(get_args(Loss)),
         help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
     ),
     option(
         "--kernel",
         setting="fit.kernel",
-        excludes=_BY_BUDGET,
         type=NameChoice([kernel.value for kernel in Kernel]),
         help="Shape of the Gaussians: true ones, or compact ones that end, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
@@ -299,7 +294,7 @@ method_options = together(
     option(
         "--device",
         trait="device",
-        excludes={**_BY_BUDGET, **_FINISHED},
+        excludes=_FINISHED,
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
@@ -309,7 +304,7 @@ method_options = together(
     option(
         "--early-stop",
         setting="early_stop",
-        excludes={**_BY_BUDGET, **_FINISHED},
+        excludes=_FINISHED,
         is_flag=True,
         help="End the fit when held-out views stop improving; holds out every tenth unless --views does.",
     ),
@@ -318,7 +313,7 @@ method_options = together(
     option(
         "--checkpoint",
         trait="checkpoints",
-        excludes=_NOT_KEPT,
+        excludes=_FINISHED,
         of_one_call=True,
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
@@ -327,7 +322,7 @@ method_options = together(
     option(
         "--resume",
         trait="checkpoints",
-        excludes=_NOT_KEPT,
+        excludes=_FINISHED,
         of_one_call=True,
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),
@@ -344,7 +339,6 @@ method_options = together(
         "--plain-splatting",
         setting="fit.rays.rectified",
         inverted=True,
-        excludes=_BY_BUDGET,
         is_flag=True,
         help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It has a bias that the "
         "corrected projection avoids.",

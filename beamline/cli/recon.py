@@ -168,7 +168,7 @@ def run_reconstruction(
     from beamline.reconstruct.pipeline import reconstruct_file  # here: help needs none of it
 
     limit = values.get("max_residual")
-    stop = StopOnSignal(ready=options.follow is not None or options.budget is not None)
+    stop = StopOnSignal(ready=options.follow is not None)
 
     def made(event: Event) -> None:
         """Note when there is a volume: from the first step or iteration on; what has a unit is a trial, or slices.

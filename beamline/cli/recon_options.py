@@ -187,7 +187,7 @@ recon_options = together(
     option(
         "--dry-run",
         "dry",
-        excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time"},
+        excludes={"follow": "a scan that runs takes its own time", "budget": "it states the time of every method"},
         of_one_call=True,
         is_flag=True,
         help="Print the memory, time and disk space that it will take, and end. Nothing is run.",

@@ -49,10 +49,8 @@ if TYPE_CHECKING:
 
 SAY_EVERY = 0.2  # s between events on the progress of many frames
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
-_COUNTED = {
-    **dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames")),
-    "archive": ("written and compared", "MB"),
-}  # stage: the name of its bar and what it counts; other stages are named after what they count
+_COUNTED = dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames"))
+# stage: the name of its bar and what it counts; other stages are named after what they count
 
 
 class Terminal:

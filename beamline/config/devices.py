@@ -105,10 +105,10 @@ class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # typ
     )
     usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = Field(
         default=None,
-        description="USB product id, for the doctor; null: any of the vendor's (which makes other things too).",
+        description="USB product id, for `check --connect`; null: any of the vendor's (which makes other things too).",
     )
     usb_serial: str | None = Field(
-        default=None, description="USB serial number, for the doctor, where there are several cameras."
+        default=None, description="USB serial number, for `check --connect`, where there are several cameras."
     )
 
     @property

@@ -279,8 +279,8 @@ class StepsListed(Listed, event="explain"):
     """Steps of a frame of a scene in order, and the effects that it does not name."""
 
 
-class Diagnosed(Listed, event="check"):
-    """One result of `beamline doctor`."""
+class DeviceRead(Listed, event="device"):
+    """What a device says of itself to `beamline check --connect`: `name`, `fault` ("" if it answers) and its values."""
 
 
 class RunDone(Event, event="done"):

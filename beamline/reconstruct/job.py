@@ -1,4 +1,4 @@
-"""Job: views from a source, and the volume that is made of them: at once, in slabs or within a budget."""
+"""Job: views from a source, and the volume that is made of them: at once or in slabs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beamline.core.recon_events import FitReached
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.budget import within
+from beamline.reconstruct.budget import in_budget
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
@@ -185,12 +185,20 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct within a time budget, in slabs, or at once; returns the volume, and the views as used."""
-    prepared = job.prepared
-    if job.options.budget is not None or not job.slabs:
-        budget = job.options.budget
-        made, used = (_at_once(job, decided), prepared) if budget is None else _within_budget(job, budget)
-        return replace(made, outside=None), without_outside(used, made)
+    """Reconstruct in slabs, or at once; returns the volume, and the views as used."""
+    prepared, budget = job.prepared, job.options.budget
+    if budget is not None:
+        with refused(job.options):
+            method, words = in_budget(
+                job.method, budget, prepared.geometry, prepared.box, job.channels.clock.now, job.channels.warn
+            )
+        job.say(words, "budget")
+        made, used = volume_of(replace(job, options=replace(job.options, method=method, budget=None)), decided)
+        chosen = f"{made.chosen or made.method}; {words}"
+        return replace(made, chosen=chosen, settings={**made.settings, "budget": budget}), used
+    if not job.slabs:
+        made = _at_once(job, decided)
+        return replace(made, outside=None), without_outside(prepared, made)
     made = _by_slabs(job, decided)
     if job.options.method.traits.direct and prepared.view_weights is not None:
         # For the record: FBP takes all rays alike, and so do its figures.
@@ -301,12 +309,3 @@ def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
             runner_of(options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
         )
     return _ended(result, replace(result.ending, early=job.stop.stopped))
-
-
-def _within_budget(job: Job, budget: float) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct within `budget` s, from pixels that may be joined."""
-    methods, largest = candidates_of(job.options.method), None if job.region is None else 1
-    control = RunControl(job.stop, job.listener(budget), now=job.channels.clock.now)
-    with refused(job.options):
-        made, prepared = within(budget, job.prepared, methods, job.options.seed, control, job.channels.warn, largest)
-    return _ended(made, Ending(job.stop.stopped), made.chosen), prepared

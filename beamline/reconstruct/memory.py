@@ -195,7 +195,6 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
     whole = {
         **{f"{step.asked_by} with roll or tilt": step.may_lean for step in geometry_steps(options.selection)},
         "--poses with roll, tilt or vectors": poses is not None and poses.leans,
-        "--budget": options.budget is not None,
         "--checkpoint and --resume": options.checkpoints.wanted,
         "--early-stop": options.stops_early,
     }

@@ -113,7 +113,7 @@ class ReconOptions:
 
     Attributes:
         method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
-        budget: s for everything from line integrals to volume; chooses the method and all settings.
+        budget: s from line integrals to volume; methods of a choice that would take longer are left out.
         quality: a preset instead of the fit's steps, Gaussians.
         filter: of the FBP that the volume is compared with.
         truth: FILE or FILE:first:end to compare with.

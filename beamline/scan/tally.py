@@ -118,8 +118,8 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s are missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" {taken.lost} were exposed but never delivered by the camera: `beamline doctor` looks at its link "
-                "and at the disk."
+                f" {taken.lost} were exposed but never delivered by the camera: "
+                "`beamline check --connect` looks at its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."

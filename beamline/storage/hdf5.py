@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import h5py
-import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
+import hdf5plugin  # noqa: F401 - registers the compressors that copies of scans use
 
 from beamline.core.errors import DataError
 from beamline.core.files import no_file

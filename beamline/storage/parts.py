@@ -219,7 +219,7 @@ def to_join(run: Path) -> str:
 def require_joined(file: h5py.File) -> None:
     """Raise DataError if a joined file refers to frames of changed parts, or lacks a part.
 
-    A file with frames of its own, such as an archived one, always passes.
+    A file with frames of its own, such as a repacked copy, always passes.
     """
     if layout.PART_STARTS not in file or not file[layout.DATA].is_virtual:
         return

@@ -76,7 +76,7 @@ class ReconRecord:
             by this program just now; files do not hold it.
         warnings: sentences.
         hiding: the warning of what the volume may hide; empty without.
-        chosen: how `auto`, a budget or a preset came to its settings; empty where they were given.
+        chosen: how `auto` or a preset came to its settings; empty where they were given.
         output, report: files of the volume and of its report; None: not written.
         elapsed, times: s in all, and of each phase.
     """

@@ -26,30 +26,10 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 
 
-@dataclass(frozen=True)
-class SerialPort:
-    """A serial port by its device name, with the ids and texts of its USB adapter; None and "" without one."""
-
-    device: str
-    vendor: int | None
-    product: int | None
-    serial: str
-    description: str
-
-    def __str__(self) -> str:
-        usb = "" if self.vendor is None else f" {self.vendor:04x}:{self.product or 0:04x}"
-        number = f" serial {self.serial}" if self.serial else ""
-        return f"{self.device}{usb}{number}" + (f" ({self.description})" if self.description else "")
-
-
-def serial_ports() -> tuple[SerialPort, ...]:
-    """The ports that pyserial lists, by device name; none is opened."""
-    return tuple(sorted((_described(port) for port in list_ports.comports()), key=lambda port: port.device))
-
-
-def _described(port: Any) -> SerialPort:
-    description = "" if port.description in (None, "n/a") else port.description
-    return SerialPort(port.device, port.vid, port.pid, port.serial_number or "", description)
+def serial_ports() -> str:
+    """The ports that pyserial lists, by device name with the ids of their adapters; none is opened."""
+    ports = sorted(list_ports.comports(), key=lambda port: str(port.device))
+    return "; ".join(f"{port.device} ({port.description}, {port.hwid})" for port in ports) or "none"
 
 
 def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> Any:
@@ -158,7 +138,8 @@ class SerialLine:
                 device,
                 f"the port {url!r} does not open: {problem}",
                 expected="a port like /dev/ttyUSB0, COM3, socket://host:port or sim://pm16c",
-                advice="Check the cable, the port's name in the configuration and that no other program holds it",
+                advice="Check the cable, the port's name in the configuration and that no other program holds it. "
+                f"Serial ports of this computer: {serial_ports()}",
                 state="Nothing was sent",
             ) from problem
         self._reader = LineReader(self._port, clock, self._transcript, rules.framing, rules.unsolicited, rules.check)

@@ -1,41 +1,18 @@
-"""Useful lengths of methods, presets, and times as text."""
+"""Lengths of fits, presets, and times as text."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from recon.base.choices import Quality
-from recon.base.empirical import DEFAULT_STEPS
 
 MODEL_STEPS = 50
 """Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
 
 
-@dataclass(frozen=True)
-class UsefulSteps:
-    """Steps of a method between which the volume becomes better, on four measured and simulated scans.
-
-    Attributes:
-        setting: that counts them; empty for a method without steps.
-        least: from which the volume is nearer to the truth than FBP.
-        most: beyond which further steps fit the noise.
-    """
-
-    setting: str = ""
-    least: int = 1
-    most: int = 1
-
-
-USEFUL: Mapping[str, UsefulSteps] = {
-    "fbp": UsefulSteps(),
-    "os-sirt-tv": UsefulSteps("iterations", 10, 40),
-    "r2": UsefulSteps("steps", 125, 1000),
-    "fista-tv": UsefulSteps("iterations", 5, 40),
-}
-"""By method, the preferred one last: up to 7.1, 8.4 and 8.1 dB above FBP, means of four scans; the last two are level.
-Of pixels binned by two, all are 1.7 to 3.9 dB behind FBP of all pixels."""
+MOST_STEPS = 1000
+"""Of a fit within a time: further ones fit the noise, on four measured and simulated scans."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +28,6 @@ class Preset:
 
 
 PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Preset(400, 1.0), "best": Preset(1500, 1.0)}
-
-
-def best_steps(method: str) -> int:
-    """Steps of this method beyond which further ones fit the noise."""
-    return USEFUL[method].most if method in USEFUL else DEFAULT_STEPS
 
 
 def parse_budget(text: str) -> float:

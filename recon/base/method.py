@@ -213,7 +213,7 @@ class Reconstruction:
         series: all volumes, the first of which is `volume`; None: the method makes one.
         at: gives the volume [z, y, x] that a view shows, by its time as in `DataUse.times`, or by the number of its
             energy; None: the method makes one volume.
-        chosen: how a choice, a budget or a preset came to the settings; empty where they were given.
+        chosen: how a choice or a preset came to the settings; empty where they were given.
         started_from: Gaussians at the start of a fit; 0 for other methods.
         ending: how it ended, as its caller knows it.
         outside: gives what the sample outside the volume adds to views, [view, row, col] for their geometry; None:
@@ -266,7 +266,7 @@ class Traits:
         held_out: views can be held out.
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
-        budget: a time budget chooses its settings, see `recon.assess.time_model`.
+        budget: a time budget leaves out candidates of it.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.

@@ -20,7 +20,6 @@ from typing import Any, Generic, Literal, TypeVar
 
 _PREFIX = "splatline."
 ADD_ONS = {
-    "archive": "splatline-archive",
     "cluster": "splatline-cluster",
     "emission": "splatline-emission",
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),

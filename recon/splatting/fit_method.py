@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 from recon.base.method import Method
 
 if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
-    from recon.base.arrays import F32
     from recon.base.choices import Start
     from recon.base.geometry import Geometry
     from recon.base.method import Clock, Plain
@@ -60,9 +59,6 @@ class FitMethod(Method, Protocol):
 
     def as_candidate(self) -> Self:
         """The same fit, which makes its own volume whatever methods on voxels predict."""
-
-    def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
-        """Start the fit on these views; the result runs within the seconds that are then `left`."""
 
     def for_trial(self, share: float, of_steps: float) -> Self:
         """The fit alone, of this share of the rows, with this share of the steps."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
-import numpy as np
-
-from recon.assess.time_model import MODEL_STEPS, PRESETS, best_steps
-from recon.base.arrays import F32
+from recon.assess.time_model import MODEL_STEPS, PRESETS
 from recon.base.choices import Quality, Start
 from recon.base.declared_types import Checked, Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
@@ -20,7 +17,7 @@ from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import default_count, first_volume, place
+from recon.splatting.initialise import default_count
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
@@ -59,7 +56,6 @@ class R2(Checked):
         held_out=True,
         checkpoints=True,
         presets=True,
-        budget=True,
         any_grid=True,
         needs_matter=True,
         halo=16,
@@ -126,15 +122,6 @@ class R2(Checked):
             gaussians=max(1, round(share * count)) if isinstance(count, int) else count,
             seconds=None if seconds is None else of_time * seconds,
         )
-
-    def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
-        """The fit from Gaussians that are placed here, within the seconds `left` afterwards."""
-        field = Grid.of_field(geometry, geometry.sample_pitch)
-        assert not isinstance(self.gaussians, Gaussians)
-        rng = np.random.default_rng(seed)
-        volume = first_volume(projections, geometry, field)
-        placed = place(volume, projections, geometry, self.gaussians, rng, kernel=self.fit.kernel)
-        return replace(self, steps=best_steps(self.name), seconds=max(0.0, left()), gaussians=placed)
 
     @property
     def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:

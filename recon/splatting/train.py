@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.time_model import MODEL_STEPS, best_steps
+from recon.assess.time_model import MODEL_STEPS, MOST_STEPS
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -369,7 +369,7 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
 
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
     """The plan of the finish, if so many seconds remain after first steps of `step` seconds each."""
-    return planned_finish(run.method, remaining, best_steps(run.method.name) * step, run.views.fitted, run.control.now)
+    return planned_finish(run.method, remaining, MOST_STEPS * step, run.views.fitted, run.control.now)
 
 
 def _predicts_worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:

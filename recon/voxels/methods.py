@@ -54,7 +54,7 @@ class FistaTv(VoxelMethod):
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=12, error_bars=(2.2, 0.1))
+    traits: ClassVar[Traits] = Traits(device=True, halo=12, error_bars=(2.2, 0.1))
     buffers: ClassVar[Buffers] = Buffers(7.3, 3.0, 4.8, filtered=True)
 
     iterations: Count = TRIAL_SWEEPS
@@ -111,7 +111,7 @@ class OsSirtTv(VoxelMethod):
 
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
-    traits: ClassVar[Traits] = Traits(budget=True, halo=20)
+    traits: ClassVar[Traits] = Traits(halo=20)
     buffers: ClassVar[Buffers] = Buffers(8.1, 5.2, 8.2, filtered=True)
 
     iterations: Count = 40

@@ -5,7 +5,7 @@ electrons:
 
     phantom: {kind: battery, field_of_view: [0.9, 0.9], n_particles: 150, seed: 7}
     # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
-    # or:    kind cathode, foam or resolution (samples.builders.cathode, ...), or volume or mesh, from a file (voxels)
+    # or:    kind cathode or foam (samples.builders.cathode, ...), or volume, from a file (voxels)
     #        {kind: foam, change: {kind: settle, share: 0.2, over_s: 9}}      # while it is scanned (builders.change)
     beam: {photons_per_s: 1.0e5}        # detected a second and sensor pixel (quantum efficiency included)
     axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels

@@ -2,6 +2,6 @@
 
 COMMANDS = {
     "info": ("Describe a scan file or a volume.", False),
-    "validate": ("Check a scan file or a volume against the rules of its format.", False),
+    "validate": ("Check whether a scan file can be reconstructed, or whether a volume is sound.", False),
     "ingest": ("Copy any scan into one HDF5 scan, frame by frame.", True),
 }

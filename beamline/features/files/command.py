@@ -147,7 +147,7 @@ def _text(value: Any) -> str:
 @click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
 def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
-    """Check the scan or volume in FILE against the rules of its format.
+    """Check whether the scan in FILE can be reconstructed, or whether the volume in it is sound.
 
     Exit code: 0 no error (warnings may be), 5 errors.
     """

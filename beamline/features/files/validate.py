@@ -1,6 +1,6 @@
 """validate and describe: everything that the rules find in a file of a scan or a volume, and its facts as plain values.
 
-The rules of storage.rules look at a scan of any format; the ones of `nexus` at how an NXtomo is written down.
+The rules of storage.rules look at a scan of any format; `frame_log` at what the camera's count and the clock say.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
-from beamline.features.files.nexus import nexus_findings
+from beamline.features.files.frame_log import framestamp_order, time_order
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -84,14 +84,12 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
                 with opened_volume(path, at=at) as record, hdf5.readable(path):
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]
-        findings += _as_hdf5(path)
         with open_scan(scan) as source:
-            findings += source_findings(source)
+            findings += [*time_order(source), *framestamp_order(source), *source_findings(source)]
             findings += views_lit(source, deep is not None)
             findings += frames_as_written(source, deep)
     except DataError as error:
-        if not any(finding.severity == "error" for finding in findings):  # else it is already said why
-            findings.append(Finding("error", "readable", str(error)))
+        findings.append(Finding("error", "readable", str(error)))
     except (OSError, RuntimeError, KeyError) as error:
         if not damaged(error):
             raise
@@ -166,16 +164,6 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         )
     elif progress and not source.checksummed:
         yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
-
-
-def _as_hdf5(path: Path) -> list[Finding]:
-    if not path.is_file():
-        return []
-    try:
-        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-            return nexus_findings(file)
-    except DataError:
-        return []  # not HDF5, or without frames: open_scan says what is wrong
 
 
 LOOK = 15.0

@@ -39,7 +39,7 @@ class R2Published(R2):
     name: ClassVar[str] = "r2-published"
     label: ClassVar[str] = "R²-Gaussian as published"
 
-    traits: ClassVar[Traits] = replace(R2.traits, budget=False, error_bars=None)
+    traits: ClassVar[Traits] = replace(R2.traits, error_bars=None)
 
     steps: int | None = _STEPS
     gaussians: int | Gaussians | None = 50_000

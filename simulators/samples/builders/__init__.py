@@ -1,1 +1,1 @@
-"""Builders: batteries, cathodes, foams and resolution patterns out of bodies."""
+"""Builders: batteries, cathodes and foams out of bodies."""

@@ -1,3 +1,3 @@
-"""Samples of voxels: volumes and meshes that are read from files."""
+"""Samples of voxels: volumes that are read from files."""
 
-PHANTOMS = dict.fromkeys(("volume", "mesh"), f"{__name__}.files")
+PHANTOMS = {"volume": f"{__name__}.files"}

@@ -63,9 +63,9 @@ def test_work_loads_what_it_uses_and_a_wrong_file_nothing_heavy(tmp_path: Path) 
     (tmp_path / "wrong.h5").write_text("no HDF5", encoding="utf-8")
     (tmp_path / "bad.yaml").write_text("scan: {nonsense: 3}", encoding="utf-8")
     light = ["runs .", "validate scan.h5", "info scan.h5"]
-    wrong = [f"{name} bad.yaml" for name in ("check", "home", "tune", "scan", "doctor")]
+    wrong = [f"{name} bad.yaml" for name in ("check", "home", "tune", "scan")]
     wrong += [f"{name} wrong.h5" for name in ("info", "recover", "monitor", "view")]
-    wrong += ["ingest wrong.h5 out.h5", "export wrong.h5 -o out.h5", "archive wrong.h5 -o out.h5"]
+    wrong += ["ingest wrong.h5 out.h5", "export wrong.h5 -o out.h5"]
     kernels = ["recon -m fbp", "recon -m r2", "voxelise -o out.h5", "render -o out.h5", "surface -o out.stl"]
     kernels = [f"{words} wrong.h5" for words in kernels]
     works = "recon -m fbp scan.h5 -o v.h5 --no-report"

@@ -121,7 +121,7 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     def completed(*words: str) -> list[str]:
         return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
 
-    assert completed("doctor", "--se") == ["--session", "--set"]
+    assert completed("check", "--se") == ["--set"]
     monkeypatch.setattr("beamline.cli.main.import_module", None)
     assert completed("re")[:3] == ["resume", "recon", "recover"]
     assert completed("--v") == ["--version"]

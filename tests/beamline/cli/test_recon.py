@@ -121,12 +121,11 @@ def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path,
 
 
 @pytest.mark.slow
-def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> None:
+def test_a_budget_says_what_it_chose(folder: Path) -> None:
     result = succeeds("recon", "scan.h5", "--axis", "20.7", "--budget", "1s", "--no-report")
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
-    assert "of 1 s; " in lines["chosen"]
     parameters = read_reconstruction(folder / "scan_auto.h5").parameters
-    assert parameters["budget"] == 1 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
+    assert parameters["budget"] == 1 and "; 1 s for fbp" in lines["chosen"]
 
 
 def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) -> None:

@@ -15,7 +15,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.reconstruct.budget import binned
+from beamline.reconstruct.run import binned
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource, scan_of

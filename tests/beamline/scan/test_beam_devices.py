@@ -13,10 +13,9 @@ import pytest
 from beamline.config.models import Config
 from beamline.core.errors import ConfigError
 from beamline.core.stop import StopRequest
-from beamline.features.doctor.examine import examine
-from beamline.features.files.nexus import nexus_findings
 from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
+from beamline.instrument.states import device_states
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
@@ -103,7 +102,6 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(
     assert len(told) == (asked != "null") and all(i < frames[0] for i in told)
     with h5py.File(run.folder / "scan.h5") as file:
         in_file(file, written)
-        assert not nexus_findings(file)
 
 
 @pytest.mark.parametrize(("name", "asked"), [("filter", "Al 1 mm"), ("monochromator", "8.34")])
@@ -194,31 +192,30 @@ URL = f"pva://{PREFIX}it"
 STANDS = {
     "filter": (
         f"{{kind: epics, pv: '{URL}', places: {{none: 0, Cu: 2}}, timeout_s: 0.5}}",
-        {2.0: ("ok", "Cu."), 1.0: ("warning", "It stands at no place that has a name.")},
+        {2.0: {"place": "Cu"}, 1.0: {"place": "none that has a name"}},
     ),
     "monochromator": (
         f"{{kind: epics, pv: '{URL}', status_pv: '{URL}', timeout_s: 0.5, unit: eV, range_kev: [4, 25]}}",
-        {8340.0: ("ok", "8.34 keV."), 8.34: ("warning", "It stands at 0.00834 keV.")},
+        {8340.0: {"energy_kev": 8.34}},
     ),
 }
 
 
 @pytest.mark.parametrize("name", STANDS)
-def test_the_doctor_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
+def test_a_check_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
     pytest.importorskip("p4p")
-    monkeypatch.setattr("beamline.features.doctor.examine.MOST", 1 << 20)
     section, stands = STANDS[name]
     settings = shipped("instrument", f"devices.{name}={section}", f"storage.folder={tmp_path}")
     served, clock = Variables({"it": 0.0}), TickingClock()
 
-    def found() -> tuple[str, str]:
-        (one,) = [check for check in examine(settings, clock) if check.name == name]
-        return one.verdict, one.observed
+    def found() -> tuple[str, dict[str, Any]]:
+        (one,) = [state for state in device_states(settings, clock) if state.name == name]
+        return one.fault, dict(one.values)
 
     with serve_pva(served, clock, monkeypatch) as ioc:
         for value, expected in stands.items():
             served.values["it"] = value
             clock.sleep(1)
-            assert found() == expected
+            assert found() == ("", expected)
         ioc.stop()
-    assert found()[0] == "failed"
+    assert found()[0]

@@ -163,7 +163,7 @@ def test_a_view_that_became_invalid_is_taken(tmp_path: Path, monkeypatch: pytest
 
 
 def _assert_told_of_parts(run: Path) -> None:
-    """Each part names the joined file, which speaks of no other, and is reconstructed as little as it is archived."""
+    """Each part names the joined file, which speaks of no other, and is not reconstructed by itself."""
     for part in (run / "scan.h5", run / "part-2/scan.h5"):
         line = f"This file is one of 2 parts of a scan: give {run / 'joined.h5'}, which has the frames of all."
         assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1

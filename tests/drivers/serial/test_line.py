@@ -13,7 +13,7 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.serial.line import LineRules, Probe, SerialLine, SerialPort, serial_ports
+from drivers.serial.line import LineRules, Probe, SerialLine, serial_ports
 from drivers.serial.line_reader import RECENT_LINES
 from simulators.devices.clock import VirtualClock
 from simulators.wires.wire import register
@@ -29,15 +29,8 @@ def listed(device: str, **facts: object) -> ListPortInfo:
 def test_ports_and_what_they_say(monkeypatch: pytest.MonkeyPatch) -> None:
     adapter = listed("/dev/ttyUSB0", vid=0x0403, pid=0x6001, serial_number="FT1234", description="FT232R USB UART")
     monkeypatch.setattr(list_ports, "comports", lambda: [adapter, listed("/dev/ttyS0")])
-    plain, usb = serial_ports()
-    assert usb == SerialPort("/dev/ttyUSB0", 0x0403, 0x6001, "FT1234", "FT232R USB UART")
-    assert str(usb) == "/dev/ttyUSB0 0403:6001 serial FT1234 (FT232R USB UART)"
-    assert plain == SerialPort("/dev/ttyS0", None, None, "", "")
-    assert str(plain) == "/dev/ttyS0"
-
-
-def test_this_computer_can_be_asked() -> None:
-    assert all(port.device for port in serial_ports())
+    plain, usb = serial_ports().split("; ")
+    assert plain == "/dev/ttyS0 (n/a, n/a)" and usb.startswith("/dev/ttyUSB0 (FT232R USB UART, ")
 
 
 NAMES = (f"line-test-{number}" for number in itertools.count())

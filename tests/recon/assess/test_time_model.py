@@ -1,4 +1,4 @@
-"""Times are read and said in any unit, and useful lengths are those of methods."""
+"""Times are read and said in any unit."""
 
 from __future__ import annotations
 
@@ -6,14 +6,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from recon.assess.time_model import USEFUL, duration_text, parse_budget
-from recon.methods import by_name, has_setting
-
-
-def test_useful_steps_are_counted_by_a_setting_of_the_method() -> None:
-    for name, useful in USEFUL.items():
-        assert useful.least <= useful.most
-        assert has_setting(by_name(name), useful.setting) or (useful.setting == "" and by_name(name).traits.direct)
+from recon.assess.time_model import duration_text, parse_budget
 
 
 @given(st.floats(0.1, 900))

@@ -1,3 +1,3 @@
-"""Builders of packed bodies and patterns: cathodes, foams and resolution patterns."""
+"""Builders of packed bodies: cathodes and foams."""
 
-PHANTOMS = dict.fromkeys(("cathode", "foam", "resolution"), f"{__name__}.pieces")
+PHANTOMS = dict.fromkeys(("cathode", "foam"), f"{__name__}.pieces")

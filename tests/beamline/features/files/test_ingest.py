@@ -83,7 +83,7 @@ def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.
         assert (source.quantity, source.attributes["sample"]) == ("counts", "rock")
         np.testing.assert_array_equal(source.read(slice(3, None)), pages)
     told = {finding.rule for finding in validate(tmp_path / "out.h5")}
-    assert told == {"stuck-frames", "constant-darks"}  # flats and darks are of one number
+    assert told == {"constant-darks"}  # flats and darks are of one number
 
 
 @pytest.mark.parametrize(

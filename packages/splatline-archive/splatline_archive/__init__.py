@@ -1,1 +1,0 @@
-"""Compressed copies of scan files, compared with them frame by frame."""
