@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
+import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import no_file
@@ -127,6 +128,24 @@ def look_again(item: h5py.Dataset) -> None:
     plist = item.file.id.get_access_plist()
     if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
         item.refresh()
+
+
+def written(item: Any, known: int = 0) -> int:
+    """How many frames or values of a growing dataset are there, of which `known` were before.
+
+    Its writer may have made room for more: for frames of which no chunk is stored, or for values at the end of a list
+    that are its fill value or NaN.
+    """
+    look_again(getattr(item, "item", item))
+    if item.ndim == 1:
+        values = item[()]
+        return int(np.flatnonzero((values != item.fillvalue) & (values == values)).max(initial=-1)) + 1
+    if not isinstance(item, h5py.Dataset) or item.chunks is None:
+        return len(item)
+    last = [n - 1 for n in item.shape[1:]]
+    while known < len(item) and item.id.get_chunk_info_by_coord((known, *last)).byte_offset is not None:
+        known += 1
+    return known
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:

@@ -38,9 +38,9 @@ PLACES = (
 )
 
 
-def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
+def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = hdf5.open_hdf5(path)
+    file = hdf5.open_hdf5(path, follow)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
@@ -52,11 +52,16 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
-        n_views = len(stacks[-1].frames)
-        if own_angles:
-            source.angles[-n_views:] = _theta(file, n_views)
-        source.take_order(_thetas(file, stacks), _later_flats(file, int((source.image_key == FrameKind.FLAT).sum())))
-        _set_exposures(source, file)
+        n_views, source.own_angles = len(stacks[-1].frames), own_angles
+        if source.finished:
+            if own_angles:
+                source.angles[-n_views:] = _theta(file, n_views)
+            n_flats = int((source.image_key == FrameKind.FLAT).sum())
+            source.take_order(_thetas(file, stacks), _later_flats(file, n_flats))
+            _set_exposures(source, file)
+        else:
+            source.came = np.zeros((0, 2), np.int64)
+            source.refresh()
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
@@ -68,10 +73,38 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 class ExchangeSource(StacksSource):
-    """A scan in a Data Exchange file."""
+    """A scan in a Data Exchange file.
 
+    Attributes:
+        came: [frame, 2] the stack of each frame and its place in it, as they came, of a file that was still being
+            written when it was opened; else None.
+    """
+
+    own_angles: bool = True
+    came: NDArray[np.int64] | None = None
     _of_stack: NDArray[np.int64] | None = None
     """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
+
+    def refresh(self) -> int:
+        if self.came is None:
+            return super().refresh()
+        ended, angled = self.finished, np.inf
+        if self.own_angles and (theta := datasets.dataset(self._file, "exchange/theta")) is not None:
+            angled = hdf5.written(theta)
+        for number, stack in enumerate(self._stacks):
+            had = int((self.came[:, 0] == number).sum())
+            there = min(hdf5.written(stack.frames, had), angled if stack.kind == FrameKind.PROJECTION else np.inf)
+            n = len(stack.frames) if ended else int(there)
+            self.came = np.r_[self.came, np.c_[np.full(n - had, number), np.arange(had, n)]]
+        self._starts = np.cumsum([0, *(len(stack.frames) for stack in self._stacks)])
+        self._of_stack = self._starts[self.came[:, 0]] + self.came[:, 1]
+        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.came[:, 0]]
+        views = self.image_key == FrameKind.PROJECTION
+        self.angles, self.exposures = np.full((2, views.size), np.nan)
+        if self.own_angles:
+            self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
+        _set_exposures(self, self._file)
+        return views.size
 
     def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
         """Sort darks and flats among the views, if the file says when flats were taken.
@@ -204,7 +237,7 @@ def _positive(file: h5py.File, where: str, units: Mapping[str, float]) -> float 
     return value if value is not None and value > 0 else None
 
 
-def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
+def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.float64]:
     theta = datasets.dataset(file, "exchange/theta")
     if theta is None:
         datasets.refuse_broken(file, "exchange/theta")
@@ -213,7 +246,7 @@ def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
             "give them with --angles FILE (degrees, one a line)."
         )
     angles = datasets.radians(theta, default="degrees")
-    if angles.size != n_views or n_views not in (1, *theta.shape):
+    if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
         way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
@@ -246,5 +279,5 @@ def _recognises(path: Path, opening: Opening) -> bool:
 FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
-    lambda path, opening: open_exchange(path, own_angles=opening.own_angles),
+    lambda path, opening: open_exchange(path, follow=opening.follow, own_angles=opening.own_angles),
 )

@@ -19,6 +19,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.superblock import marked
 from drivers.base.frame import FrameKind
 
 
@@ -28,8 +29,11 @@ class TurnedFrames:
     def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
         """`order`: which dimensions of `item` are frames, rows and columns."""
         self.item, self._order = item, order
-        self.shape = tuple(item.shape[axis] for axis in order)
         self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.item.shape[axis] for axis in self._order)
 
     @property
     def frame_bytes(self) -> int:
@@ -80,7 +84,7 @@ class FrameStack:
 
 
 class StacksSource(ScanSource):
-    """A scan in stacks; see ScanSource. `finished` is always True: a scan in stacks cannot grow.
+    """A scan in stacks; see ScanSource.
 
     Quantity: "counts" if there are darks and flats, otherwise "unknown".
     """
@@ -105,6 +109,10 @@ class StacksSource(ScanSource):
         self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
         self.in_order = kinds == {FrameKind.PROJECTION}
 
+    @property
+    def finished(self) -> bool:
+        return not isinstance(self._file, h5py.File) or not marked(self.path)
+
     def _check(self) -> None:
         views = self._stacks[-1]
         for stack in self._stacks:
@@ -118,7 +126,8 @@ class StacksSource(ScanSource):
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
-            raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
+            none = DataError if self.finished else hdf5.NotReadyError
+            raise none(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
