@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.text import NUMBER, one_line, printable
+from beamline.core.machine import free_memory
+from beamline.core.text import NUMBER, one_line, printable, size
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
 from beamline.storage.structure import drawn_on, plain_name
 
@@ -42,7 +43,7 @@ HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one 
 _CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
-_PIECE = 2**31  # bytes of a chunk of frames
+_UNPACKING = 2  # a filter has its input and its output in memory at once (measured: 1.6 to 2.1 chunks)
 NAME = 1000  # letters of a name or a title
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan
 
@@ -337,8 +338,12 @@ def _fills(drawn: h5py.Dataset, source: Any) -> bool:
     return [n for n in drawn.shape if n != 1] == [n for n in extent if n != 1]
 
 
-def require_possible(item: h5py.Dataset) -> None:
-    """Raise DataError for frames [frame, row, col] without pixels, or too large for any memory."""
+def require_possible(item: Any) -> int:
+    """Bytes of memory that are taken while a chunk of frames [frame, row, col] is unpacked.
+
+    Raises:
+        DataError: frames without pixels, or too large for any memory, or for this one.
+    """
     if 0 in item.shape[1:]:
         raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
@@ -346,11 +351,14 @@ def require_possible(item: h5py.Dataset) -> None:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    if (piece := piece_of(item)) > _PIECE:
+    packed = getattr(item, "item", item).id.get_create_plist().get_nfilters()
+    if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in pieces of {piece / 1e9:.3g} GB, which are unpacked "
-            f"for any frame; expected {_PIECE / 1e9:.3g} GB at most. Copy it with a frame a chunk."
+            f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "
+            f"{size(needed)} of memory, {size(free)} are free. Copy it with a frame a chunk (h5repack -l CHUNK=...), "
+            "where there is more. Nothing was read."
         )
+    return needed
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:

@@ -105,7 +105,7 @@ class NexusSource(ScanSource):
         for item in (self._places.data, self._places.image_key, finer):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
-        datasets.require_possible(self._places.data)
+        self.unpacking = datasets.require_possible(self._places.data)
         require_order(self._places)
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
         if lost:

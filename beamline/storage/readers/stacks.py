@@ -122,7 +122,7 @@ class StacksSource(ScanSource):
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset):
-                datasets.require_possible(stack.frames)
+                self.unpacking = max(self.unpacking, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):

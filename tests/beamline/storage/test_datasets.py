@@ -113,3 +113,25 @@ def test_a_source_is_opened_once_however_often_it_is_drawn_on(tmp_path: Path, mo
     virtual(tmp_path, "5.h5", ("12.h5", slice(0, 8)))  # a circle
     with h5py.File(tmp_path / "12.h5") as file:
         assert datasets.missing_links(file["d"]) == [str(tmp_path / "11.h5")]
+
+
+@pytest.mark.parametrize(("packed", "free", "refused"), [("gzip", 1e3, True), ("gzip", 1e6, False), (None, 1e3, False)])
+def test_a_chunk_that_the_memory_cannot_unpack_is_refused_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packed: str | None, free: float, refused: bool
+) -> None:
+    monkeypatch.setattr(datasets, "HELD", 100)
+    monkeypatch.setattr(datasets, "free_memory", lambda: free)
+    path = foreign_scans.exchange(tmp_path / "scan.h5")
+    with h5py.File(path, "r+") as file:
+        frames = np.repeat(file["exchange/data"][()], 10, axis=1)
+        for name in ("data", "data_white", "data_dark"):
+            of = frames if name == "data" else frames[:1]
+            del file[f"exchange/{name}"]
+            file["exchange"].create_dataset(name, data=of, chunks=of.shape, compression=packed)
+    if refused:
+        with pytest.raises(DataError, match=r"pieces of 2\.4 kB: to unpack one takes 4\.8 kB of memory, 1 kB are free"):
+            open_scan(path)
+    else:
+        with open_scan(path) as scan:
+            assert scan.unpacking == (2 * frames.nbytes if packed else 0)
+            np.testing.assert_array_equal(scan.read([2])[0], frames[0])
