@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import struct
@@ -130,11 +131,11 @@ def look_again(item: h5py.Dataset) -> None:
         item.refresh()
 
 
-def written(item: Any, known: int = 0) -> int:
-    """How many frames or values of a growing dataset are there, of which `known` were before.
+def written(item: Any) -> int:
+    """How many frames or values of a growing dataset are there.
 
-    Its writer may have made room for more: for frames of which no chunk is stored, or for values at the end of a list
-    that are its fill value or NaN.
+    Its writer may have made room for more: for frames of which no chunk is stored yet, or for values at the end of a
+    list that are its fill value or NaN.
     """
     look_again(getattr(item, "item", item))
     if item.ndim == 1:
@@ -142,10 +143,8 @@ def written(item: Any, known: int = 0) -> int:
         return int(np.flatnonzero((values != item.fillvalue) & (values == values)).max(initial=-1)) + 1
     if not isinstance(item, h5py.Dataset) or item.chunks is None:
         return len(item)
-    last = [n - 1 for n in item.shape[1:]]
-    while known < len(item) and item.id.get_chunk_info_by_coord((known, *last)).byte_offset is not None:
-        known += 1
-    return known
+    tiles = math.prod(-(-n // across) for n, across in zip(item.shape[1:], item.chunks[1:], strict=True))
+    return min(len(item), item.id.get_num_chunks() // tiles * item.chunks[0])
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:

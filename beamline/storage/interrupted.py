@@ -99,21 +99,16 @@ def next_step(scan: Path) -> str:
     if not scan.is_file() or not marked(scan):
         return ""
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
-        if layout.COMMITTED not in file:
-            return _step_of_another(scan)
+        if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
+            return (
+                f"It is marked as being written, and has not changed for {QUIET:.0f} s or longer. Where the program "
+                f"that wrote it has ended, `h5clear -s {scan}` clears the mark."
+                if abandoned(scan)
+                else f"Another program still writes it: `beamline recon {scan} --follow` reconstructs it meanwhile."
+            )
     if held(scan):
         return f"Its scan still runs: `beamline recon {scan} --follow` reconstructs it meanwhile."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
-
-
-def _step_of_another(scan: Path) -> str:
-    """The next step for a file that another program writes, which has no lock that shows whether it lives."""
-    if not abandoned(scan):
-        return f"Another program still writes it: `beamline recon {scan} --follow` reconstructs it meanwhile."
-    return (
-        f"It is marked as being written by another program, and has not changed for {QUIET:.0f} s or longer. Where "
-        f"that program has ended, `h5clear -s {scan}` clears the mark."
-    )
 
 
 def _step_of_run(run: Path) -> str:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
+from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
@@ -52,16 +51,16 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
-        n_views, source.own_angles = len(stacks[-1].frames), own_angles
-        if source.finished:
+        source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
+        if source.grows:
+            source.rows = source.rows[:0]
+            source.refresh()
+        else:
             if own_angles:
                 source.angles[-n_views:] = _theta(file, n_views)
             n_flats = int((source.image_key == FrameKind.FLAT).sum())
             source.take_order(_thetas(file, stacks), _later_flats(file, n_flats))
             _set_exposures(source, file)
-        else:
-            source.came = np.zeros((0, 2), np.int64)
-            source.refresh()
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
@@ -76,31 +75,22 @@ class ExchangeSource(StacksSource):
     """A scan in a Data Exchange file.
 
     Attributes:
-        came: [frame, 2] the stack of each frame and its place in it, as they came, of a file that was still being
-            written when it was opened; else None.
+        own_angles: those of the file are used.
+        grows: it was still being written when it was opened. Its frames are numbered as they come.
     """
 
     own_angles: bool = True
-    came: NDArray[np.int64] | None = None
-    _of_stack: NDArray[np.int64] | None = None
-    """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
+    grows: bool = False
 
     def refresh(self) -> int:
-        if self.came is None:
+        if not self.grows:
             return super().refresh()
-        ended, angled = self.finished, np.inf
-        if self.own_angles and (theta := datasets.dataset(self._file, "exchange/theta")) is not None:
-            angled = hdf5.written(theta)
-        for number, stack in enumerate(self._stacks):
-            had = int((self.came[:, 0] == number).sum())
-            there = min(hdf5.written(stack.frames, had), angled if stack.kind == FrameKind.PROJECTION else np.inf)
-            n = len(stack.frames) if ended else int(there)
-            self.came = np.r_[self.came, np.c_[np.full(n - had, number), np.arange(had, n)]]
-        self._starts = np.cumsum([0, *(len(stack.frames) for stack in self._stacks)])
-        self._of_stack = self._starts[self.came[:, 0]] + self.came[:, 1]
-        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.came[:, 0]]
+        ended, theta = self.finished, datasets.dataset(self._file, "exchange/theta") if self.own_angles else None
+        there = [hdf5.written(stack.frames) for stack in self._stacks]
+        angled = hdf5.written(theta) if theta is not None else there[-1]
+        there[-1] = min(there[-1], angled)
+        self.take([len(stack.frames) for stack in self._stacks] if ended else there)
         views = self.image_key == FrameKind.PROJECTION
-        self.angles, self.exposures = np.full((2, views.size), np.nan)
         if self.own_angles:
             self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
         _set_exposures(self, self._file)
@@ -128,15 +118,10 @@ class ExchangeSource(StacksSource):
             place[np.flatnonzero(kinds == FrameKind.FLAT)[later:]] = views.size
         elif FrameKind.FLAT not in thetas or not in_turn:
             return
-        self._of_stack = np.argsort(place, kind="stable")
-        for name in ("image_key", "angles", "exposures"):
-            setattr(self, name, getattr(self, name)[self._of_stack])
+        order = np.argsort(place, kind="stable")
+        for name in ("image_key", "angles", "exposures", "rows"):
+            setattr(self, name, getattr(self, name)[order])
         self.in_order = in_turn and {*kinds.tolist()} <= {*thetas, FrameKind.PROJECTION}
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        if self._of_stack is None:
-            return super().read(frames, rows)
-        return super().read(self._of_stack[frame_indices(frames, self.image_key.size)], rows)
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, NDArray[np.float64]]:

@@ -122,8 +122,8 @@ class NexusSource(ScanSource):
         places, ended, before = self._places, self.finished, self.n
         key = datasets.dataset(places.detector, "image_key_control") or places.image_key
         hdf5.look_again(key)
-        growing = [places.data, *([places.angle] if places.angle is not None and self._own_angles else [])]
-        there = [hdf5.written(each, before) for each in growing]
+        angle = places.angle if self._own_angles else None
+        there = [hdf5.written(each) for each in (places.data, angle) if each is not None]
         n = len(places.data) if ended else min(*there, len(key))
         self._read_rows(key, n, n if ended else np.inf)
         if n != before:
