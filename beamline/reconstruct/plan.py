@@ -283,7 +283,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
     truth = None if options.truth is None else read_truth(options.truth)
     if options.follow is None:
         with options.source.open() as source:
-            _require_finished(source, options)
+            _refuse_file(source, options)
             if options.selection.axis_col is not None:
                 check_axis(source, options.selection.axis_col)
     return truth
@@ -321,12 +321,19 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
         raise ConfigError(f"{error}. Nothing was written.") from error
 
 
-def _require_finished(source: ScanSource, options: ReconOptions) -> None:
-    """Raises DataError for an unfinished scan, unless it is to be taken as it is."""
+def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
+    """Raises DataError for an unfinished scan, unless it is to be taken as it is, and where a chunk of its file cannot
+    be unpacked in the memory."""
     if not (source.finished or options.unfinished):
         raise DataError(
             f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
             "frames recorded so far. Nothing was written."
+        )
+    if source.unpacking > (allowed := memory_of(options)):
+        raise DataError(
+            f"{source.path} is stored in chunks of which one takes {size(source.unpacking)} of memory to unpack, "
+            f"{size(allowed)} may be used. Give --memory {math.ceil(source.unpacking / 1e6)}M if there is as much, or "
+            "copy the file with a frame a chunk. Nothing was read."
         )
 
 

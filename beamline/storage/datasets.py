@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.text import NUMBER, printable
+from beamline.core.machine import free_memory
+from beamline.core.text import NUMBER, one_line, printable, size
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
-from beamline.storage.structure import plain_name
+from beamline.storage.structure import drawn_on, plain_name
 
 _JOULE = 1 / 1.602176634e-16  # keV
 DEGREE = np.pi / 180
@@ -41,7 +43,7 @@ HELD = 2**28  # bytes of unpacked pieces that are held, so that frames read one 
 _CACHE, _SLOTS = 2**20, 521  # bytes and places of the cache that every dataset has
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 _DEEPEST = 12  # groups within another that are looked into
-_PIECE = 2**31  # bytes of a chunk of frames
+_UNPACKING = 2  # a filter has its input and its output in memory at once (measured: 1.6 to 2.1 chunks)
 NAME = 1000  # letters of a name or a title
 BRIEF = 2**28  # bytes of a text, a number or a list of a scan
 
@@ -96,7 +98,7 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def first_of(item: h5py.Dataset) -> Any:
     """The first value of a dataset, which may have many; of an empty dataset nothing."""
-    return item[()] if item.size <= 1 else item[(0,) * item.ndim]
+    return taken(item, () if item.size <= 1 else (0,) * item.ndim)
 
 
 def values_of(item: h5py.Dataset) -> Any:
@@ -106,7 +108,53 @@ def values_of(item: h5py.Dataset) -> Any:
             f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
             f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
         )
-    return item[()]
+    return taken(item, ())
+
+
+# Filters that The HDF Group has registered and that no package brings on which we depend, by number
+FILTERS = {
+    305: "LZO", 32002: "MAFISC", 32003: "Snappy", 32005: "APAX", 32006: "CBF", 32007: "JPEG-XR", 32009: "SPDP",
+    32010: "LPC-Rice", 32011: "CCSDS-123", 32012: "JPEG-LS", 32014: "fpzip", 32016: "B3D", 32019: "JPEG",
+    32020: "VBZ", 32021: "FAPEC", 32022: "BitGroom", 32023: "Granular BitRound", 32025: "Delta-Rice", 32027: "FLAC",
+    32029: "TERSE/PROLIX", 32030: "FFMPEG",
+}  # fmt: skip
+
+
+def taken(item: Any, where: Any) -> Any:
+    """`item[where]` of a dataset.
+
+    Raises:
+        DataError: a filter that its values were stored with is not installed; the message names it.
+        OSError: they cannot be read for another reason.
+    """
+    try:
+        return item[where]
+    except OSError as error:
+        if lacking := next(_not_installed(getattr(item, "item", item)), None):
+            folders = os.environ.get("HDF5_PLUGIN_PATH") or "not set"
+            raise DataError(
+                f"{lacking}, which is not installed here. Put its HDF5 plugin into a folder that HDF5_PLUGIN_PATH "
+                f"names (now {folders}), or write the file again without the filter where it is installed: h5repack "
+                "-f NONE. Nothing was changed."
+            ) from error
+        raise
+
+
+def _not_installed(item: h5py.Dataset) -> Iterator[str]:
+    """Filters of a dataset, and of those that it draws on, that are not installed, each as the begin of a sentence."""
+    made = item.id.get_create_plist()
+    for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
+        if not h5py.h5z.filter_avail(number):
+            name = FILTERS.get(number) or one_line(text(said), 40) or "name unknown"
+            yield f"{item.name} in {item.file.filename} is stored with the HDF5 filter {number} ({name})"
+    for name, where in dict.fromkeys(drawn_on(made)) if item.is_virtual else ():
+        with suppress(DataError, OSError, LookupError), _opened(item, name) as file:
+            yield from _not_installed(file[where])
+
+
+def _opened(item: h5py.Dataset, name: str) -> AbstractContextManager[h5py.File]:
+    """A file that a virtual dataset names, "." for its own."""
+    return nullcontext(item.file) if name == "." else open_hdf5(Path(item.file.filename).parent / name)
 
 
 def piece_of(item: h5py.Dataset) -> int:
@@ -246,23 +294,30 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
             made.write(values)
 
 
-def missing_links(item: h5py.Dataset) -> list[str]:
+def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None = None) -> list[str]:
     """Sources of a virtual dataset, in other files or in the same one, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
+
+    Args:
+        whole: which datasets are, by file and path: each is opened once, however often it is drawn on. One that draws
+            on itself is not.
     """
-    lost = set()
-    for source in item.virtual_sources() if item.is_virtual else ():
-        name, where = plain_name(source.file_name), plain_name(source.dset_name)
-        path = Path(item.file.filename).parent / name
-        try:
-            with nullcontext(item.file) if name == "." else open_hdf5(path) as file:
-                drawn = dataset(file, where)
-                whole = drawn is not None and _holds(drawn, source) and not missing_links(drawn)
-        except (DataError, OSError):
-            whole = False
-        if not whole:
-            lost.add(where if name == "." else str(path))
+    drawn, lost, whole = dict[tuple[str, str], list[Any]](), set(), {} if whole is None else whole
+    for each in item.virtual_sources() if item.is_virtual else ():
+        drawn.setdefault((plain_name(each.file_name), plain_name(each.dset_name)), []).append(each)
+    for (name, where), places in drawn.items():
+        path = Path(item.file.filename) if name == "." else Path(item.file.filename).parent / name
+        key = os.path.realpath(path), where
+        with suppress(DataError, OSError), _opened(item, name) as file:
+            source = dataset(file, where)
+            if source is not None and all(_holds(source, place) for place in places):
+                if key not in whole:
+                    whole[key] = False
+                    whole[key] = not missing_links(source, whole)
+                if whole[key]:
+                    continue
+        lost.add(where if name == "." else str(path))
     return sorted(lost)
 
 
@@ -283,8 +338,12 @@ def _fills(drawn: h5py.Dataset, source: Any) -> bool:
     return [n for n in drawn.shape if n != 1] == [n for n in extent if n != 1]
 
 
-def require_possible(item: h5py.Dataset) -> None:
-    """Raise DataError for frames [frame, row, col] without pixels, or too large for any memory."""
+def require_possible(item: Any) -> int:
+    """Bytes of memory that are taken while a chunk of frames [frame, row, col] is unpacked.
+
+    Raises:
+        DataError: frames without pixels, or too large for any memory, or for this one.
+    """
     if 0 in item.shape[1:]:
         raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
@@ -292,11 +351,14 @@ def require_possible(item: h5py.Dataset) -> None:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    if (piece := piece_of(item)) > _PIECE:
+    packed = getattr(item, "item", item).id.get_create_plist().get_nfilters()
+    if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in pieces of {piece / 1e9:.3g} GB, which are unpacked "
-            f"for any frame; expected {_PIECE / 1e9:.3g} GB at most. Copy it with a frame a chunk."
+            f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "
+            f"{size(needed)} of memory, {size(free)} are free. Copy it with a frame a chunk (h5repack -l CHUNK=...), "
+            "where there is more. Nothing was read."
         )
+    return needed
 
 
 def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out: NDArray[Any]) -> None:
@@ -308,7 +370,7 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
     start = 0
     for first, end in runs(indices):
         try:
-            out[start : start + end - first] = item[first:end, rows]
+            out[start : start + end - first] = taken(item, (slice(first, end), rows))
         except OSError as error:
             which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
             raise UnreadableError(

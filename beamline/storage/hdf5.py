@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import struct
@@ -14,6 +15,7 @@ from typing import Any, Literal
 
 import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that copies of scans use
+import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import no_file
@@ -127,6 +129,22 @@ def look_again(item: h5py.Dataset) -> None:
     plist = item.file.id.get_access_plist()
     if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
         item.refresh()
+
+
+def written(item: Any) -> int:
+    """How many frames or values of a growing dataset are there.
+
+    Its writer may have made room for more: for frames of which no chunk is stored yet, or for values at the end of a
+    list that are its fill value or NaN.
+    """
+    look_again(getattr(item, "item", item))
+    if item.ndim == 1:
+        values = item[()]
+        return int(np.flatnonzero((values != item.fillvalue) & (values == values)).max(initial=-1)) + 1
+    if not isinstance(item, h5py.Dataset) or item.chunks is None:
+        return len(item)
+    tiles = math.prod(-(-n // across) for n, across in zip(item.shape[1:], item.chunks[1:], strict=True))
+    return min(len(item), item.id.get_num_chunks() // tiles * item.chunks[0])
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:

@@ -31,8 +31,8 @@ from beamline.storage.parts import (
     wide_planned,
 )
 from beamline.storage.run_record import DIED, alive, read_record
-from beamline.storage.superblock import superblock
-from beamline.storage.writer_lock import abandoned, held
+from beamline.storage.superblock import marked, superblock
+from beamline.storage.writer_lock import QUIET, abandoned, held
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
@@ -96,8 +96,16 @@ def next_step(scan: Path) -> str:
     """A sentence on the next step for a scan that is running, died or ended early; "" if nothing is missing."""
     if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file():
         return _step_of_run(run_of(scan.parent))
-    if not scan.is_file() or (head := superblock(scan)) is None or not head.open_for_writing:
+    if not scan.is_file() or not marked(scan):
         return ""
+    with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
+        if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
+            return (
+                f"It is marked as being written, and has not changed for {QUIET:.0f} s or longer. Where the program "
+                f"that wrote it has ended, `h5clear -s {scan}` clears the mark."
+                if abandoned(scan)
+                else f"Another program still writes it: `beamline recon {scan} --follow` reconstructs it meanwhile."
+            )
     if held(scan):
         return f"Its scan still runs: `beamline recon {scan} --follow` reconstructs it meanwhile."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."

@@ -85,12 +85,12 @@ def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
             f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5 and is not read. Copy "
             "them into the dataset. Nothing was read."
         )
-    n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
-    if n < CLAIMED or made.get_layout() == h5py.h5d.VIRTUAL:
+    chunk, shape = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else (), dataset.shape or ()
+    sides = [-(-side // across) * across for side, across in zip(shape, chunk, strict=True)] if chunk else shape
+    n, piece = (math.prod(each) * dataset.dtype.itemsize for each in (sides, chunk))
+    if (n < CLAIMED and piece <= _LARGE) or made.get_layout() == h5py.h5d.VIRTUAL:
         return
-    chunk = made.get_chunk() if made.get_layout() == h5py.h5d.CHUNKED else ()
-    piece, stored = math.prod(chunk) * dataset.dtype.itemsize, dataset.get_storage_size()
-    if n > PACKED * stored or is_blank(n, stored, piece):
+    if n > PACKED * (stored := dataset.get_storage_size()) or is_blank(n, stored, piece):
         raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 

@@ -73,6 +73,12 @@ def superblock(path: Path) -> Superblock | None:
     return Superblock(head, path.stat().st_size) if head[_CHECKSUM] == lookup3(head[: _CHECKSUM.start]) else None
 
 
+def marked(path: Path) -> bool:
+    """Whether the file is marked as being written: a program writes it, or died while writing."""
+    head = superblock(path)
+    return head is not None and head.open_for_writing
+
+
 def mend_checksum(at: int, read: memoryview) -> None:
     """Repair the checksum of a block in `read`, the bytes from `at` on that HDF5 asked for, that a kill or a loss of
     power left half written: across the end of a page of memory, each field is the new or the old one."""

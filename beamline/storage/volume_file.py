@@ -16,7 +16,7 @@ from tifffile import natural_sorted
 from beamline.core.errors import DataError
 from beamline.core.files import RECON, no_file, refuse_substitute, require_regular
 from beamline.core.machine import free_memory
-from beamline.storage import hdf5
+from beamline.storage import datasets, hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.tiff import require_possible
 from beamline.storage.structure import require_npy
@@ -204,7 +204,7 @@ def _from_hdf5(
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
     _check_size(path, item.nbytes)
-    return item[()], axes_of(file, name)[0]
+    return datasets.taken(item, ()), axes_of(file, name)[0]
 
 
 def _only(path: Path, axes: dict[str, int]) -> str:

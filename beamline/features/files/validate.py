@@ -29,8 +29,9 @@ from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
-from beamline.storage.writer_lock import held
+from beamline.storage.writer_lock import abandoned, held
 from beamline.storage.writers.recon_file import opened_reconstruction
+from beamline.storage.writers.rows import RUNNING
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 from recon.base.views import spread
@@ -215,8 +216,9 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     brief = brief_source(source, lambda: clock() > until)
     findings = source_findings(brief)
     attributes = dict(source.attributes)
-    if not source.finished and not held(source.path):
-        attributes["status"] = "died"
+    if not source.finished:
+        dead = not held(source.path) if "status" in attributes else abandoned(source.path)  # our writer has a lock
+        attributes["status"] = "died" if dead else RUNNING
     optional = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
     facts = {
         "path": str(source.path),

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
+from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
@@ -38,9 +37,9 @@ PLACES = (
 )
 
 
-def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
+def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = hdf5.open_hdf5(path)
+    file = hdf5.open_hdf5(path, follow)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
@@ -52,11 +51,16 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
-        n_views = len(stacks[-1].frames)
-        if own_angles:
-            source.angles[-n_views:] = _theta(file, n_views)
-        source.take_order(_thetas(file, stacks), _later_flats(file, int((source.image_key == FrameKind.FLAT).sum())))
-        _set_exposures(source, file)
+        source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
+        if source.grows:
+            source.rows = source.rows[:0]
+            source.refresh()
+        else:
+            if own_angles:
+                source.angles[-n_views:] = _theta(file, n_views)
+            n_flats = int((source.image_key == FrameKind.FLAT).sum())
+            source.take_order(_thetas(file, stacks), _later_flats(file, n_flats))
+            _set_exposures(source, file)
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
@@ -68,10 +72,29 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 class ExchangeSource(StacksSource):
-    """A scan in a Data Exchange file."""
+    """A scan in a Data Exchange file.
 
-    _of_stack: NDArray[np.int64] | None = None
-    """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
+    Attributes:
+        own_angles: those of the file are used.
+        grows: it was still being written when it was opened. Its frames are numbered as they come.
+    """
+
+    own_angles: bool = True
+    grows: bool = False
+
+    def refresh(self) -> int:
+        if not self.grows:
+            return super().refresh()
+        ended, theta = self.finished, datasets.dataset(self._file, "exchange/theta") if self.own_angles else None
+        there = [hdf5.written(stack.frames) for stack in self._stacks]
+        angled = hdf5.written(theta) if theta is not None else there[-1]
+        there[-1] = min(there[-1], angled)
+        self.take([len(stack.frames) for stack in self._stacks] if ended else there)
+        views = self.image_key == FrameKind.PROJECTION
+        if self.own_angles:
+            self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
+        _set_exposures(self, self._file)
+        return views.size
 
     def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
         """Sort darks and flats among the views, if the file says when flats were taken.
@@ -95,15 +118,10 @@ class ExchangeSource(StacksSource):
             place[np.flatnonzero(kinds == FrameKind.FLAT)[later:]] = views.size
         elif FrameKind.FLAT not in thetas or not in_turn:
             return
-        self._of_stack = np.argsort(place, kind="stable")
-        for name in ("image_key", "angles", "exposures"):
-            setattr(self, name, getattr(self, name)[self._of_stack])
+        order = np.argsort(place, kind="stable")
+        for name in ("image_key", "angles", "exposures", "rows"):
+            setattr(self, name, getattr(self, name)[order])
         self.in_order = in_turn and {*kinds.tolist()} <= {*thetas, FrameKind.PROJECTION}
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        if self._of_stack is None:
-            return super().read(frames, rows)
-        return super().read(self._of_stack[frame_indices(frames, self.image_key.size)], rows)
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, NDArray[np.float64]]:
@@ -204,7 +222,7 @@ def _positive(file: h5py.File, where: str, units: Mapping[str, float]) -> float 
     return value if value is not None and value > 0 else None
 
 
-def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
+def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.float64]:
     theta = datasets.dataset(file, "exchange/theta")
     if theta is None:
         datasets.refuse_broken(file, "exchange/theta")
@@ -213,7 +231,7 @@ def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
             "give them with --angles FILE (degrees, one a line)."
         )
     angles = datasets.radians(theta, default="degrees")
-    if angles.size != n_views or n_views not in (1, *theta.shape):
+    if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
         way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
@@ -246,5 +264,5 @@ def _recognises(path: Path, opening: Opening) -> bool:
 FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
-    lambda path, opening: open_exchange(path, own_angles=opening.own_angles),
+    lambda path, opening: open_exchange(path, follow=opening.follow, own_angles=opening.own_angles),
 )

@@ -30,6 +30,7 @@ from beamline.storage.readers.nexus import (
     require_order,
 )
 from beamline.storage.structure import drawn_on
+from beamline.storage.superblock import marked
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
@@ -87,7 +88,6 @@ class NexusSource(ScanSource):
         self.pixel_mask = self._mask()
         self.refresh()
         self._find_unused(found, geometry.turned)
-        self.energies, self.currents = read_energies(self._places.entry, self.n), self._currents()
 
     def _mask(self) -> Mask | None:
         """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
@@ -105,7 +105,7 @@ class NexusSource(ScanSource):
         for item in (self._places.data, self._places.image_key, finer):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
-        datasets.require_possible(self._places.data)
+        self.unpacking = datasets.require_possible(self._places.data)
         require_order(self._places)
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
         if lost:
@@ -113,11 +113,21 @@ class NexusSource(ScanSource):
                 f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
             )
 
+    @property
+    def finished(self) -> bool:
+        return not any(map(marked, {self.path, Path(self._places.data.file.filename)}))
+
     @guarded
     def refresh(self) -> int:
-        finer = datasets.dataset(self._places.detector, "image_key_control")
-        n = int(self._places.data.shape[0])
-        self._read_rows(self._places.image_key if finer is None else finer, n, n)
+        places, ended, before = self._places, self.finished, self.n
+        key = datasets.dataset(places.detector, "image_key_control") or places.image_key
+        hdf5.look_again(key)
+        angle = places.angle if self._own_angles else None
+        there = [hdf5.written(each) for each in (places.data, angle) if each is not None]
+        n = len(places.data) if ended else min(*there, len(key))
+        self._read_rows(key, n, n if ended else np.inf)
+        if n != before:
+            self.energies, self.currents = read_energies(places.entry, n), self._currents()
         return n
 
     def _read_rows(self, key: h5py.Dataset, n: int, most: float) -> None:

@@ -269,7 +269,7 @@ def _read(path: Path, item: h5py.Dataset) -> NDArray[Any]:
     if item.ndim not in (2, 3):
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
     if item.ndim == 2:
-        return _stack(item[()], f"{item.name} in {path}")
+        return _stack(datasets.taken(item, ()), f"{item.name} in {path}")
     datasets.require_possible(item)
     out = np.empty(item.shape, item.dtype)
     datasets.read_frames(item, np.arange(len(item)), slice(None), out)

@@ -19,6 +19,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.superblock import marked
 from drivers.base.frame import FrameKind
 
 
@@ -28,8 +29,11 @@ class TurnedFrames:
     def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
         """`order`: which dimensions of `item` are frames, rows and columns."""
         self.item, self._order = item, order
-        self.shape = tuple(item.shape[axis] for axis in order)
         self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.item.shape[axis] for axis in self._order)
 
     @property
     def frame_bytes(self) -> int:
@@ -80,10 +84,15 @@ class FrameStack:
 
 
 class StacksSource(ScanSource):
-    """A scan in stacks; see ScanSource. `finished` is always True: a scan in stacks cannot grow.
+    """A scan in stacks; see ScanSource.
 
     Quantity: "counts" if there are darks and flats, otherwise "unknown".
+
+    Attributes:
+        rows: int64 [frame, 2], the stack of each frame and its place there.
     """
+
+    rows: NDArray[np.int64] = np.zeros((0, 2), np.int64)
 
     def __init__(self, path: Path, file: Any, stacks: Sequence[FrameStack], *, format: str, facts: Attributes) -> None:
         """Take over an open file, or what else is closed with the scan.
@@ -93,17 +102,25 @@ class StacksSource(ScanSource):
         self.path, self.format, self.facts = path, format, facts
         self._file, self._stacks = file, stacks
         self._check()
-        sizes = [len(stack.frames) for stack in stacks]
-        self._starts = np.cumsum([0, *sizes])
-        views = stacks[-1].frames
-        self.shape = tuple(views.shape[1:])
+        self.shape = tuple(stacks[-1].frames.shape[1:])
         self.dtype = np.result_type(*(stack.frames.dtype for stack in stacks))
-        self.image_key = np.repeat([stack.kind for stack in stacks], sizes).astype(np.int32)
-        self.angles = np.full(self.image_key.size, np.nan)
-        self.exposures = np.full(self.image_key.size, np.nan)
+        self.take([len(stack.frames) for stack in stacks])
         kinds = {stack.kind for stack in stacks}
         self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
         self.in_order = kinds == {FrameKind.PROJECTION}
+
+    def take(self, sizes: Sequence[int]) -> None:
+        """Number the frames of stacks of these sizes after those that are known already; angles and exposures are then
+        NaN."""
+        had = np.bincount(self.rows[:, 0], minlength=len(sizes))
+        new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
+        self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
+        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.rows[:, 0]]
+        self.angles, self.exposures = np.full((2, len(self.rows)), np.nan)
+
+    @property
+    def finished(self) -> bool:
+        return not isinstance(self._file, h5py.File) or not marked(self.path)
 
     def _check(self) -> None:
         views = self._stacks[-1]
@@ -114,21 +131,22 @@ class StacksSource(ScanSource):
                 raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset):
-                datasets.require_possible(stack.frames)
+                self.unpacking = max(self.unpacking, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
-            raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
+            none = DataError if self.finished else hdf5.NotReadyError
+            raise none(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
-        for stack, first, last in zip(self._stacks, self._starts[:-1], self._starts[1:], strict=True):
-            wanted = np.flatnonzero((indices >= first) & (indices < last))
+        for number, stack in enumerate(self._stacks):
+            wanted = np.flatnonzero(self.rows[indices, 0] == number)
             if wanted.size:
                 part = np.empty((wanted.size, *out.shape[1:]), stack.frames.dtype)
-                datasets.read_frames(stack.frames, indices[wanted] - first, rows, part)
+                datasets.read_frames(stack.frames, self.rows[indices[wanted], 1], rows, part)
                 out[wanted] = part
         return out
 

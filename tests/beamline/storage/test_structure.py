@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -54,6 +55,12 @@ def test_values_that_are_the_bytes_of_another_file_and_claims_without_bytes(tmp_
         del file["entry/notes"]
         file.create_dataset("entry/notes", (2**31,), "u1", chunks=(2**31,), compression="gzip")
     with pytest.raises(DataError, match=r"claims 2\.15 GB"):
+        open_scan(path)
+    with h5py.File(path, "r+") as file:  # a chunk of 512 MiB, of which the dataset shows ten values
+        del file["entry/notes"]
+        notes = file.create_dataset("entry/notes", (10,), "u1", chunks=(2**29,), maxshape=(None,), compression="gzip")
+        notes.id.write_direct_chunk((0,), zlib.compress(bytes(10**6)))
+    with pytest.raises(DataError, match=r"claims 0\.537 GB"):
         open_scan(path)
 
 
