@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.text import NUMBER, printable
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
+from beamline.storage.packing import unpacked
 from beamline.storage.structure import plain_name
 
 _JOULE = 1 / 1.602176634e-16  # keV
@@ -91,7 +92,7 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
             if isinstance(item, h5py.Group) and depth < _DEEPEST:
                 groups.append((item, depth + 1))
             elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3, 4):
-                yield item
+                yield unpacked(item)
 
 
 def first_of(item: h5py.Dataset) -> Any:
@@ -152,7 +153,8 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
-    """The dataset at a path; None if it is missing or has a null dataspace.
+    """The dataset at a path, read as the values of its numbers where these are packed; None if it is missing or has a
+    null dataspace.
 
     Of frames in pieces that hold parts of several, it keeps the unpacked pieces of a frame, or where these are too many
     those of a row of all frames, until the next ones are read. `frames` is the number of the frame dimension.
@@ -172,7 +174,7 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
         access.set_chunk_cache(max(_SLOTS, 8 * kept // piece_of(item)), kept, 0.75)
         del item  # HDF5 keeps the cache of a dataset that is open
         item = h5py.Dataset(h5py.h5d.open(group.id, path.encode(), access))
-    return item
+    return unpacked(item)
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
