@@ -15,12 +15,16 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets
 from beamline.storage.readers.stacks import dimensions
 
-_LISTED = 6  # detectors that an error names
+_LISTED = 6  # detectors, or lists of angles, that a sentence names
+_LONGEST = 100  # steps of a chain of transformations
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Paths in a file of the fields that are read; None for a missing one."""
+    """Paths in a file of the fields that are read; None for a missing one.
+
+    `sense` is -1 for angles that count against the turn of `sample/rotation_angle`.
+    """
 
     entry: h5py.Group
     detector: h5py.Group
@@ -28,6 +32,7 @@ class Places:
     image_key: h5py.Dataset
     angle: h5py.Dataset | None
     angle_problem: str
+    sense: int = 1
 
 
 def find(file: h5py.File) -> list[Places]:
@@ -46,7 +51,7 @@ def find(file: h5py.File) -> list[Places]:
                     if broken := datasets.broken_link(detector, name):
                         unresolved.append(broken)
                 if key is not None and data is not None and data.ndim == 3:
-                    places.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
+                    places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
         raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
     return places
@@ -66,17 +71,56 @@ def _link(group: h5py.Group, name: str) -> str:
     return f"{group.name}/{name} -> {where}"
 
 
-def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset | None, str]:
+def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.Dataset | None, str, int]:
+    """The angles of n frames, why there are none, and their sense."""
     angle = datasets.dataset(entry, "sample/rotation_angle")
     if angle is not None:
-        return angle, ""
+        return angle, "", 1
     # Diamond: the NXdata named as the detector says which scanned axis goes with the frames.
     data = datasets.resolve(entry, str(detector.name).rsplit("/", 1)[1])
     name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = datasets.dataset(data, name)
-        return angle, "" if angle is not None else f"{_link(data, name)} is not there"
-    return None, datasets.broken_link(entry, "sample/rotation_angle") or f"{entry.name} has no sample/rotation_angle"
+        return angle, "" if angle is not None else f"{_link(data, name)} is not there", 1
+    rotations = _rotations_of_sample(entry)
+    if len(rotations) == 1:
+        return rotations[0][0], "", rotations[0][1]
+    if broken := datasets.broken_link(entry, "sample/rotation_angle"):
+        return None, broken, 1
+    return None, f"{entry.name} has no sample/rotation_angle{_named_angles(entry, n)}", 1
+
+
+def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
+    """The rotations with several angles that the sample depends on, and their sense: those that change, or all.
+
+    The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
+    group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
+    """
+    here, where, steps, found = datasets.resolve(entry, "sample"), datasets.text_at(entry, "sample/depends_on"), 0, []
+    while where not in ("", ".") and steps < _LONGEST and (item := datasets.resolve(here, where)) is not None:
+        inner = isinstance(item, h5py.Group)
+        values = datasets.dataset(item, "value") if inner else datasets.dataset(here, where)
+        if values is not None and values.size > 1 and datasets.attribute(item, "transformation_type") == "rotation":
+            vector = np.ravel(item.attrs.get("vector", 1))
+            against = vector.dtype.kind in "if" and vector[np.abs(vector).argmax()] < 0
+            found.append((values, -1 if against else 1))
+        here, where, steps = item.parent, datasets.attribute(item, "depends_on"), steps + 1
+    changing = [each for each in found if np.unique(datasets.values_of(each[0])).size > 1]
+    return changing or found
+
+
+def _named_angles(entry: h5py.Group, n: int) -> str:
+    """The lists of n numbers in a unit of angles, and the option that takes one; "" without them."""
+    found = list[str]()
+
+    def look(_: str, item: h5py.Dataset | h5py.Group) -> None:
+        if isinstance(item, h5py.Dataset) and item.size == n:
+            known = datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS) is not None
+            found.extend([str(item.name)] if known else [])
+
+    entry.visititems(look)
+    which = ", ".join(found[:_LISTED])
+    return f"; {which} may be the angles: --angles-path {found[0]} takes them" if found else ""
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
