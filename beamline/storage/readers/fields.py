@@ -121,21 +121,6 @@ def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool
     return value.dtype.kind in "uif" and value.size > 0 and float(np.ptp(value.astype(np.float64))) > _HALF_PIXEL
 
 
-def _off_middle(along: int) -> Matters:
-    def matters(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
-        """A central ray of a cone more than a twentieth of the detector beside its middle."""
-        if (
-            source.cone is None
-            or value.size != 1
-            or datasets.attribute(item, "units").lower() not in ("", "pixel", "px")
-        ):
-            return False
-        n = source.shape[along]
-        return abs(float(value.reshape(-1)[0]) - (n - 1) / 2) > 0.05 * n
-
-    return matters
-
-
 def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """More than 1 % from 1: an optical magnification that nothing in the file's pixel sizes tells apart."""
     return value.dtype.kind in "uif" and value.size == 1 and abs(float(value.reshape(-1)[0]) - 1) > 0.01
@@ -217,8 +202,12 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
     Entry("detector/field_of_view", "the views show whether the field is half", False),
     Entry("detector/half_acquisition", "the views show whether the field is half", False),
-    Entry("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
-    Entry("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
+    Entry("detector/beam_center_x", "a cone's central ray is taken to meet the rotation axis; --axis places it", False),
+    Entry(
+        "detector/beam_center_y",
+        "a cone's central ray is taken to meet the middle of the rows; --central-row places it",
+        False,
+    ),
     Entry("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
     Entry("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
     Entry("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),

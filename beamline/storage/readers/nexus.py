@@ -3,6 +3,7 @@ mirrored frames."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -171,6 +172,7 @@ class NexusGeometry:
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
+        central: (row, column) that the central ray meets, counted as frames are read; NaN where it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
         turned: turns of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
@@ -178,6 +180,7 @@ class NexusGeometry:
 
     pixel_mm: tuple[float | None, float | None]
     cone: tuple[float, float] | None
+    central: tuple[float, float]
     mirrored: tuple[bool, bool]
     turned: str
     remarks: dict[str, str]
@@ -200,7 +203,17 @@ def read_geometry(places: Places) -> NexusGeometry:
     mirrored, turned = _mirrored(detector)
     if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
         remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back as they are read"
-    return NexusGeometry((pixels[0], pixels[1]), cone, mirrored, turned, remarks)
+    beside = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
+    row, col = (_central(places, i, beside[i], mirrored[1 - i]) for i in (1, 0))
+    return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)
+
+
+def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> float:
+    """The pixel along x (0) or y (1) that the central ray meets, by a length or a number of pixels; NaN: not stated."""
+    pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
+    pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
+    at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
+    return math.nan if at is None else places.data.shape[2 - along] - 1 - at if reverse else at
 
 
 def _cone_of(
