@@ -184,6 +184,13 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
     return float(values[0]) if values is not None and values.size and np.isfinite(values[0]) else None
 
 
+def typical(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
+    """The median of a size that may be stated for each frame, in the unit of this program; None as `scalar`."""
+    values = in_units(dataset(group, path), units)
+    known = np.empty(0) if values is None else values[np.isfinite(values)]
+    return float(np.median(known[known > 0] if (known > 0).any() else known)) if known.size else None
+
+
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
     """Numbers in the unit of this program, as a list, also where they are written as text, such as "6.5 um".
 

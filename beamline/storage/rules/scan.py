@@ -107,8 +107,8 @@ def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = Non
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"The file states that the central ray meets {side} {at:.6g} of {n} (beam_center, from the centre of the "
-                f"first). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
+                f"The file states that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
+                f"of {n}). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
             )
 
 
