@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -76,8 +76,8 @@ def text_of(item: h5py.Dataset) -> str:
     return text(first_of(item))
 
 
-def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Each dataset that may hold images, once, also behind links."""
+def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Dataset]:
+    """Each dataset of numbers with so many dimensions, once, also behind links."""
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -91,7 +91,7 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
             seen.add(place)
             if isinstance(item, h5py.Group) and depth < _DEEPEST:
                 groups.append((item, depth + 1))
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3, 4):
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in dimensions:
                 yield unpacked(item)
 
 

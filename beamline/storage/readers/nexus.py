@@ -88,7 +88,11 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
         return rotations[0][0], "", rotations[0][1]
     if broken := datasets.broken_link(entry, "sample/rotation_angle"):
         return None, broken, 1
-    return None, f"{entry.name} has no sample/rotation_angle{_named_angles(entry, n)}", 1
+    lists = [item for item in datasets.arrays_in(entry.file, (1,)) if item.size == n]
+    units = ((item, datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)) for item in lists)
+    names = [str(item.name) for item, known in units if known is not None]
+    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} takes them" if names else ""
+    return None, f"{entry.name} has no sample/rotation_angle{which}", 1
 
 
 def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
@@ -108,20 +112,6 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
         here, where, steps = item.parent, datasets.attribute(item, "depends_on"), steps + 1
     changing = [each for each in found if np.unique(datasets.values_of(each[0])).size > 1]
     return changing or found
-
-
-def _named_angles(entry: h5py.Group, n: int) -> str:
-    """The lists of n numbers in a unit of angles, and the option that takes one; "" without them."""
-    found = list[str]()
-
-    def look(_: str, item: h5py.Dataset | h5py.Group) -> None:
-        if isinstance(item, h5py.Dataset) and item.size == n:
-            known = datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS) is not None
-            found.extend([str(item.name)] if known else [])
-
-    entry.visititems(look)
-    which = ", ".join(found[:_LISTED])
-    return f"; {which} may be the angles: --angles-path {found[0]} takes them" if found else ""
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
