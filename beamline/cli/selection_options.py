@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import POSITIVE, NameChoice, option, parsed, together
+from beamline.cli.options import POSITIVE, FiniteRange, NameChoice, option, parsed, together
 from beamline.cli.recipe import CORRECTIONS, DATA, heading
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
@@ -176,6 +176,7 @@ def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOpti
         sample_width=values["sample_width"],
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
         cone=values["cone"],
+        central_row=values["central_row"],
         seed=seed,
         steps=chosen_steps(values),
     )
@@ -269,6 +270,13 @@ _AFTER = (
         callback=parsed(distances),
         metavar="SOD:SDD",
         help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
+    ),
+    option(
+        "--central-row",
+        type=FiniteRange(),
+        metavar="PX",
+        help="Cone beam: row of the unbinned detector that the central ray meets, the one at a right angle to the "
+        "rotation axis (0: centre of the first row; also beyond the detector). Default: the middle row.",
     ),
     heading(CORRECTIONS),
 )

@@ -56,6 +56,7 @@ _INVERTED = (
 )
 # Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
+_SCALED = ", as one also seems to where the pixel size differs from view to view"  # in width and height alike
 _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrower", "wider"), ("shorter", "taller")
 
 
@@ -309,7 +310,8 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
             worst = float(off.max())
             sentence = (
                 f"Frames {frames[first]} and {frames[later]}, as others that see the same rays at two times, show "
-                f"another sample: it becomes {', '.join(np.array(words)[off > 1])}. One volume blurs what changes: "
+                f"another sample: it becomes {', '.join(np.array(words)[off > 1])}"
+                f"{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. One volume blurs what changes: "
                 "give --time N for several in time, --calibrate shifts where the sample moved as a whole, or --views "
                 "for a part of the scan."
             )

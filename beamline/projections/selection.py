@@ -36,6 +36,7 @@ class Selection:
             unknown); None takes the file's, or measures it.
         pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
+        central_row: row of the full detector that the central ray of a cone meets, also off it; None: the middle.
         seed: of random view selections.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
         steps: corrections that are to do something else than their defaults, see `beamline.projections.corrections`.
@@ -48,6 +49,7 @@ class Selection:
     sample_width: float | None = None
     pixel_size_mm: float | None = None
     cone: tuple[float, float] | None = None
+    central_row: float | None = None
     seed: int = 0
     axis_rows: tuple[int, int] | None = None
     steps: tuple[NamedStep, ...] = ()
@@ -122,7 +124,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
 
     Raises:
-        ConfigError: a cone beam's pixel size is not known.
+        ConfigError: a cone beam's pixel size is not known; a central row of a parallel beam.
     """
     rows = rows_of(source, selection)
     full = (rows.stop - rows.start, source.shape[1])
@@ -133,9 +135,12 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
                 f"{source.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
                 "detector)."
             )
-        # The central ray meets the middle of the detector, whatever rows are read.
-        axis_row = (source.shape[0] - 1) / 2 - rows.start
+        # The central ray meets the same row of the detector, whatever rows are read.
+        meets = (source.shape[0] - 1) / 2 if selection.central_row is None else selection.central_row
+        axis_row = meets - rows.start
         return Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row).binned(selection.binning)
+    if selection.central_row is not None:
+        raise ConfigError(f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone.")
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )

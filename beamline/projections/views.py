@@ -25,7 +25,7 @@ from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import quantity_stated
 from beamline.storage.rules.references import references_usable
-from beamline.storage.rules.scan import references_present, scan_ended, scan_findings
+from beamline.storage.rules.scan import central_ray_taken, references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -132,6 +132,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
     findings = [*scan_findings(source), *scan_ended(source)]
+    given = {"central-column": selection.axis_col, "central-row": selection.central_row}
+    findings += [hit for hit in central_ray_taken(source, selection.cone) if given[hit.rule] is None]
     findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]

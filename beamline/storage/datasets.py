@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import NUMBER, one_line, printable, size
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
+from beamline.storage.packing import unpacked
 from beamline.storage.structure import drawn_on, plain_name
 
 _JOULE = 1 / 1.602176634e-16  # keV
@@ -77,8 +78,8 @@ def text_of(item: h5py.Dataset) -> str:
     return text(first_of(item))
 
 
-def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Each dataset that may hold images, once, also behind links."""
+def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Dataset]:
+    """Each dataset of numbers with so many dimensions, once, also behind links."""
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -92,8 +93,8 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
             seen.add(place)
             if isinstance(item, h5py.Group) and depth < _DEEPEST:
                 groups.append((item, depth + 1))
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3, 4):
-                yield item
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in dimensions:
+                yield unpacked(item)
 
 
 def first_of(item: h5py.Dataset) -> Any:
@@ -200,7 +201,8 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
-    """The dataset at a path; None if it is missing or has a null dataspace.
+    """The dataset at a path, read as the values of its numbers where these are packed; None if it is missing or has a
+    null dataspace.
 
     Of frames in pieces that hold parts of several, it keeps the unpacked pieces of a frame, or where these are too many
     those of a row of all frames, until the next ones are read. `frames` is the number of the frame dimension.
@@ -220,7 +222,7 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
         access.set_chunk_cache(max(_SLOTS, 8 * kept // piece_of(item)), kept, 0.75)
         del item  # HDF5 keeps the cache of a dataset that is open
         item = h5py.Dataset(h5py.h5d.open(group.id, path.encode(), access))
-    return item
+    return unpacked(item)
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
@@ -228,6 +230,13 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
     item = dataset(group, path)
     values = None if item is None else _converted(item, units, first_of)
     return float(values[0]) if values is not None and values.size and np.isfinite(values[0]) else None
+
+
+def typical(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
+    """The median of a size that may be stated for each frame, in the unit of this program; None as `scalar`."""
+    values = in_units(dataset(group, path), units)
+    known = np.empty(0) if values is None else values[np.isfinite(values)]
+    return float(np.median(known[known > 0] if (known > 0).any() else known)) if known.size else None
 
 
 def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:

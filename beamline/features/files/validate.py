@@ -26,7 +26,7 @@ from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
-from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
+from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held
@@ -102,7 +102,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 def source_findings(source: ScanSource) -> list[Finding]:
     """Findings in an open scan: its content, its references, and its flagged frames."""
     findings = list[Finding]()
-    for rule in (*SOURCE_RULES, scan_ended, references_usable, darks_beside_views, frames_flagged):
+    for rule in (*SOURCE_RULES, central_ray_taken, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
         except TakesTooLongError as error:

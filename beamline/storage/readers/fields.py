@@ -67,7 +67,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         elif value.size not in (1, source.image_key.size, views):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
         else:
-            why = _unit_problem(field, value, item, source)
+            why = _unit_problem(field, value, item, source) or _varying(field, item, source)
         if why:
             unused.append(NotUsed(field.where, _text(value, datasets.attribute(item, "units")), why, doubt))
     return tuple(unused)
@@ -82,6 +82,18 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
         return "it is text; expected a number, and a known unit behind it or as its attribute `units`"
     unit = datasets.attribute(item, "units")
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+
+
+def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> str:
+    """What one length for all views does, where the file states others for some; "" where that is not seen."""
+    lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
+    if lengths is None or lengths.size == 1:
+        return ""
+    lengths = lengths[source.image_key == FrameKind.PROJECTION] if lengths.size == source.image_key.size else lengths
+    typical = np.median(lengths)
+    whole = typical if "pixel_size" in field.where else np.inf if source.cone is None else source.cone[1]
+    moved = float(np.max(np.abs(lengths - typical)) / whole * max(source.shape) / 2)  # px at the edge of the field
+    return _ONE.format(moved) if moved > _HALF_PIXEL else ""
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
@@ -121,26 +133,15 @@ def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool
     return value.dtype.kind in "uif" and value.size > 0 and float(np.ptp(value.astype(np.float64))) > _HALF_PIXEL
 
 
-def _off_middle(along: int) -> Matters:
-    def matters(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
-        """A central ray of a cone more than a twentieth of the detector beside its middle."""
-        if (
-            source.cone is None
-            or value.size != 1
-            or datasets.attribute(item, "units").lower() not in ("", "pixel", "px")
-        ):
-            return False
-        n = source.shape[along]
-        return abs(float(value.reshape(-1)[0]) - (n - 1) / 2) > 0.05 * n
-
-    return matters
-
-
 def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """More than 1 % from 1: an optical magnification that nothing in the file's pixel sizes tells apart."""
     return value.dtype.kind in "uif" and value.size == 1 and abs(float(value.reshape(-1)[0]) - 1) > 0.01
 
 
+_ONE = (
+    "it differs from view to view, one value is taken for all, and so images differ in size, by up to {:.2g} px at the "
+    "edge of the field. Scale the images about the rotation axis to one pixel size"
+)
 _POSES = "give the shifts of views with --poses"
 _POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
 UPRIGHT = "the detector is taken to stand upright to the beam"
@@ -217,8 +218,12 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
     Entry("detector/field_of_view", "the views show whether the field is half", False),
     Entry("detector/half_acquisition", "the views show whether the field is half", False),
-    Entry("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
-    Entry("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
+    Entry("detector/beam_center_x", "a cone's central ray is taken to meet the rotation axis; --axis places it", False),
+    Entry(
+        "detector/beam_center_y",
+        "a cone's central ray is taken to meet the middle of the rows; --central-row places it",
+        False,
+    ),
     Entry("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
     Entry("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
     Entry("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),

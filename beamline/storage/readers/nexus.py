@@ -3,6 +3,7 @@ mirrored frames."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +16,16 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets
 from beamline.storage.readers.stacks import dimensions
 
-_LISTED = 6  # detectors that an error names
+_LISTED = 6  # detectors, or lists of angles, that a sentence names
+_LONGEST = 100  # steps of a chain of transformations
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Paths in a file of the fields that are read; None for a missing one."""
+    """Paths in a file of the fields that are read; None for a missing one.
+
+    `sense` is -1 for angles that count against the turn of `sample/rotation_angle`.
+    """
 
     entry: h5py.Group
     detector: h5py.Group
@@ -28,6 +33,7 @@ class Places:
     image_key: h5py.Dataset
     angle: h5py.Dataset | None
     angle_problem: str
+    sense: int = 1
 
 
 def find(file: h5py.File) -> list[Places]:
@@ -46,7 +52,7 @@ def find(file: h5py.File) -> list[Places]:
                     if broken := datasets.broken_link(detector, name):
                         unresolved.append(broken)
                 if key is not None and data is not None and data.ndim == 3:
-                    places.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
+                    places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
         raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
     return places
@@ -66,17 +72,46 @@ def _link(group: h5py.Group, name: str) -> str:
     return f"{group.name}/{name} -> {where}"
 
 
-def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset | None, str]:
+def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.Dataset | None, str, int]:
+    """The angles of n frames, why there are none, and their sense."""
     angle = datasets.dataset(entry, "sample/rotation_angle")
     if angle is not None:
-        return angle, ""
+        return angle, "", 1
     # Diamond: the NXdata named as the detector says which scanned axis goes with the frames.
     data = datasets.resolve(entry, str(detector.name).rsplit("/", 1)[1])
     name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = datasets.dataset(data, name)
-        return angle, "" if angle is not None else f"{_link(data, name)} is not there"
-    return None, datasets.broken_link(entry, "sample/rotation_angle") or f"{entry.name} has no sample/rotation_angle"
+        return angle, "" if angle is not None else f"{_link(data, name)} is not there", 1
+    rotations = _rotations_of_sample(entry)
+    if len(rotations) == 1:
+        return rotations[0][0], "", rotations[0][1]
+    if broken := datasets.broken_link(entry, "sample/rotation_angle"):
+        return None, broken, 1
+    lists = [item for item in datasets.arrays_in(entry.file, (1,)) if item.size == n]
+    units = ((item, datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)) for item in lists)
+    names = [str(item.name) for item, known in units if known is not None]
+    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} takes them" if names else ""
+    return None, f"{entry.name} has no sample/rotation_angle{which}", 1
+
+
+def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
+    """The rotations with several angles that the sample depends on, and their sense: those that change, or all.
+
+    The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
+    group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
+    """
+    here, where, steps, found = datasets.resolve(entry, "sample"), datasets.text_at(entry, "sample/depends_on"), 0, []
+    while where not in ("", ".") and steps < _LONGEST and (item := datasets.resolve(here, where)) is not None:
+        inner = isinstance(item, h5py.Group)
+        values = datasets.dataset(item, "value") if inner else datasets.dataset(here, where)
+        if values is not None and values.size > 1 and datasets.attribute(item, "transformation_type") == "rotation":
+            vector = np.ravel(item.attrs.get("vector", 1))
+            against = vector.dtype.kind in "if" and vector[np.abs(vector).argmax()] < 0
+            found.append((values, -1 if against else 1))
+        here, where, steps = item.parent, datasets.attribute(item, "depends_on"), steps + 1
+    changing = [each for each in found if np.unique(datasets.values_of(each[0])).size > 1]
+    return changing or found
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
@@ -127,6 +162,7 @@ class NexusGeometry:
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
+        central: (row, column) that the central ray meets, counted as frames are read; NaN where it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
         turned: turns of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
@@ -134,6 +170,7 @@ class NexusGeometry:
 
     pixel_mm: tuple[float | None, float | None]
     cone: tuple[float, float] | None
+    central: tuple[float, float]
     mirrored: tuple[bool, bool]
     turned: str
     remarks: dict[str, str]
@@ -146,8 +183,8 @@ def read_geometry(places: Places) -> NexusGeometry:
         DataError: distances that cannot be.
     """
     detector, entry = places.detector, places.entry
-    own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
-    at_sample = [datasets.scalar(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
+    own = [datasets.typical(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
+    at_sample = [datasets.typical(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
     pixels = [theirs or ours for theirs, ours in zip(at_sample, own, strict=True)]
     cone, remarks = _cone_of(places, own[0], at_sample[0])
     if cone is not None:  # on the detector
@@ -156,7 +193,17 @@ def read_geometry(places: Places) -> NexusGeometry:
     mirrored, turned = _mirrored(detector)
     if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
         remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back as they are read"
-    return NexusGeometry((pixels[0], pixels[1]), cone, mirrored, turned, remarks)
+    beside = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
+    row, col = (_central(places, i, beside[i], mirrored[1 - i]) for i in (1, 0))
+    return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)
+
+
+def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> float:
+    """The pixel along x (0) or y (1) that the central ray meets, by a length or a number of pixels; NaN: not stated."""
+    pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
+    pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
+    at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
+    return math.nan if at is None else places.data.shape[2 - along] - 1 - at if reverse else at
 
 
 def _cone_of(

@@ -83,6 +83,7 @@ class NexusSource(ScanSource):
         """
         geometry = read_geometry(self._places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
+        self.central = geometry.central
         self.pixel_size_mm, height = geometry.pixel_mm
         self.row_pitch_mm = differing(height, self.pixel_size_mm)
         self.pixel_mask = self._mask()
@@ -134,7 +135,8 @@ class NexusSource(ScanSource):
         """Kind, angle and exposure of the first n frames. DataError: there are fewer of one of them, or more than
         `most`."""
         places = self._places
-        angles = datasets.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
+        known = places.angle is not None and self._own_angles
+        angles = places.sense * datasets.radians(places.angle) + 0.0 if known else np.full(n, np.nan)  # no -0
         keys = np.ravel(datasets.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
         if min(sizes) < n or max(sizes) > most:
@@ -161,19 +163,22 @@ class NexusSource(ScanSource):
         """Further metadata: sample, title, times."""
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
-        for name, where in TEXTS.items():
-            value = datasets.text_at(entry, where)[: datasets.NAME]
+        for name, at in TEXTS.items():
+            value = datasets.text_at(entry, at)[: datasets.NAME]
             if value:
                 facts[name] = value
-        for name, where, units in NUMBERS:
-            number = datasets.scalar(entry, where, units)
+        for name, at, units in NUMBERS:
+            number = datasets.scalar(entry, at, units)
             if number is not None:
                 facts[name] = number
         if "exposure_s" not in facts and np.isfinite(self.exposures).any():
             facts["exposure_s"] = float(np.nanmedian(self.exposures))
         facts |= self._remarks
+        where, against = str(getattr(self._places.angle, "name", "")), self._places.sense < 0
         if self._places.angle_problem:
             facts["angles"] = f"unknown: {self._places.angle_problem}"
+        elif self._own_angles and (against or not where.endswith("/rotation_angle")):
+            facts["angles_reversed" if against else "angles_from"] = where
         if self._places.data.is_virtual:
             facts["parts"] = ", ".join(name for name, _ in drawn_on(self._places.data.id.get_create_plist()))
         return facts

@@ -260,7 +260,7 @@ def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
     """Every dataset that may be images, once, also behind links."""
-    return (item for item in datasets.images_in(file) if min(item.shape[-2:]) > 1)
+    return (item for item in datasets.arrays_in(file, (2, 3, 4)) if min(item.shape[-2:]) > 1)
 
 
 def _read(path: Path, item: h5py.Dataset) -> NDArray[Any]:

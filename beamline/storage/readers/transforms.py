@@ -60,6 +60,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         cols=cols,
         shape=(base.shape[0], end - first),
         axis_col=None if base.axis_col is None else base.axis_col - first,
+        central=None if base.central is None else (base.central[0], base.central[1] - first),
         flags=moved,
     )
 
@@ -80,6 +81,7 @@ def turned(base: ScanSource) -> ScanSource:
         pixels=lambda read, frames, rows: np.ascontiguousarray(np.rot90(read(frames), axes=(1, 2))[:, rows]),
         shape=base.shape[::-1],
         axis_col=None,
+        central=None if base.central is None else (base.shape[1] - 1 - base.central[1], base.central[0]),
         pixel_size_mm=sizes[0],
         row_pitch_mm=sizes[1],
         shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],

@@ -22,7 +22,7 @@ _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a tu
 
 
 def angles_known(source: ScanSource) -> Iterator[Finding]:
-    """Every projection has a finite angle."""
+    """Every projection has a finite angle, in a sense that is certain."""
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     unknown = views[~np.isfinite(source.angles[views])]
     if unknown.size:
@@ -33,6 +33,13 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
             f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
             + (f"; {why}" if why else "")
             + ". Give them with --angles FILE (degrees, one a line).",
+        )
+    if where := source.attributes.get("angles_reversed"):
+        yield Finding(
+            "warning",
+            "angles",
+            f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
+            f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one.",
         )
 
 

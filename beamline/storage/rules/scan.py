@@ -19,6 +19,9 @@ from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelle
 from drivers.base.frame import FrameKind
 
 
+_OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
+
+
 def scan_findings(source: ScanSource) -> list[Finding]:
     """Findings of `SOURCE_RULES` on an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
@@ -94,6 +97,19 @@ def stated_used(source: ScanSource) -> Iterator[Finding]:
     for field in source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
         yield Finding("warning" if field.doubt else "info", "not-used", message)
+
+
+def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = None) -> Iterator[Finding]:
+    """The central ray of a cone, which the file states or the caller, meets the middle of the rows, and the axis."""
+    ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
+    for (side, taken, option), at, n in zip(ways, source.central or (), source.shape, strict=False):
+        if (cone or source.cone) is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
+            yield Finding(
+                "warning",
+                f"central-{side}",
+                f"The file states that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
+                f"of {n}). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
+            )
 
 
 def pixels_square(source: ScanSource) -> Iterator[Finding]:

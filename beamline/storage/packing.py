@@ -1,0 +1,89 @@
+"""Packed numbers: of a dataset whose attributes say how they are read, as CF (netCDF) and CIL write them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+
+_CF, _CIL = ("scale_factor", "add_offset"), ("scale", "offset")
+_NAMES = {*_CF, *_CIL, "_FillValue", "missing_value", "valid_range", "valid_min", "valid_max", "_Unsigned"}
+
+
+class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
+    """A dataset that is read as the values of its numbers; `id.dtype` is the type that is stored."""
+
+    def __init__(self, item: h5py.Dataset, values: Callable[[Any], NDArray[Any]]) -> None:
+        super().__init__(item.id)
+        self._stored, self._values = item, values
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return values_type(self._stored.dtype)
+
+    def __getitem__(self, args: Any, new_dtype: Any = None) -> NDArray[Any]:
+        return self._values(self._stored.__getitem__(args, new_dtype))
+
+
+def unpacked(item: h5py.Dataset) -> h5py.Dataset:
+    """A dataset that is read as the values of its numbers. DataError as of `packing`."""
+    if item.dtype.kind not in "uif" or not _NAMES & {*item.attrs}:
+        return item
+    by_cil = "cil_version" in item.file.attrs or "NEXUSDataWriter" in str(item.file.attrs.get("creator"))
+    values = packing(item.attrs, item.dtype, f"{item.name} in {item.file.filename}", by_cil=by_cil)
+    return item if values is None else PackedDataset(item, values)
+
+
+def values_type(stored: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of the values of packed numbers: real ones that hold all of them."""
+    return np.result_type(stored, np.float32)
+
+
+def packing(
+    said: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
+) -> Callable[[Any], NDArray[Any]] | None:
+    """What makes values of packed numbers [...] of a type, NaN of those that are none; None where they are the values.
+
+    By CF value = stored * scale_factor + add_offset, by CIL value = (stored - offset) / scale.
+
+    Args:
+        said: the attributes of the numbers.
+        by_cil: CIL wrote them: others mean something else by scale and offset.
+
+    Raises:
+        DataError: nobody says what they mean, or no number has such a value.
+    """
+    pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*said} and not {*_CF} & {*said} else _CF
+    scale, offset = (float(np.ravel(said.get(name, plain)).item()) for name, plain in zip(pair, (1, 0), strict=True))
+    if not (scale and np.isfinite(scale + offset)) or (pair is _CIL and not by_cil and (scale, offset) != (1, 0)):
+        raise DataError(
+            f"{where} has the attributes {pair[0]} {scale:g} and {pair[1]} {offset:g}, and nothing says how its numbers "
+            "are read by them. In a copy, name them scale_factor and add_offset, where value = stored * scale_factor + "
+            "add_offset, or store the values."
+        )
+    if pair is _CIL:
+        scale, offset = 1 / scale, -offset / scale
+    unsigned = dtype.kind == "i" and "true" in str(said.get("_Unsigned")).lower()
+    signed = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
+    fills = np.concatenate([np.ravel(said.get(name, [])) for name in ("_FillValue", "missing_value")])
+    ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    fills = fills[(fills >= ends[0]) & (fills <= ends[1])].astype(dtype).view(signed)  # NaN are no values as they are
+    limits = np.ravel(said.get("valid_range", [said.get("valid_min", -np.inf), said.get("valid_max", np.inf)]))
+    if limits.dtype.kind == "f" and dtype.kind != "f":  # in the unit of the values, as these have another type
+        limits = np.rint((limits - offset) / scale)
+    low, high = limits.min(), limits.max()
+    if (scale, offset, signed, fills.size) == (1, 0, dtype, 0) and low <= ends[0] and ends[1] <= high:
+        return None
+
+    def values(stored: Any) -> NDArray[Any]:
+        numbers = np.asarray(stored).view(signed)
+        made = np.asarray(numbers.astype(values_type(dtype)) * scale + offset, values_type(dtype))
+        made[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
+        return made
+
+    return values
