@@ -18,7 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.machine import free_memory
 from beamline.storage.structure import numbers_of, shape_of
 
-_METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
+METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -26,7 +26,7 @@ Spacing = tuple[float, float, float]
 
 def is_zarr(path: Path) -> bool:
     """Whether a folder is a Zarr store, written by any program."""
-    return any((path / name).is_file() for name in _METADATA)
+    return any((path / name).is_file() for name in METADATA)
 
 
 @dataclass(frozen=True)

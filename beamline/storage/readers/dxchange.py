@@ -21,7 +21,16 @@ from beamline.storage.readers.fields import (
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
+from beamline.storage.readers.stacks import (
+    SINOGRAM,
+    USUAL,
+    FrameStack,
+    Order,
+    StacksSource,
+    dimensions,
+    in_order,
+    shape_without_ones,
+)
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
@@ -45,9 +54,10 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
-        items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0])) for kind, where in PLACES)
+        items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0] or 0)) for kind, where in PLACES)
+        usual = order or (SINOGRAM if len(shape_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
         stacks = [
-            FrameStack(kind, where, in_order(item, _order(item) or order or USUAL))
+            FrameStack(kind, where, in_order(item, _order(item) or usual))
             for kind, where, item in items
             if item is not None
         ]
@@ -166,7 +176,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
     return [axis for part in np.ravel(item.attrs.get("axes", ())) for axis in datasets.text(part).split(":")]
 
 
-def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
+def _order(item: h5py.Dataset) -> Order | None:
     """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
     return dimensions(_axes(item))
 

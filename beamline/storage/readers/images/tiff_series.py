@@ -1,4 +1,4 @@
-"""TIFF series: a folder (or .zip) with one image a file.
+"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG.
 
 The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
 order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
@@ -28,28 +28,32 @@ from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.arrays import holds_arrays
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
+    DECODERS,
     SUFFIXES,
     UNREADABLE,
     image_of,
+    images_among,
     is_hidden,
+    no_image,
     opened,
-    read_image,
     refuse_volume,
     stated,
 )
 from beamline.storage.structure import is_blank
 from beamline.storage.writers.rows import ScanEnding
+from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
 LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
 class TiffSeriesSource(ScanSource):
@@ -57,17 +61,25 @@ class TiffSeriesSource(ScanSource):
 
     format = "tiff_series"
 
-    def __init__(self, path: Path, *, one_series: bool = False) -> None:
-        """Open. `one_series`: all images are one numbered series, whatever the names say of kinds."""
+    def __init__(self, path: Path, *, one_series: bool = False, listed: list[str] | None = None) -> None:
+        """Open.
+
+        Args:
+            one_series: all images are one numbered series, whatever the names say of kinds.
+            listed: names of the images, all of them views; None: those that lie in the folder.
+        """
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
         with hdf5.closed_on_error(self):
-            names = self._names()
-            images = in_order(path, [name for name in names if name.lower().endswith(SUFFIXES)], one_series=one_series)
-            self._files, self.image_key, self.angles = images.names, images.kinds, images.angles
-            self.in_order, self.numbers = images.references == 0, images.numbers
-            self.exposures = np.full(len(self._files), np.nan)
-            references, series = self._files[: images.references], self._files[images.references :]
+            names = self._names() if listed is None else listed
+            among = images_among(name for name in names if not ANGLE_FILE.search(name.lower()))
+            if not among:
+                raise DataError(no_image(path, names))
+            images = in_order(path, among, one_series=one_series or listed is not None)
+            self.names, self.image_key, self.angles = images.names, images.kinds, images.angles
+            self.in_order, self.numbers = len(images.series) == len(images.names), images.numbers
+            self.exposures = np.full(len(self.names), np.nan)
+            references, series = images.references, images.series
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
                 self.not_used = stated(path, tif)
@@ -75,9 +87,11 @@ class TiffSeriesSource(ScanSource):
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
-            self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
+            self._texts = [name for name in names if ANGLE_FILE.search(name.lower()) and not name.endswith(".npy")]
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
+        if images.beside:
+            self.not_used += (NotUsed(images.beside[0], f"{len(images.beside)} images", _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
@@ -93,7 +107,7 @@ class TiffSeriesSource(ScanSource):
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):
-            name = self._files[number]
+            name = self.names[number]
             image = self._image(name)
             if image.shape != self.shape:
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
@@ -160,8 +174,11 @@ class TiffSeriesSource(ScanSource):
                 break
             looked += self._size(name)
             try:
-                with self._tiff(name) as tif:
-                    shape, dtype = image_of(tif)
+                if name.lower().endswith(SUFFIXES):
+                    with self._tiff(name) as tif:
+                        shape, dtype = image_of(tif)
+                else:
+                    shape, dtype = (image := self._image(name)).shape, image.dtype
                 images.append((self._require_grey(name, shape, dtype), dtype))
             except UnreadableError as error:
                 failed.append(error)
@@ -175,15 +192,19 @@ class TiffSeriesSource(ScanSource):
     def _image(self, name: str) -> NDArray[Any]:
         content = self._bytes(name, LARGEST_IMAGE)
         try:
-            image = read_image(io.BytesIO(content), LARGEST_IMAGE)
+            image = DECODERS[name[name.rindex(".") :].lower()](io.BytesIO(content), LARGEST_IMAGE)
         except UNREADABLE as error:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+            raise UnreadableError(
+                f"{name} in {self.path} cannot be read as an image ({hdf5.reason(error)})."
+            ) from error
+        while image.ndim > 2 and image.shape[0] == 1:
+            image = image[0]
         self._require_grey(name, image.shape, image.dtype)
         return image
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
+            raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
         if len(shape) != 2:
             raise DataError(
                 f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --then FILE."
@@ -210,11 +231,15 @@ def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
     if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers count no images
         return (), ""
     left_out, first = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}), int(numbers.min())
-    return tuple(images.references + number - first for number in left_out), spans(left_out)
+    before = int((images.kinds == FrameKind.PROJECTION).argmax())
+    return tuple(before + number - first for number in left_out), spans(left_out)
 
 
+_BESIDE = "a view half a turn from the first, taken beside the series: the axis is found by the series itself"
 FORMAT = ScanFormat(
-    "a folder or .zip of TIFFs",
-    lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
+    "a folder or .zip of images (TIFF, .npy or PNG)",
+    lambda path, opening: (
+        (path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip")) and not holds_arrays(path)
+    ),
     lambda path, opening: TiffSeriesSource(path, one_series=opening.one_series),
 )
