@@ -161,11 +161,11 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
         DataError: a list longer than any scan.
     """
     item = resolve(group, path)
-    if not isinstance(item, h5py.Dataset) or item.shape is None:
+    if item is None or getattr(item, "shape", None) is None:
         return None
     if item.ndim == 1 and item.size > _FRAMES:
         raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
-    several = item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
+    several = isinstance(item, h5py.Dataset) and item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
     sizes = (bytes_unpacked(item, axis) for axis in (frames, int(not frames))) if several else ()
     if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
         access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)

@@ -28,7 +28,6 @@ from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
-from beamline.storage.volumes.base import VolumeFormat
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import held
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -77,9 +76,9 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
         deep: every frame is read and compared with its checksum; it is called with how many of how many.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
-    findings = list[Finding]()
+    findings, stated = list[Finding](), isinstance(scan, SourceOptions) and scan.stated
     try:
-        if _volume_format(scan) is not None:
+        if not stated and volume_format(path) is not None:
             of_all: dict[Finding, None] = {}
             for at in range(len(times_of(path))) or (None,):
                 with opened_volume(path, at=at) as record, hdf5.readable(path):
@@ -183,17 +182,10 @@ LOOK = 15.0
 """Seconds in which frames are looked at for faults."""
 
 
-def _volume_format(scan: SourceOptions | Path | str) -> VolumeFormat | None:
-    """The format of a volume; None for a scan, and where the caller says anything of a scan."""
-    if isinstance(scan, SourceOptions):
-        return None if scan.stated else volume_format(Path(scan.path))
-    return volume_format(Path(scan))
-
-
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
     """Describe a scan or a volume. Raises DataError if it cannot be opened."""
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
-    if (kind := _volume_format(scan)) is not None:
+    if not (isinstance(scan, SourceOptions) and scan.stated) and (kind := volume_format(path)) is not None:
         seconds = times_of(path)
         with opened_reconstruction(path, 0) if seconds else kind.open(path) as record:
             return describe_volume(path, kind.name, record)

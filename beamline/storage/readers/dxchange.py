@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
+from beamline.storage.readers.arrays import opened, zarr_root
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.fields import (
     EXCHANGE,
@@ -49,7 +51,7 @@ PLACES = (
 
 def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = hdf5.open_hdf5(path)
+    file = opened(path)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
@@ -135,7 +137,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
-    of_views = datasets.attribute(file["exchange"].get("theta", item), "units")
+    of_views = datasets.attribute(datasets.dataset(file, "exchange/theta") or item, "units")
     known = datasets.factor_of(of_views, datasets.ANGLE_UNITS) is not None
     angles = datasets.radians(item, default=of_views if known else "degrees")
     return angles if np.isfinite(angles).all() else None
@@ -242,14 +244,14 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
     for name, where in TEXTS.items():
         if datasets.dataset(file, where) is not None:
             facts[name] = datasets.text_at(file, where)[: datasets.NAME]
-    facts["theta_units"] = datasets.attribute(file["exchange"].get("theta", file), "units") or "not given"
+    facts["theta_units"] = datasets.attribute(datasets.dataset(file, "exchange/theta") or file, "units") or "not given"
     return facts
 
 
 def _recognises(path: Path, opening: Opening) -> bool:
-    if not hdf5.is_hdf5(path, opening.follow):
+    if not hdf5.is_hdf5(path, opening.follow) and zarr_root(path) is None:
         return False
-    with hdf5.open_hdf5(path, opening.follow) as file:
+    with closing(opened(path, opening.follow)) as file:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 

@@ -16,7 +16,6 @@ from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
 from beamline.storage.hdf5 import NotReadyError
-from beamline.storage.readers.angle_files import Angles, load_angles, parse_angles
 from beamline.storage.readers.arrays import holds_arrays
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -25,15 +24,17 @@ from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.replacements import (
+    Angles,
     Images,
     assign,
+    load_angles,
     load_images,
     overlaid,
+    parse_angles,
     select_rows,
 )
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.sinograms import with_order
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks, with_order
 from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
@@ -81,8 +82,8 @@ class SourceOptions:
     """A scan file, and replacements for its metadata.
 
     Attributes:
-        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of images, .npy, .npz,
-            Zarr, .txrm, the folder of a scene of R²-Gaussian.
+        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of images, .npy, Zarr,
+            .txrm, the folder of a scene of R²-Gaussian.
         quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
             darks of 0.
         angles: replace the file's: a file in degrees (a text with one a line, a table with a column named so, .npy), a
@@ -325,12 +326,11 @@ def _open(path: Path, opening: Opening) -> ScanSource:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
         if holds_arrays(path):
-            return open_arrays(path, opening)
+            return open_arrays(path)
     if not hdf5.is_hdf5(path):
-        _refuse_pickle(path)
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a folder or "
-            ".zip of images."
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip of "
+            "images."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -345,20 +345,6 @@ def _open(path: Path, opening: Opening) -> ScanSource:
     raise DataError(
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
-    )
-
-
-def _refuse_pickle(path: Path) -> None:
-    """DataError for a pickle, as NAF and SAX-NeRF keep their scenes: to read one runs the code that is in it."""
-    if path.suffix.lower() not in (".pickle", ".pkl", ".pck"):
-        return
-    raise DataError(
-        f"{path} is a pickle, which is never opened here: it may run any program that its writer put into it. If you "
-        'trust the writer, convert it: python -c "import numpy as np, pickle; d = pickle.load(open('
-        f"'{path}', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']"
-        "['angles']); print({k: v for k, v in d.items() if np.size(v) < 9})\". It prints DSO, DSD and dDetector in mm. "
-        "Then: beamline recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD "
-        "--pixel-size-um 1000*dDetector. Nothing was read."
     )
 
 

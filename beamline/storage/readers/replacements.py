@@ -1,4 +1,4 @@
-"""Angles and references from outside the scan file: references are read, both laid on frames only where they fit.
+"""Angles and references from outside the scan file: read, and laid on frames only where they fit.
 
 Darks and flats are an array, TIFFs, or an HDF5 file of their own, as httomo, i12 and Savu have.
 """
@@ -18,18 +18,91 @@ from numpy.typing import ArrayLike, NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.core.files import text_in
+from beamline.core.text import NUMBER
+from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.readers.arrays import Arrays, holds_arrays
+from beamline.storage.readers.arrays import holds_arrays, opened
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at, in_order
+from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, dataset_at, in_order
 from beamline.storage.readers.tiff import DECODERS, UNREADABLE, images_among, no_image, read_image
 from beamline.storage.readers.transforms import type_wrapped, unsigned
 from drivers.base.frame import FrameKind
+
+Angles = Path | str | ArrayLike
+"""A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
+_ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # in the name of a column
+_UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # at its end
+_VALUE = re.compile(rf"[-+]?({NUMBER}|\d+,\d+|nan|inf)", re.IGNORECASE)
+
+
+def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from a file, or from an array in radians.
+
+    Args:
+        unit: "deg" or "rad", whatever the file says; None: as it says.
+
+    Raises:
+        DataError: they cannot be read, or several lists could be meant.
+    """
+    if not isinstance(angles, Path | str):
+        return np.atleast_1d(np.asarray(angles, np.float64))
+    name, _, where = (str(angles), "", "") if Path(angles).exists() else str(angles).partition("::")
+    path = Path(name)
+    if (arrays := holds_arrays(path)) or (path.is_file() and hdf5.is_hdf5(path)):
+        with hdf5.readable(path):
+            return angles_at(path, where.replace("\\", "/"), unit, "degrees" if arrays else "")
+    try:
+        return parse_angles(text_in(path), str(path), where, unit)
+    except OSError as error:
+        raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
+
+
+def parse_angles(content: str, name: str, column: str = "", unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from text in degrees (see `plan.from_text`), or from a column of a table, as `load_angles` has it.
+
+    Args:
+        name: where the text came from.
+    """
+    try:
+        text, stated = _column(content.splitlines(), column)
+        if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
+            raise ValueError(f"the unit of its column is {stated!r}; say --angles-unit deg or rad")
+        return from_text(text, unknown=True) * (factor / datasets.DEGREE)
+    except ValueError as error:
+        raise DataError(f"{name}: {error}.") from error
+
+
+def _column(lines: list[str], wanted: str) -> tuple[str, str]:
+    """The text of one column of a table, a line for each of the table, and its unit.
+
+    Args:
+        wanted: its name, or its number from 0 on; "": the only one that is named after angles. Names stand in the first
+            line, which may be a comment. A text without them is one list, in degrees.
+    """
+    filled = [number for number, line in enumerate(lines) if line.strip()] or [0]
+    head, last = (lines[filled[end]].strip() if lines else "" for end in (0, -1))
+    bare = head.lstrip("# ")
+    mark = next((mark for mark in (";", "\t", ",", None) if len(last.split(mark)) == len(bare.split(mark)) > 1), "\n")
+    names = [cell.strip(' "') for cell in bare.split(mark)]
+    titled = not any(map(_VALUE.fullmatch, names)) and (len(names) > 1 or (head == bare and bool(_ANGLE.search(bare))))
+    if not (titled or wanted):
+        return "\n".join(lines), "deg"
+    chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
+    chosen = chosen or [int(wanted)] * wanted.isdecimal()
+    if len(chosen) != 1 or chosen[0] >= len(names):
+        held = ", ".join(names) if titled else f"{len(names)} without names"
+        raise ValueError(f"its columns are {held}; name that of the angles, or its number from 0: FILE::COLUMN")
+    for number, line in enumerate(lines):
+        cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
+        lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "nothing" * bool(cells)
+    unit = _UNIT.search(names[chosen[0]]) if titled else None
+    return "\n".join(lines), (unit[1] or unit[2]).strip() if unit else "deg"
 
 
 def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
@@ -183,7 +256,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
     if name.isdecimal() and shape is not None and not path.exists():
         return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
     if holds_arrays(path):
-        with closing(Arrays(path)) as arrays, hdf5.readable(path):
+        with closing(opened(path)) as arrays, hdf5.readable(path):
             return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
     if path.is_file() and hdf5.is_hdf5(path):
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):

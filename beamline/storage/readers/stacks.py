@@ -19,10 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.readers.arrays import Arrays, NamedArray, holds_arrays, shapes_text
-from beamline.storage.readers.base import WHOLE, Attributes, NotUsed, Opening, ScanSource, frame_indices
+from beamline.storage.readers.arrays import Arrays, NamedArray, opened
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.readers.frames import Frames, Read
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
-
 
 Order = tuple[int | None, int | None, int | None]
 """Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
@@ -175,13 +176,8 @@ class StacksSource(ScanSource):
         self._file.close()
 
 
-def opened(path: Path) -> Any:
-    """A file with arrays by their names: HDF5, or `Arrays`."""
-    return Arrays(path) if holds_arrays(path) else hdf5.open_hdf5(path)
-
-
 def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
-    """The scan whose arrays have these paths in an HDF5 file, a Zarr or a file of NumPy. A dark or flat may be a single
+    """The scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
     image [row, col].
 
     Args:
@@ -209,46 +205,22 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
 
 
-_EXCHANGE = "exchange/data", "exchange/data_dark", "exchange/data_white", "exchange/theta"
-
-
-def open_arrays(path: Path, opening: Opening) -> StacksSource:
-    """The scan in a file of NumPy or a Zarr: its only array of images, or those that it names as Data Exchange does.
-
-    Raises:
-        DataError: it cannot be read, or holds several such arrays, or none.
-    """
+def open_arrays(path: Path) -> StacksSource:
+    """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
     with closing(Arrays(path)) as file:
-        images = [name for name, item in file.items.items() if item.ndim > 1]
-        data, darks, flats, theta = (name if name in file.items else None for name in _EXCHANGE)
-        if data is None and len(images) != 1:
+        images = [name for name, item in file.items() if item.ndim > 1]
+        if len(images) != 1:
             raise DataError(
                 f"{path} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the scan: "
                 "--data-path, --angles-path, --darks-path, --flats-path."
             )
-        angles = datasets.radians(file.items[theta], default="degrees") if opening.own_angles and theta else None
-        others = [item for name, item in file.items.items() if name not in (data or images[0], darks, flats, theta)]
-    source = open_stacks(path, data or images[0], darks, flats, theta)
-    source.not_used = tuple(
-        NotUsed(item.name, f"{' x '.join(map(str, item.shape))} values", _OTHER, False) for item in others
-    )
-    views = source.image_key == FrameKind.PROJECTION
-    if angles is not None and angles.size != views.sum():
-        source.close()
-        raise DataError(
-            f"{path}: {theta} has {angles.size} angles for {views.sum()} projections; expected one for each."
-        )
-    source.angles[views] = np.nan if angles is None else angles
-    return source
-
-
-_OTHER = "an array beside the projections: --angles-path, --darks-path or --flats-path takes it"
+    return open_stacks(path, images[0], None, None)
 
 
 def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
     """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
     where, colon, names = data.rpartition(":")
-    if not colon or dataset_in(file, data) is not None:
+    if not colon or datasets.dataset(file, data) is not None:
         return dataset_at(file, data), data, None
     return dataset_at(file, where), where, stated_order(names)
 
@@ -257,8 +229,8 @@ def stated_order(names: str) -> Order:
     """The order that a caller states, as in "row,view,col". DataError for another text."""
     if (order := dimensions(names.split(","))) is None:
         raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of a "
-            "sinogram."
+            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
+            "a sinogram."
         )
     return order
 
@@ -286,58 +258,112 @@ def _order_of(
 
 
 def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians of the array `where` of an HDF5 file, a Zarr or a file of NumPy, a list or a column.
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
 
     Args:
         where: "": the only list whose unit is one of angles, or the only array.
-        unit: "deg" or "rad", whatever the file says; None: as it says.
-        default: the unit of a file that says none.
+        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
 
     Raises:
         DataError: it is not there, is no list, or nothing says its unit.
     """
     with closing(opened(path)) as file, hdf5.readable(path):
-        item = dataset_at(file, where) if where or isinstance(file, Arrays) else _only_angles(file)
+        if not where and isinstance(file, h5py.File):
+            where = _only_angles(file)
+        item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
         return datasets.radians(item, unit, default)
 
 
-def _only_angles(file: h5py.File) -> h5py.Dataset:
-    """The only list of a file whose unit is one of angles."""
-    lists = [item for item in _arrays_of(file) if item.ndim == 1 and item.size > 1]
-    found = [item for item in lists if datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)]
+def _only_angles(file: h5py.File) -> str:
+    """The path of the only list of a file whose unit is one of angles."""
+    found = [
+        str(item.name)
+        for item in _arrays_of(file)
+        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
+    ]
     if len(found) != 1:
         raise DataError(
-            f"{file.filename} has {len(found)} lists with a unit of angles. {shapes_text(lists)} Name the one: "
-            "--angles FILE::DATASET, and where it states no unit, --angles-unit deg or rad."
+            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the one: --angles "
+            "FILE::DATASET, and where it states no unit, --angles-unit deg or rad."
         )
     return found[0]
 
 
-def dataset_in(file: Any, where: str) -> Any | None:
-    """The array at a path; None without it."""
-    return file.get(where) if isinstance(file, Arrays) else datasets.dataset(file, where)
-
-
 def dataset_at(file: Any, where: str) -> Any:
     """The array at a path. If there is none, the DataError lists those of the file."""
-    item = dataset_in(file, where)
+    item = datasets.dataset(file, where)
     if item is None:
-        if isinstance(file, h5py.File):
-            datasets.refuse_broken(file, where)
+        datasets.refuse_broken(file, where)
         raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")
     return item
 
 
 def datasets_text(file: Any) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    return shapes_text(_arrays_of(file))
+    arrays = sorted(_arrays_of(file), key=lambda item: (-item.ndim, -item.size))
+    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
+    more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
+    return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."
+
+
+_LISTED = 10  # datasets of a file that an error names
 
 
 def _arrays_of(file: Any) -> list[Any]:
     if isinstance(file, Arrays):
-        return [*file.items.values()]
+        return [*file.values()]
     arrays = list[h5py.Dataset]()
     file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
     return arrays
+
+
+def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
+    """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
+
+    Args:
+        order: None: the images are views, but for a single one that has as many rows, or columns, as there are angles:
+            it is a sinogram.
+
+    Raises:
+        DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
+    """
+    fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
+    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
+        return base
+    if order is None and len(fits) > 1:
+        raise DataError(
+            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
+            "which side the views are is not known. Say --order view,col or --order col,view."
+        )
+    order = order or ("col,view" if fits[0] else "view,col")
+    images = in_order(_Images(base), stated_order(order))
+    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
+        raise DataError(
+            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
+            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
+            "flats with --darks and --flats."
+        )
+
+    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
+        indices = frame_indices(frames, len(images))
+        out = np.empty((indices.size, len(range(images.shape[1])[rows]), images.shape[2]), base.dtype)
+        datasets.read_frames(images, indices, rows, out)
+        return out
+
+    unknown, cost = np.full(len(images), np.nan), base.frame_bytes * base.image_key.size
+    own = {"angles": unknown, "exposures": unknown, "numbers": None, "ending": ScanEnding(), "frame_bytes": cost}
+    own |= {"attributes": lambda known: {**known, "dimensions": order}, "in_order": True, "shape": images.shape[1:]}
+    return Frames(base, pixels=pixels, image_key=np.zeros(len(images), np.int32), **own)
+
+
+class _Images:
+    """All images of a scan as an array [image, row, col]."""
+
+    def __init__(self, base: ScanSource) -> None:
+        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
+        self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
+
+    def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:
+        return self._read(part[0], part[1])[..., part[2]]

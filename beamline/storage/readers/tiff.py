@@ -7,7 +7,7 @@ import lzma
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,7 +31,8 @@ UNREADABLE = (
     *(*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile),
     Image.DecompressionBombError,
 )
-"""What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among them."""
+"""What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
+them."""
 _NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
@@ -149,14 +150,14 @@ FOREIGN = (
 )  # pictures that are not read: nearly all of them have 8 bits, or losses
 
 
-def images_among(names: Iterable[str]) -> list[str]:
+def images_among(names: Sequence[str]) -> list[str]:
     """The images among files, of the first kind that there is: other kinds beside it are no frames of the scan."""
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])
 
 
-def no_image(path: Path, names: Iterable[str]) -> str:
+def no_image(path: Path, names: Sequence[str]) -> str:
     """A sentence on a folder without images that are read."""
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:

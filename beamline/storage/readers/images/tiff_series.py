@@ -24,11 +24,11 @@ from tifffile import TiffFile
 
 from beamline.core.errors import DataError
 from beamline.core.files import TEXT, decoded
-from beamline.core.text import size, spans
+from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.arrays import holds_arrays
+from beamline.storage.readers.arrays import zarr_root
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
 from beamline.storage.readers.side_files import offered
@@ -72,7 +72,7 @@ class TiffSeriesSource(ScanSource):
         self._zip = _open_zip(path) if path.is_file() else None
         with hdf5.closed_on_error(self):
             names = self._names() if listed is None else listed
-            among = images_among(name for name in names if not ANGLE_FILE.search(name.lower()))
+            among = images_among([name for name in names if not ANGLE_FILE.search(name.lower())])
             if not among:
                 raise DataError(no_image(path, names))
             images = in_order(path, among, one_series=one_series or listed is not None)
@@ -91,7 +91,7 @@ class TiffSeriesSource(ScanSource):
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if images.beside:
-            self.not_used += (NotUsed(images.beside[0], f"{len(images.beside)} images", _BESIDE, False),)
+            self.not_used += (NotUsed(images.beside[0], count(len(images.beside), "image"), _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
@@ -239,7 +239,7 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 FORMAT = ScanFormat(
     "a folder or .zip of images (TIFF, .npy or PNG)",
     lambda path, opening: (
-        (path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip")) and not holds_arrays(path)
+        (path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip")) and zarr_root(path) is None
     ),
     lambda path, opening: TiffSeriesSource(path, one_series=opening.one_series),
 )

@@ -15,11 +15,12 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.angle_files import load_angles, parse_angles
 from beamline.storage.readers.replacements import (
     assign,
     evenly_spaced_window,
+    load_angles,
     load_images,
+    parse_angles,
     select_rows,
 )
 from beamline.storage.readers.stacks import StacksSource
