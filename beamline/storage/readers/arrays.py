@@ -78,16 +78,16 @@ def opened(path: Path, follow: bool = False) -> Any:
 _NUMPY = ".npy"
 _RUNS = (
     "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
-    'writer, convert it (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
-    "'{0}', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
-    'print({{k: v for k, v in d.items() if np.size(v) < 9}})". It prints DSO, DSD and dDetector in mm. Then: beamline '
+    'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
+    "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
+    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. Then: beamline '
     "recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD --pixel-size-um "
     "1000*dDetector. Nothing was read."
 )
 _PACKED = (
-    '{0} holds arrays saved by Python, and its projections are read from an .npy: python -c "import numpy as np; d = '
-    "np.load('{0}'); [np.save(n + '.npy', d[n]) for n in d.files]; print(d.files)\" writes one for each array. Angles "
-    "are in degrees, or --angles-unit rad. `beamline view` shows a volume of an .npz. Nothing was read."
+    '{0} holds arrays saved by Python, which are read from an .npy: python -c "import numpy as np; d = np.load('
+    "'FILE'); [np.save(n + '.npy', d[n]) for n in d.files]; print(d.files)\" writes one for each. `beamline view` shows "
+    "a volume of an .npz. Nothing was read."
 )
 _CONVERTED = {".npz": _PACKED, **dict.fromkeys((".pickle", ".pkl", ".pck"), _RUNS)}
 """How files that are not read become some that are, by suffix."""
@@ -96,7 +96,7 @@ _CONVERTED = {".npz": _PACKED, **dict.fromkeys((".pickle", ".pkl", ".pck"), _RUN
 def holds_arrays(path: Path) -> bool:
     """Whether a path is an .npy, or a Zarr. DataError: a file whose arrays are read once they are converted."""
     if path.is_file() and (way := _CONVERTED.get(path.suffix.lower())):
-        raise DataError(way.format(path))
+        raise DataError(way.replace("{0}", str(path)))
     return (path.suffix.lower() == _NUMPY and path.is_file()) or zarr_root(path) is not None
 
 

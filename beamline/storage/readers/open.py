@@ -329,8 +329,8 @@ def _open(path: Path, opening: Opening) -> ScanSource:
             return open_arrays(path)
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip of "
-            "images."
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip "
+            "of images, also of a single one."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

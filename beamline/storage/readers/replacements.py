@@ -75,7 +75,8 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
             raise ValueError(f"the unit of its column is {stated!r}; say --angles-unit deg or rad")
         return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
-        raise DataError(f"{name}: {error}.") from error
+        table = " Of a table, FILE::COLUMN is a column: its name, or its number from 0." if "," in str(error) else ""
+        raise DataError(f"{name}: {error}.{table}") from error
 
 
 def _column(lines: list[str], wanted: str) -> tuple[str, str]:
@@ -94,10 +95,10 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
     if not (titled or wanted):
         return "\n".join(lines), "deg"
     chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
-    chosen = chosen or [int(wanted)] * wanted.isdecimal()
+    chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
     if len(chosen) != 1 or chosen[0] >= len(names):
         held = ", ".join(names) if titled else f"{len(names)} without names"
-        raise ValueError(f"its columns are {held}; name that of the angles, or its number from 0: FILE::COLUMN")
+        raise ValueError(f"its columns are {held}; expected one that is named after angles")
     for number, line in enumerate(lines):
         cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
         lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "nothing" * bool(cells)
@@ -193,6 +194,9 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
             f"{angles.size}, the first {lost} or the last {lost} may be lost"
         )
+    if angles.size in source.shape:
+        sides = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
+        message += f". If each image is a sinogram of {angles.size} views, say --order {sides}"
     if angles.size < n:
         return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
     message += f". Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"

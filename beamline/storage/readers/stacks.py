@@ -272,7 +272,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
             where = _only_angles(file)
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
+            raise DataError(f"{item.name} in {path} is {item.shape}; expected a list of angles.")
         return datasets.radians(item, unit, default)
 
 

@@ -37,6 +37,9 @@ def _open(path: Path, opening: Opening) -> ScanSource:
     assert folder is not None
     meta: dict[str, Any] = json.loads(text_in(folder / _META))
     scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
+    beams = {"cone": (float(scanner["DSO"]), float(scanner["DSD"])), "parallel": None}
+    if (mode := scanner["mode"]) not in beams or not angles:
+        raise DataError(f"{folder / _META} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
     if lost := [name for name in angles if not is_below(folder, name)]:
         raise DataError(
             f"{folder / _META} names {len(angles)} views, of which {len(lost)} are not there, such as {lost[0]}. Fetch "
@@ -45,8 +48,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
     source.angles = np.array([angles[name] for name in source.names])
-    beams = {"cone": (float(scanner["DSO"]), float(scanner["DSD"])), "parallel": None}
-    source.cone = beams[scanner["mode"]]
+    source.cone = beams[mode]
     size, n = np.broadcast_to(scanner.get("sDetector", 0), 2), np.broadcast_to(scanner["nDetector"], 2)
     height, width = map(float, np.broadcast_to(scanner.get("dDetector", size / n), 2))
     source.pixel_size_mm, source.row_pitch_mm = width, differing(height, width)
