@@ -86,8 +86,8 @@ _RUNS = (
 )
 _PACKED = (
     '{0} holds arrays saved by Python, which are read from an .npy: python -c "import numpy as np; d = np.load('
-    "'FILE'); [np.save(n + '.npy', d[n]) for n in d.files]; print(d.files)\" writes one for each. `beamline view` shows "
-    "a volume of an .npz. Nothing was read."
+    "'FILE'); [np.save(n + '.npy', d[n]) for n in d.files]; print(d.files)\" writes one for each. `beamline view` "
+    "shows a volume of an .npz. Nothing was read."
 )
 _CONVERTED = {".npz": _PACKED, **dict.fromkeys((".pickle", ".pkl", ".pck"), _RUNS)}
 """How files that are not read become some that are, by suffix."""

@@ -75,8 +75,10 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
             raise ValueError(f"the unit of its column is {stated!r}; say --angles-unit deg or rad")
         return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
-        table = " Of a table, FILE::COLUMN is a column: its name, or its number from 0." if "," in str(error) else ""
-        raise DataError(f"{name}: {error}.{table}") from error
+        table = ". Of a table, FILE::COLUMN is one column: its name, or its number from 0" * (
+            "column" in str(error) or "its angle" in str(error)
+        )
+        raise DataError(f"{name}: {error}{table}.") from error
 
 
 def _column(lines: list[str], wanted: str) -> tuple[str, str]:
@@ -101,7 +103,7 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
         raise ValueError(f"its columns are {held}; expected one that is named after angles")
     for number, line in enumerate(lines):
         cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
-        lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "nothing" * bool(cells)
+        lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)
     unit = _UNIT.search(names[chosen[0]]) if titled else None
     return "\n".join(lines), (unit[1] or unit[2]).strip() if unit else "deg"
 
@@ -194,12 +196,14 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
             f"{angles.size}, the first {lost} or the last {lost} may be lost"
         )
-    if angles.size in source.shape:
-        sides = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
-        message += f". If each image is a sinogram of {angles.size} views, say --order {sides}"
     if angles.size < n:
         return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
-    message += f". Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
+    if angles.size in source.shape:
+        order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
+        message += f". If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+    else:
+        message += ". Say"
+    message += f" with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
     window = evenly_spaced_window(angles, n)
     if window is not None:
         low, high = np.degrees(angles[list(window)])

@@ -165,8 +165,8 @@ def no_image(path: Path, names: Sequence[str]) -> str:
     return (
         f"{path} holds pictures such as {foreign}, which are not read: their 8 bits, or what their compression leaves "
         "out, spoil line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
-        f"nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L').save("
-        f"n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
+        "nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L')"
+        f".save(n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
     )
 
 
