@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.readers.arrays import opened, zarr_root
+from beamline.storage.foreign_zarr import opened, zarr_root
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.fields import (
     EXCHANGE,

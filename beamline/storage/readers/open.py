@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
+from beamline.storage.foreign_zarr import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
-from beamline.storage.readers.arrays import holds_arrays
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.frames import Frames

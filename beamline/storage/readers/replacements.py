@@ -23,7 +23,7 @@ from beamline.core.text import NUMBER
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.readers.arrays import holds_arrays, opened
+from beamline.storage.foreign_zarr import holds_arrays, opened
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
@@ -72,7 +72,7 @@ def parse_angles(content: str, name: str, column: str = "", unit: str | None = N
     try:
         text, stated = _column(content.splitlines(), column)
         if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
-            raise ValueError(f"the unit of its column is {stated!r}; say --angles-unit deg or rad")
+            raise ValueError(f"the unit of its angles is {stated!r}; say --angles-unit deg or rad")
         return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
         table = ". Of a table, FILE::COLUMN is one column: its name, or its number from 0" * (

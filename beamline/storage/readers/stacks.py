@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.readers.arrays import Arrays, NamedArray, opened
+from beamline.storage.foreign_zarr import Arrays, NamedArray, opened
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.writers.rows import ScanEnding
@@ -352,10 +352,20 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         datasets.read_frames(images, indices, rows, out)
         return out
 
-    unknown, cost = np.full(len(images), np.nan), base.frame_bytes * base.image_key.size
-    own = {"angles": unknown, "exposures": unknown, "numbers": None, "ending": ScanEnding(), "frame_bytes": cost}
-    own |= {"attributes": lambda known: {**known, "dimensions": order}, "in_order": True, "shape": images.shape[1:]}
-    return Frames(base, pixels=pixels, image_key=np.zeros(len(images), np.int32), **own)
+    unknown = np.full(len(images), np.nan)
+    return Frames(
+        base,
+        pixels=pixels,
+        image_key=np.zeros(len(images), np.int32),
+        angles=unknown,
+        exposures=unknown,
+        shape=images.shape[1:],
+        numbers=None,
+        in_order=True,
+        ending=ScanEnding(),
+        frame_bytes=base.frame_bytes * base.image_key.size,
+        attributes=lambda known: {**known, "dimensions": order},
+    )
 
 
 class _Images:

@@ -121,11 +121,6 @@ def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
         return upright(images_of(tif)[0].asarray(), orientation(tif))
 
 
-def _of_numpy(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
-    """An .npy of one image, or several. Raises ValueError for Python's objects."""
-    return np.asarray(np.load(file, allow_pickle=False))
-
-
 def _of_png(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
     """A grey picture. Raises ValueError for colours, a palette, or more bytes than allowed."""
     with Image.open(file, formats=["PNG"]) as picture:
@@ -137,7 +132,7 @@ def _of_png(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
 DECODERS: dict[str, Callable[..., NDArray[Any]]] = {
     ".tif": read_image,
     ".tiff": read_image,
-    ".npy": _of_numpy,
+    ".npy": lambda file, most=0: np.load(file, allow_pickle=False),
     ".png": _of_png,
 }
 """How the images of a folder are read, by suffix: each takes an open file, and the bytes that it may unpack to."""

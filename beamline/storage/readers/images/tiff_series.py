@@ -1,4 +1,4 @@
-"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG.
+"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG; a scene of R²-Gaussian.
 
 The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
 order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import math
 import os
 import re
@@ -23,14 +24,15 @@ from numpy.typing import ArrayLike, NDArray
 from tifffile import TiffFile
 
 from beamline.core.errors import DataError
-from beamline.core.files import TEXT, decoded
+from beamline.core.files import TEXT, decoded, is_below, text_in
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
+from beamline.storage.foreign_zarr import zarr_root
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.arrays import zarr_root
-from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
     DECODERS,
@@ -235,11 +237,69 @@ def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
     return tuple(before + number - first for number in left_out), spans(left_out)
 
 
+_META = "meta_data.json"
+_TEST = "views that its authors keep to judge by; they are left out"
+_AXES = "volume[z, y, x] is vol_gt.transpose(2, 0, 1)[::-1, ::-1]; lengths in mm are units of the scene"
+
+
+def _scene_of(path: Path) -> Path | None:
+    """The folder of a scene, by itself or by its file; None for another path."""
+    folder = path.parent if path.name == _META else path
+    file = folder / _META
+    return folder if file.is_file() and '"proj_train"' in text_in(file) else None
+
+
+def _open_scene(folder: Path) -> ScanSource:
+    """The scan in the folder of a scene of R²-Gaussian (Zha et al. 2024, NeurIPS, github.com/Ruyi-Zha/r2_gaussian).
+
+    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume. Views
+    and angles are taken as they stand. There the first row of a view is the highest z, and the source stands at
+    (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
+
+    Raises:
+        DataError: views are not there, or it is no cone or parallel beam.
+    """
+    meta: dict[str, Any] = json.loads(text_in(folder / _META))
+    scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
+    beams = {"cone": (float(scanner["DSO"]), float(scanner["DSD"])), "parallel": None}
+    if (mode := scanner["mode"]) not in beams or not angles:
+        raise DataError(f"{folder / _META} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
+    if lost := [name for name in angles if not is_below(folder, name)]:
+        raise DataError(
+            f"{folder / _META} names {len(angles)} views, of which {len(lost)} are not there, such as {lost[0]}. Fetch "
+            "them, or take them out of its list. Nothing was read."
+        )
+    source = TiffSeriesSource(folder, listed=[*angles])
+    source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
+    source.angles = np.array([angles[name] for name in source.names])
+    source.cone = beams[mode]
+    size, n = np.broadcast_to(scanner.get("sDetector", 0), 2), np.broadcast_to(scanner["nDetector"], 2)
+    height, width = map(float, np.broadcast_to(scanner.get("dDetector", size / n), 2))
+    source.pixel_size_mm, source.row_pitch_mm = width, differing(height, width)
+    moved = {name: scanner[name] for name in ("offDetector", "offOrigin") if np.any(scanner.get(name, 0))}
+    source.axis_col = None if "offDetector" in moved else (source.shape[1] - 1) / 2
+    source.facts = {**source.facts, "axes": _AXES}
+    source.not_used += tuple(NotUsed(f"scanner/{name}", str(value), _MOVED, True) for name, value in moved.items())
+    if test := meta.get("proj_test"):
+        source.not_used += (NotUsed("proj_test", f"{len(test)} views", _TEST, False),)
+    return source
+
+
+_MOVED = "the axis is searched, and the central ray meets the middle row; --axis states the axis"
 _BESIDE = "a view half a turn from the first, taken beside the series: the axis is found by the series itself"
+
+
+def _open(path: Path, opening: Opening) -> ScanSource:
+    scene = _scene_of(path)
+    return TiffSeriesSource(path, one_series=opening.one_series) if scene is None else _open_scene(scene)
+
+
 FORMAT = ScanFormat(
-    "a folder or .zip of images (TIFF, .npy or PNG)",
+    "a folder or .zip of images (TIFF, .npy or PNG), or a scene of R²-Gaussian",
     lambda path, opening: (
-        (path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip")) and zarr_root(path) is None
+        (path.is_dir() and zarr_root(path) is None)
+        or (path.is_file() and path.suffix.lower() == ".zip" and zarr_root(path) is None)
+        or _scene_of(path) is not None
     ),
-    lambda path, opening: TiffSeriesSource(path, one_series=opening.one_series),
+    _open,
 )
