@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 )
 @recon_options
 def recon(**values: Any) -> None:
-    """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of TIFFs, .txrm.
+    """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of images, .npy, Zarr, .txrm.
 
     HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
 

@@ -39,26 +39,39 @@ scan_options = together(
     option(
         "--horizontal-axis", is_flag=True, help="The rotation axis lies along the rows: turn frames by a quarter turn."
     ),
-    option("--angles", of_one_call=True, type=_PATH, help="Text file with one angle per line, degrees."),
+    option(
+        "--angles",
+        of_one_call=True,
+        type=_PATH,
+        help="File of angles in degrees: a text with one a line, a table with a column named so, .npy, or a list in an "
+        "HDF5 file by its unit; FILE::NAME for one of several.",
+    ),
     option("--angle-rows", of_one_call=True, metavar="A:B", help="Lines of --angles that belong to the projections."),
     option(
         "--darks",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file; or a "
-        "number, the counts of every pixel.",
+        help="TIFF, folder of images, .npy, Zarr or HDF5 file (FILE::DATASET) with darks, instead of those in the "
+        "file; or a number, the counts of every pixel.",
     ),
     option(
         "--flats",
         of_one_call=True,
         type=_PATH,
-        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with flats, instead of those in the file.",
+        help="TIFF, folder of images, .npy, Zarr or HDF5 file (FILE::DATASET) with flats, instead of those in the "
+        "file.",
     ),
     option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout, or of several detectors: its projections, as /raw/images, with their "
-        "dimensions where these are not frame,row,col: /raw/images:frame,col,row.",
+        help="For an HDF5 file or Zarr of any layout, or of several detectors: its projections, as /raw/images, with "
+        "their dimensions where these are not frame,row,col: /raw/images:frame,col,row.",
+    ),
+    option(
+        "--order",
+        metavar="DIMENSIONS",
+        help="Dimensions of the projections, of images one after the other, too, where these are not frame,row,col: "
+        "row,view,col for a stack of sinograms, view,col or col,view for one.",
     ),
     option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
@@ -90,7 +103,9 @@ scan_options = together(
         help="File of the scanner's vendor beside the images (.xtekct, .log, .pca, .xml): distances, pixels, angles.",
     ),
     option(
-        "--angles-unit", type=NameChoice(["deg", "rad"]), help="Unit of --angles-path, overriding the one in the file."
+        "--angles-unit",
+        type=NameChoice(["deg", "rad"]),
+        help="Unit of --angles-path or --angles, overriding the one in the file.",
     ),
 )
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""

@@ -211,11 +211,11 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
         DataError: a list longer than any scan.
     """
     item = resolve(group, path)
-    if not isinstance(item, h5py.Dataset) or item.shape is None:
+    if item is None or getattr(item, "shape", None) is None:
         return None
     if item.ndim == 1 and item.size > _FRAMES:
         raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
-    several = item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
+    several = isinstance(item, h5py.Dataset) and item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
     sizes = (bytes_unpacked(item, axis) for axis in (frames, int(not frames))) if several else ()
     if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
         access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
@@ -360,7 +360,8 @@ def require_possible(item: Any) -> int:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    packed = getattr(item, "item", item).id.get_create_plist().get_nfilters()
+    stored = getattr(item, "item", item)  # pieces of a Zarr are packed as a rule
+    packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
             f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "

@@ -202,8 +202,8 @@ def ingest(
 ) -> None:
     """Copy the scan IN into the new HDF5 scan OUT.h5.
 
-    IN: a multi-page TIFF, folder or .zip of TIFFs, .txrm, or HDF5 (--data-path where its layout is not known). Frames
-    are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
+    IN: a multi-page TIFF, folder or .zip of images, .npy, Zarr, .txrm, or HDF5 (--data-path where its layout is not
+    known). Frames are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
     """
     from beamline.features.files.ingest import ingest as ingest_scan
     from beamline.storage.readers.open import SourceOptions

@@ -77,9 +77,9 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
         deep: every frame is read and compared with its checksum; it is called with how many of how many.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
-    findings = list[Finding]()
+    findings, stated = list[Finding](), isinstance(scan, SourceOptions) and scan.stated
     try:
-        if volume_format(path) is not None:
+        if not stated and volume_format(path) is not None:
             of_all: dict[Finding, None] = {}
             for at in range(len(times_of(path))) or (None,):
                 with opened_volume(path, at=at) as record, hdf5.readable(path):
@@ -174,7 +174,7 @@ LOOK = 15.0
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
     """Describe a scan or a volume. Raises DataError if it cannot be opened."""
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
-    if (kind := volume_format(path)) is not None:
+    if not (isinstance(scan, SourceOptions) and scan.stated) and (kind := volume_format(path)) is not None:
         seconds = times_of(path)
         with opened_reconstruction(path, 0) if seconds else kind.open(path) as record:
             return describe_volume(path, kind.name, record)

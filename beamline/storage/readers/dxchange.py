@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import h5py
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
+from beamline.storage.foreign_zarr import opened, zarr_root
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
@@ -20,7 +22,16 @@ from beamline.storage.readers.fields import (
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import USUAL, FrameStack, StacksSource, dimensions, in_order
+from beamline.storage.readers.stacks import (
+    SINOGRAM,
+    USUAL,
+    FrameStack,
+    Order,
+    StacksSource,
+    dimensions,
+    in_order,
+    shape_without_ones,
+)
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
@@ -39,14 +50,15 @@ PLACES = (
 
 def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = hdf5.open_hdf5(path, follow)
+    file = opened(path, follow)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
-        items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0])) for kind, where in PLACES)
+        items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0] or 0)) for kind, where in PLACES)
+        usual = order or (SINOGRAM if len(shape_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
         stacks = [
-            FrameStack(kind, where, in_order(item, _order(item) or order or USUAL))
+            FrameStack(kind, where, in_order(item, _order(item) or usual))
             for kind, where, item in items
             if item is not None
         ]
@@ -143,7 +155,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
-    of_views = datasets.attribute(file["exchange"].get("theta", item), "units")
+    of_views = datasets.attribute(datasets.dataset(file, "exchange/theta") or item, "units")
     known = datasets.factor_of(of_views, datasets.ANGLE_UNITS) is not None
     angles = datasets.radians(item, default=of_views if known else "degrees")
     return angles if np.isfinite(angles).all() else None
@@ -184,7 +196,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
     return [axis for part in np.ravel(item.attrs.get("axes", ())) for axis in datasets.text(part).split(":")]
 
 
-def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
+def _order(item: h5py.Dataset) -> Order | None:
     """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
     return dimensions(_axes(item))
 
@@ -250,14 +262,14 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
     for name, where in TEXTS.items():
         if datasets.dataset(file, where) is not None:
             facts[name] = datasets.text_at(file, where)[: datasets.NAME]
-    facts["theta_units"] = datasets.attribute(file["exchange"].get("theta", file), "units") or "not given"
+    facts["theta_units"] = datasets.attribute(datasets.dataset(file, "exchange/theta") or file, "units") or "not given"
     return facts
 
 
 def _recognises(path: Path, opening: Opening) -> bool:
-    if not hdf5.is_hdf5(path, opening.follow):
+    if not hdf5.is_hdf5(path, opening.follow) and zarr_root(path) is None:
         return False
-    with hdf5.open_hdf5(path, opening.follow) as file:
+    with closing(opened(path, opening.follow)) as file:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 

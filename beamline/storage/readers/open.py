@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
+from beamline.storage.foreign_zarr import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -33,7 +34,7 @@ from beamline.storage.readers.replacements import (
     select_rows,
 )
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks, with_order
 from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
@@ -81,10 +82,12 @@ class SourceOptions:
     """A scan file, and replacements for its metadata.
 
     Attributes:
-        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
+        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of images, .npy, Zarr,
+            .txrm, the folder of a scene of R²-Gaussian.
         quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
             darks of 0.
-        angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
+        angles: replace the file's: a file in degrees (a text with one a line, a table with a column named so, .npy), a
+            list in an HDF5 file by its unit, FILE::NAME of one of several, or an array in radians; one angle for each
             projection, one for each frame where the order of all frames is known, or one for each number of a series
             of files, from its first to its last.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) are those of the
@@ -95,7 +98,9 @@ class SourceOptions:
             detectors: where the frames of one are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
-        angles_unit: "deg" or "rad", of these, instead of what the file says.
+        angles_unit: "deg" or "rad", of these or of `angles`, instead of what the file says.
+        order: of the dimensions of the projections, such as "row,view,col" for a stack of sinograms, or "view,col" for
+            one; of images in files one after the other, too.
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
@@ -117,6 +122,7 @@ class SourceOptions:
     flats_path: str | None = None
     angles_path: str | None = None
     angles_unit: str | None = None
+    order: str | None = None
     horizontal_axis: bool = False
     earlier: tuple[Path, ...] = ()
     frames: str | None = None
@@ -124,6 +130,11 @@ class SourceOptions:
     side_file: Path | None = None
     cols: tuple[int, int] | None = None
     frames_per_view: int | None = 1
+
+    @property
+    def stated(self) -> bool:
+        """Whether the caller says more of the scan than its path: then it is no volume."""
+        return any(getattr(self, field.name) is not field.default for field in fields(self)[1:])
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """Open the scan with these replacements; see `open_scan`."""
@@ -168,8 +179,9 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
         def file(path: Path) -> ScanSource:
             if options.data_path is None:
                 return opened.enter_context(_open(path, opening))
+            data = options.data_path if options.order is None else f"{options.data_path}:{options.order}"
             with hdf5.readable(path):
-                return opened.enter_context(_at_data_path(path, options.data_path, options))
+                return opened.enter_context(_at_data_path(path, data, options))
 
         base = file(path)
         if options.then:
@@ -190,6 +202,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
     _, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
+    base = with_order(
+        base, options.order if options.data_path is None else None, None if angles is None else angles.size
+    )
     if angles is not None:
         angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
         base = Frames(base, angles=assign(base, angles, angles_from, of_views=options.angle_rows is not None))
@@ -230,7 +245,7 @@ def _angle_table(
     options: SourceOptions, base: ScanSource, side: SideFile | None
 ) -> tuple[NDArray[np.float64] | None, str]:
     """The angles that are given or stand beside a TIFF series, and where they come from; None: the scan's own."""
-    table = None if options.angles is None else load_angles(options.angles)
+    table = None if options.angles is None else load_angles(options.angles, options.angles_unit)
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
         origin = f"{options.angles_path} in {options.path}"
@@ -249,7 +264,7 @@ def _angle_table(
 
 def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
-    if options.darks_path is None and options.flats_path is None:
+    if options.darks_path is None and options.flats_path is None and not holds_arrays(path):
         with hdf5.open_hdf5(path) as file:
             named = datasets.dataset(file, data)
             keyed = named is not None and any(places.data == named for places in find(file))
@@ -310,11 +325,12 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         for kind in FORMATS:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
+        if holds_arrays(path):
+            return open_arrays(path)
     if not hdf5.is_hdf5(path):
-        saved = path.suffix == ".npz" and ", but arrays saved by Python: `beamline view` shows a volume of these"
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm{saved or ''}; a scan is one of these, or a folder or .zip "
-            "of TIFFs."
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip "
+            "of images, also of a single one."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -353,6 +369,7 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
         if getattr(options, one) is not None and getattr(options, other) is not None:
             raise DataError(f"--{one} and --{other.replace('_', '-')} name the same thing twice: give one of them.")
     for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
-        if getattr(options, name) is not None and getattr(options, needed) is None:
+        of_angles = name == "angles_unit" and isinstance(options.angles, Path | str)
+        if getattr(options, name) is not None and getattr(options, needed) is None and not of_angles:
             dashed = (f"--{each.replace('_', '-')}" for each in (name, needed))
             raise DataError("{} goes with {}: give both, or neither.".format(*dashed))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -19,39 +19,93 @@ from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
+from beamline.core.text import NUMBER
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
+from beamline.storage.foreign_zarr import holds_arrays, opened
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
+from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, dataset_at, in_order
+from beamline.storage.readers.tiff import DECODERS, UNREADABLE, images_among, no_image, read_image
 from beamline.storage.readers.transforms import type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
-Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
+Angles = Path | str | ArrayLike
+"""A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
+_ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # in the name of a column
+_UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # at its end
+_VALUE = re.compile(rf"[-+]?({NUMBER}|\d+,\d+|nan|inf)", re.IGNORECASE)
 
 
-def load_angles(angles: Angles) -> NDArray[np.float64]:
-    """Read radians from a text file in degrees (one per line, # begins a comment), or from an array in radians."""
-    if isinstance(angles, Path | str):
-        path = Path(angles)
-        try:
-            return parse_angles(text_in(path), str(path))
-        except OSError as error:
-            raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
-    return np.atleast_1d(np.asarray(angles, np.float64))
+def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from a file, or from an array in radians.
 
+    Args:
+        unit: "deg" or "rad", whatever the file says; None: as it says.
 
-def parse_angles(content: str, name: str) -> NDArray[np.float64]:
-    """Radians from text in degrees (see `plan.angles.from_text`); `name` is where it came from."""
+    Raises:
+        DataError: they cannot be read, or several lists could be meant.
+    """
+    if not isinstance(angles, Path | str):
+        return np.atleast_1d(np.asarray(angles, np.float64))
+    name, _, where = (str(angles), "", "") if Path(angles).exists() else str(angles).partition("::")
+    path = Path(name)
+    if (arrays := holds_arrays(path)) or (path.is_file() and hdf5.is_hdf5(path)):
+        with hdf5.readable(path):
+            return angles_at(path, where.replace("\\", "/"), unit, "degrees" if arrays else "")
     try:
-        return from_text(content, unknown=True)
+        return parse_angles(text_in(path), str(path), where, unit)
+    except OSError as error:
+        raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
+
+
+def parse_angles(content: str, name: str, column: str = "", unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from text in degrees (see `plan.from_text`), or from a column of a table, as `load_angles` has it.
+
+    Args:
+        name: where the text came from.
+    """
+    try:
+        text, stated = _column(content.splitlines(), column)
+        if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
+            raise ValueError(f"the unit of its angles is {stated!r}; say --angles-unit deg or rad")
+        return from_text(text, unknown=True) * (factor / datasets.DEGREE)
     except ValueError as error:
-        raise DataError(f"{name}: {error}.") from error
+        table = ". Of a table, FILE::COLUMN is one column: its name, or its number from 0" * (
+            "column" in str(error) or "its angle" in str(error)
+        )
+        raise DataError(f"{name}: {error}{table}.") from error
+
+
+def _column(lines: list[str], wanted: str) -> tuple[str, str]:
+    """The text of one column of a table, a line for each of the table, and its unit.
+
+    Args:
+        wanted: its name, or its number from 0 on; "": the only one that is named after angles. Names stand in the first
+            line, which may be a comment. A text without them is one list, in degrees.
+    """
+    filled = [number for number, line in enumerate(lines) if line.strip()] or [0]
+    head, last = (lines[filled[end]].strip() if lines else "" for end in (0, -1))
+    bare = head.lstrip("# ")
+    mark = next((mark for mark in (";", "\t", ",", None) if len(last.split(mark)) == len(bare.split(mark)) > 1), "\n")
+    names = [cell.strip(' "') for cell in bare.split(mark)]
+    titled = not any(map(_VALUE.fullmatch, names)) and (len(names) > 1 or (head == bare and bool(_ANGLE.search(bare))))
+    if not (titled or wanted):
+        return "\n".join(lines), "deg"
+    chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
+    chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
+    if len(chosen) != 1 or chosen[0] >= len(names):
+        held = ", ".join(names) if titled else f"{len(names)} without names"
+        raise ValueError(f"its columns are {held}; expected one that is named after angles")
+    for number, line in enumerate(lines):
+        cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
+        lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)
+    unit = _UNIT.search(names[chosen[0]]) if titled else None
+    return "\n".join(lines), (unit[1] or unit[2]).strip() if unit else "deg"
 
 
 def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
@@ -144,7 +198,12 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     if angles.size < n:
         return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
-    message += f". Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
+    if angles.size in source.shape:
+        order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
+        message += f". If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+    else:
+        message += ". Say"
+    message += f" with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
     window = evenly_spaced_window(angles, n)
     if window is not None:
         low, high = np.degrees(angles[list(window)])
@@ -178,8 +237,8 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
 
 
 Images = Path | str | NDArray[Any]
-"""A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), an array [frame, row, col], or a
-whole number, the counts of every pixel, unless a file has it as its name."""
+"""A TIFF, a folder of images, an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` where it has several), an array
+[frame, row, col], or a whole number, the counts of every pixel, unless a file has it as its name."""
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
 _LISTED = 8  # datasets that an error names
@@ -204,26 +263,35 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
     path = Path(name)
     if name.isdecimal() and shape is not None and not path.exists():
         return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
+    if holds_arrays(path):
+        with closing(opened(path)) as arrays, hdf5.readable(path):
+            return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
     if path.is_file() and hdf5.is_hdf5(path):
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-            return _of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape)
+            return _in_rows(_of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape), shape)
     if dataset:
         raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
-    return _of_tiffs(path)
+    return _in_rows(_of_images(path), shape)
 
 
-def _of_tiffs(path: Path) -> NDArray[Any]:
+def _in_rows(images: NDArray[Any], shape: tuple[int, int] | None) -> NDArray[Any]:
+    """References of a detector of one row, [frame, col], as frames of one row."""
+    lines = shape is not None and len(images) == shape[0] == 1 < images.shape[1] and images.shape[2] == shape[1]
+    return images.swapaxes(0, 1) if lines else images
+
+
+def _of_images(path: Path) -> NDArray[Any]:
     files = [path]
     if path.is_dir():
-        names = natural_sorted(item.name for item in path.iterdir() if item.suffix.lower() in SUFFIXES)
-        files = [path / name for name in names if not is_hidden(name)]
-    if not files:
-        raise DataError(f"{path} holds no .tif or .tiff file.")
+        names = [item.name for item in path.iterdir()]
+        files = [path / name for name in natural_sorted(images_among(names))]
+        if not files:
+            raise DataError(no_image(path, names))
     try:
-        parts = [read_image(file) for file in files]
+        parts = [DECODERS.get(file.suffix.lower(), read_image)(file) for file in files]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
-        wanted = "" if isinstance(error, OSError) and error.errno else " as TIFFs of one shape, nor as HDF5"
+        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
         raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
     return _stack(stack, str(path))
 
@@ -263,16 +331,15 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
     return (item for item in datasets.arrays_in(file, (2, 3, 4)) if min(item.shape[-2:]) > 1)
 
 
-def _read(path: Path, item: h5py.Dataset) -> NDArray[Any]:
+def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
         raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
-    if item.ndim not in (2, 3):
+    frames = in_order(item)
+    if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
-    if item.ndim == 2:
-        return _stack(datasets.taken(item, ()), f"{item.name} in {path}")
-    datasets.require_possible(item)
-    out = np.empty(item.shape, item.dtype)
-    datasets.read_frames(item, np.arange(len(item)), slice(None), out)
+    datasets.require_possible(frames)
+    out = np.empty(frames.shape, frames.dtype)
+    datasets.read_frames(frames, np.arange(len(frames)), slice(None), out)
     return _stack(out, f"{item.name} in {path}")
 
 

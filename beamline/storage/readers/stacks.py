@@ -7,6 +7,7 @@ projections.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,22 +19,27 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
+from beamline.storage.foreign_zarr import Arrays, NamedArray, opened
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.superblock import marked
+from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
+
+Order = tuple[int | None, int | None, int | None]
+"""Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
 
 
 class TurnedFrames:
-    """A dataset of three dimensions in any order, read as [frame, row, col]."""
+    """An array of any dimensions, read as [frame, row, col]. Dimensions that are none of these have length one."""
 
-    def __init__(self, item: h5py.Dataset, order: tuple[int, int, int]) -> None:
-        """`order`: which dimensions of `item` are frames, rows and columns."""
+    def __init__(self, item: Any, order: Order) -> None:
         self.item, self._order = item, order
         self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(self.item.shape[axis] for axis in self._order)
+        return tuple(1 if axis is None else int(self.item.shape[axis]) for axis in self._order)
 
     @property
     def frame_bytes(self) -> int:
@@ -43,35 +49,59 @@ class TurnedFrames:
     def __len__(self) -> int:
         return int(self.shape[0])
 
-    def __getitem__(self, wanted: tuple[slice, slice]) -> NDArray[Any]:
-        stored = [slice(None)] * 3
-        for axis, part in zip(self._order, wanted, strict=False):
-            stored[axis] = part
-        return np.asarray(self.item[tuple(stored)]).transpose(self._order)
+    def __getitem__(self, wanted: tuple[slice, ...]) -> NDArray[Any]:
+        stored, given = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
+        for axis, part in zip(self._order, given, strict=True):
+            if axis is not None:
+                stored[axis] = part
+        found, kept = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
+        found = found.transpose([*kept, *({*range(found.ndim)} - {*kept})])
+        sizes = [1 if axis is None else found.shape[kept.index(axis)] for axis in self._order]
+        return found.reshape(sizes)[
+            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, given, strict=True))
+        ]
 
 
-def dimensions(axes: Sequence[str]) -> tuple[int, int, int] | None:
-    """Which of three named dimensions are frames, rows and columns; None if the names do not tell.
+def dimensions(axes: Sequence[str]) -> Order | None:
+    """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
 
-    x, u or columns; y, v or rows; the third, whatever its name (theta, rotation_angle), are frames.
+    x, u or columns; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
     """
     names = [axis.strip().lower() for axis in axes]
     cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith("col")]
     rows = [i for i, name in enumerate(names) if name[:1] == "y" or (name.startswith(("v", "row")) and name != "view")]
-    if len(names) != 3 or len(cols) != 1 or len(rows) != 1:
+    frames = [i for i in range(len(names)) if i not in cols + rows]
+    if len(names) not in (2, 3) or len(cols) != 1 or len(rows) > 1 or len(frames) > 1:
         return None
-    return 3 - cols[0] - rows[0], rows[0], cols[0]
+    return (*frames, None)[0], (*rows, None)[0], cols[0]
 
 
 USUAL = (0, 1, 2)
+SINOGRAM = (0, None, 1)
+"""The order of one sinogram [view, col]."""
 
 
-def in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
-    """A dataset as frames [frame, row, col]."""
-    return item if order == USUAL or item.ndim != 3 else TurnedFrames(item, order)
+def shape_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
+    """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
+    no column of pixels is, or the first of them."""
+    kept = dict(enumerate(shape))
+    while len(kept) > n and 1 in kept.values():
+        last = max(kept)
+        del kept[last if kept[last] == 1 else next(axis for axis, size in kept.items() if size == 1)]
+    return kept
 
 
-_LISTED = 10  # datasets of a file that an error names
+def in_order(item: Any, order: Order = USUAL) -> Any:
+    """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
+    n = 3 - order.count(None)
+    if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
+        return item
+    kept = [*shape_without_ones(item.shape, n)]
+    if len(kept) == n - 1 and (frames := order[0]) is not None:
+        order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
+    elif len(kept) != n:
+        return item
+    return TurnedFrames(item, tuple(axis if axis is None else kept[axis] for axis in order))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -128,9 +158,12 @@ class StacksSource(ScanSource):
             datasets.require_real(stack.frames.dtype, f"{stack.name} in {self.path}")
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
-                raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
+                raise DataError(
+                    f"{self.path}: expected frames [frame, row, col] of one shape, beside dimensions of length one; "
+                    f"found {shapes}. --order view,row,col says another order of dimensions."
+                )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
-            if isinstance(item, h5py.Dataset):
+            if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpacking = max(self.unpacking, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
@@ -162,7 +195,8 @@ class StacksSource(ScanSource):
 
 
 def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
-    """The scan whose datasets have these paths in an HDF5 file. A dark or flat may be a single image [row, col].
+    """The scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
+    image [row, col].
 
     Args:
         data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
@@ -172,75 +206,111 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
-    file = hdf5.open_hdf5(path)
+    file = opened(path)
     with hdf5.closed_on_error(file):
         views, where, order = _named_order(file, data)
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
         references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
         n_angles = None if angles is None else dataset_at(file, angles).size
-        order = order or _order_of(views, [item.shape for *_, item in references], n_angles)
-        stacks = [FrameStack(kind, name, _frames(item, order)) for kind, name, item in references]
+        shapes = [
+            tuple(shape_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
+        ]
+        order = order or _order_of(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
+        stacks = [FrameStack(kind, name, in_order(item, order)) for kind, name, item in references]
         stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
-        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL]
+        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
         return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
 
 
-def _named_order(file: h5py.File, data: str) -> tuple[h5py.Dataset, str, tuple[int, int, int] | None]:
+def open_arrays(path: Path) -> StacksSource:
+    """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
+    with closing(Arrays(path)) as file:
+        images = [name for name, item in file.items() if item.ndim > 1]
+        if len(images) != 1:
+            raise DataError(
+                f"{path} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the scan: "
+                "--data-path, --angles-path, --darks-path, --flats-path."
+            )
+    return open_stacks(path, images[0], None, None)
+
+
+def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
     """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
     where, colon, names = data.rpartition(":")
     if not colon or datasets.dataset(file, data) is not None:
         return dataset_at(file, data), data, None
+    return dataset_at(file, where), where, stated_order(names)
+
+
+def stated_order(names: str) -> Order:
+    """The order that a caller states, as in "row,view,col". DataError for another text."""
     if (order := dimensions(names.split(","))) is None:
-        raise DataError(f"The dimensions of {where} are given as {names}; expected three, such as frame,row,col.")
-    return dataset_at(file, where), where, order
+        raise DataError(
+            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
+            "a sinogram."
+        )
+    return order
 
 
-def _order_of(views: h5py.Dataset, references: list[tuple[int, ...]], n_angles: int | None) -> tuple[int, int, int]:
+def _order_of(
+    views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
+) -> Order:
     """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
 
     MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
     views in the middle are sinograms, as ASTRA has them, with columns first.
     """
-    if views.ndim != 3:
-        return USUAL
-    images = [(*views.shape[:axis], *views.shape[axis + 1 :]) for axis in USUAL]
+    if len(views) != 3:
+        lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
+        return SINOGRAM if lines else USUAL
+    images = [(*views[:axis], *views[axis + 1 :]) for axis in USUAL]
     fitting = [
         axis
         for axis in USUAL
         if all(images[axis] in (shape, (*shape[:axis], *shape[axis + 1 :])) for shape in references)
     ]
-    frames = next((axis for axis in fitting if views.shape[axis] == n_angles), fitting[0] if fitting else 0)
+    frames = next((axis for axis in fitting if views[axis] == n_angles), fitting[0] if fitting else 0)
     rows, cols = (axis for axis in USUAL if axis != frames)
-    return (frames, cols, rows) if "MATLAB_class" in views.attrs and frames != 1 else (frames, rows, cols)
+    return (frames, cols, rows) if matlab and frames != 1 else (frames, rows, cols)
 
 
-def _frames(item: h5py.Dataset, order: tuple[int, int, int]) -> Any:
-    """Darks or flats as frames [frame, row, col]; also of one image, which has no dimension of frames."""
-    if item.ndim != 2:
-        return in_order(item, order)
-    image = np.asarray(datasets.values_of(item))
-    return (image.T if order[1] > order[2] else image)[None]
-
-
-def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
-    """Angles in radians of the dataset `where` of an HDF5 file, a list or a column.
+def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
 
     Args:
-        unit: "deg" or "rad", whatever the file says; None: as it says.
+        where: "": the only list whose unit is one of angles, or the only array.
+        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
 
     Raises:
         DataError: it is not there, is no list, or nothing says its unit.
     """
-    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+    with closing(opened(path)) as file, hdf5.readable(path):
+        if not where and isinstance(file, h5py.File):
+            where = _only_angles(file)
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
-        return datasets.radians(item, unit)
+            raise DataError(f"{item.name} in {path} is {item.shape}; expected a list of angles.")
+        return datasets.radians(item, unit, default)
 
 
-def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
-    """The dataset at a path. If there is none, the DataError lists the datasets of the file."""
+def _only_angles(file: h5py.File) -> str:
+    """The path of the only list of a file whose unit is one of angles."""
+    found = [
+        str(item.name)
+        for item in _arrays_of(file)
+        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
+    ]
+    if len(found) != 1:
+        raise DataError(
+            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the one: --angles "
+            "FILE::DATASET, and where it states no unit, --angles-unit deg or rad."
+        )
+    return found[0]
+
+
+def dataset_at(file: Any, where: str) -> Any:
+    """The array at a path. If there is none, the DataError lists those of the file."""
     item = datasets.dataset(file, where)
     if item is None:
         datasets.refuse_broken(file, where)
@@ -248,11 +318,80 @@ def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
     return item
 
 
-def datasets_text(file: h5py.File) -> str:
+def datasets_text(file: Any) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    arrays = list[h5py.Dataset]()
-    file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
-    arrays.sort(key=lambda item: (-item.ndim, -item.size))
+    arrays = sorted(_arrays_of(file), key=lambda item: (-item.ndim, -item.size))
     shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
     more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."
+
+
+_LISTED = 10  # datasets of a file that an error names
+
+
+def _arrays_of(file: Any) -> list[Any]:
+    if isinstance(file, Arrays):
+        return [*file.values()]
+    arrays = list[h5py.Dataset]()
+    file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
+    return arrays
+
+
+def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
+    """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
+
+    Args:
+        order: None: the images are views, but for a single one that has as many rows, or columns, as there are angles:
+            it is a sinogram.
+
+    Raises:
+        DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
+    """
+    fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
+    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
+        return base
+    if order is None and len(fits) > 1:
+        raise DataError(
+            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
+            "which side the views are is not known. Say --order view,col or --order col,view."
+        )
+    order = order or ("col,view" if fits[0] else "view,col")
+    images = in_order(_Images(base), stated_order(order))
+    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
+        raise DataError(
+            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
+            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
+            "flats with --darks and --flats."
+        )
+
+    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
+        indices = frame_indices(frames, len(images))
+        out = np.empty((indices.size, len(range(images.shape[1])[rows]), images.shape[2]), base.dtype)
+        datasets.read_frames(images, indices, rows, out)
+        return out
+
+    unknown = np.full(len(images), np.nan)
+    return Frames(
+        base,
+        pixels=pixels,
+        image_key=np.zeros(len(images), np.int32),
+        angles=unknown,
+        exposures=unknown,
+        shape=images.shape[1:],
+        numbers=None,
+        in_order=True,
+        ending=ScanEnding(),
+        frame_bytes=base.frame_bytes * base.image_key.size,
+        attributes=lambda known: {**known, "dimensions": order},
+    )
+
+
+class _Images:
+    """All images of a scan as an array [image, row, col]."""
+
+    def __init__(self, base: ScanSource) -> None:
+        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
+        self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
+
+    def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:
+        return self._read(part[0], part[1])[..., part[2]]

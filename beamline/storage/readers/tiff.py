@@ -1,4 +1,4 @@
-"""TIFF images: reading them whole, and what all readers of them ask."""
+"""TIFF images: reading them whole, and what all readers of them ask. Images as .npy and PNG are read whole, too."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import lzma
 import math
 import re
 import zipfile
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import IO, Any
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from beamline.core.errors import DataError
 from beamline.core.files import require_regular
@@ -25,8 +27,12 @@ from beamline.storage.structure import PACKED, is_blank
 _MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile)
-"""What tifffile, zipfile and their decoders raise for a file that they cannot read; none of ours is among them."""
+UNREADABLE = (
+    *(*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile),
+    Image.DecompressionBombError,
+)
+"""What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
+them."""
 _NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
@@ -113,6 +119,50 @@ def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
         refuse_packed(tif)
         require_possible(tif, most)
         return upright(images_of(tif)[0].asarray(), orientation(tif))
+
+
+def _of_png(file: IO[bytes], most: float = math.inf) -> NDArray[Any]:
+    """A grey picture. Raises ValueError for colours, a palette, or more bytes than allowed."""
+    with Image.open(file, formats=["PNG"]) as picture:
+        if not picture.mode.startswith(("L", "I")) or picture.mode == "LA" or 4 * math.prod(picture.size) > most:
+            raise ValueError(f"its pixels are {picture.mode}, {picture.width} x {picture.height}; expected grey ones")
+        return np.asarray(picture)
+
+
+DECODERS: dict[str, Callable[..., NDArray[Any]]] = {
+    ".tif": read_image,
+    ".tiff": read_image,
+    ".npy": lambda file, most=0: np.load(file, allow_pickle=False),
+    ".png": _of_png,
+}
+"""How the images of a folder are read, by suffix: each takes an open file, and the bytes that it may unpack to."""
+FOREIGN = (
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".gif",
+    ".jp2",
+)  # pictures that are not read: nearly all of them have 8 bits, or losses
+
+
+def images_among(names: Sequence[str]) -> list[str]:
+    """The images among files, of the first kind that there is: other kinds beside it are no frames of the scan."""
+    kinds = (SUFFIXES, (".npy",), (".png",))
+    by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
+    return next(filter(None, by_kind), [])
+
+
+def no_image(path: Path, names: Sequence[str]) -> str:
+    """A sentence on a folder without images that are read."""
+    foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
+    if foreign is None:
+        return f"{path} holds no image: no .tif, .tiff, .npy or .png file."
+    return (
+        f"{path} holds pictures such as {foreign}, which are not read: their 8 bits, or what their compression leaves "
+        "out, spoil line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
+        "nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L')"
+        f".save(n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
+    )
 
 
 def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:

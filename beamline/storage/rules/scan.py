@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
@@ -64,13 +66,17 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
     if source.quantity != "counts":
         return
+    path = Path(source.path).absolute()
+    others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
+    beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
+    way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if not (source.image_key == kind).any():
             yield Finding(
                 "error",
                 "references",
                 f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
-                "say --quantity transmission, or line-integrals where their logarithm was taken.",
+                f"say --quantity transmission, or line-integrals where their logarithm was taken.{way}",
             )
 
 

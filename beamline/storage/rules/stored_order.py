@@ -126,8 +126,8 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
             "axis",
             f"The {views.size} images look like sinograms: the rows of each hold one mass, whose centre goes along a "
             f"sine of the angles ({along_rows:.0%} of its change), as views do, and from image to image it does not "
-            f"({along_frames:.0%}). Then the first dimension counts rows of the detector. Say so by the attribute axes "
-            "of the dataset (y:theta:x), or write a copy as [view, row, column].",
+            f"({along_frames:.0%}). Then the first dimension counts rows of the detector: --order row,view,col, or "
+            "in a file the attribute axes of the dataset (y:theta:x), says so.",
         )
 
 

@@ -1,4 +1,4 @@
-"""TIFF series: a folder (or .zip) with one image a file.
+"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG; a scene of R²-Gaussian.
 
 The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
 order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import math
 import os
 import re
@@ -23,33 +24,38 @@ from numpy.typing import ArrayLike, NDArray
 from tifffile import TiffFile
 
 from beamline.core.errors import DataError
-from beamline.core.files import TEXT, decoded
-from beamline.core.text import size, spans
+from beamline.core.files import TEXT, decoded, is_below, text_in
+from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
+from beamline.storage.foreign_zarr import zarr_root
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
+    DECODERS,
     SUFFIXES,
     UNREADABLE,
     image_of,
+    images_among,
     is_hidden,
+    no_image,
     opened,
-    read_image,
     refuse_volume,
     stated,
 )
 from beamline.storage.structure import is_blank
 from beamline.storage.writers.rows import ScanEnding
+from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
 LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
 class TiffSeriesSource(ScanSource):
@@ -57,17 +63,25 @@ class TiffSeriesSource(ScanSource):
 
     format = "tiff_series"
 
-    def __init__(self, path: Path, *, one_series: bool = False) -> None:
-        """Open. `one_series`: all images are one numbered series, whatever the names say of kinds."""
+    def __init__(self, path: Path, *, one_series: bool = False, listed: list[str] | None = None) -> None:
+        """Open.
+
+        Args:
+            one_series: all images are one numbered series, whatever the names say of kinds.
+            listed: names of the images, all of them views; None: those that lie in the folder.
+        """
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
         with hdf5.closed_on_error(self):
-            names = self._names()
-            images = in_order(path, [name for name in names if name.lower().endswith(SUFFIXES)], one_series=one_series)
-            self._files, self.image_key, self.angles = images.names, images.kinds, images.angles
-            self.in_order, self.numbers = images.references == 0, images.numbers
-            self.exposures = np.full(len(self._files), np.nan)
-            references, series = self._files[: images.references], self._files[images.references :]
+            names = self._names() if listed is None else listed
+            among = images_among([name for name in names if not ANGLE_FILE.search(name.lower())])
+            if not among:
+                raise DataError(no_image(path, names))
+            images = in_order(path, among, one_series=one_series or listed is not None)
+            self.names, self.image_key, self.angles = images.names, images.kinds, images.angles
+            self.in_order, self.numbers = len(images.series) == len(images.names), images.numbers
+            self.exposures = np.full(len(self.names), np.nan)
+            references, series = images.references, images.series
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
                 self.not_used = stated(path, tif)
@@ -75,9 +89,11 @@ class TiffSeriesSource(ScanSource):
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
-            self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
+            self._texts = [name for name in names if ANGLE_FILE.search(name.lower()) and not name.endswith(".npy")]
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
+        if images.beside:
+            self.not_used += (NotUsed(images.beside[0], count(len(images.beside), "image"), _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
@@ -93,7 +109,7 @@ class TiffSeriesSource(ScanSource):
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):
-            name = self._files[number]
+            name = self.names[number]
             image = self._image(name)
             if image.shape != self.shape:
                 raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
@@ -160,8 +176,11 @@ class TiffSeriesSource(ScanSource):
                 break
             looked += self._size(name)
             try:
-                with self._tiff(name) as tif:
-                    shape, dtype = image_of(tif)
+                if name.lower().endswith(SUFFIXES):
+                    with self._tiff(name) as tif:
+                        shape, dtype = image_of(tif)
+                else:
+                    shape, dtype = (image := self._image(name)).shape, image.dtype
                 images.append((self._require_grey(name, shape, dtype), dtype))
             except UnreadableError as error:
                 failed.append(error)
@@ -175,15 +194,19 @@ class TiffSeriesSource(ScanSource):
     def _image(self, name: str) -> NDArray[Any]:
         content = self._bytes(name, LARGEST_IMAGE)
         try:
-            image = read_image(io.BytesIO(content), LARGEST_IMAGE)
+            image = DECODERS[name[name.rindex(".") :].lower()](io.BytesIO(content), LARGEST_IMAGE)
         except UNREADABLE as error:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+            raise UnreadableError(
+                f"{name} in {self.path} cannot be read as an image ({hdf5.reason(error)})."
+            ) from error
+        while image.ndim > 2 and image.shape[0] == 1:
+            image = image[0]
         self._require_grey(name, image.shape, image.dtype)
         return image
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
+            raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
         if len(shape) != 2:
             raise DataError(
                 f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --then FILE."
@@ -210,11 +233,73 @@ def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
     if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers count no images
         return (), ""
     left_out, first = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}), int(numbers.min())
-    return tuple(images.references + number - first for number in left_out), spans(left_out)
+    before = int((images.kinds == FrameKind.PROJECTION).argmax())
+    return tuple(before + number - first for number in left_out), spans(left_out)
+
+
+_META = "meta_data.json"
+_TEST = "views that its authors keep to judge by; they are left out"
+_AXES = "volume[z, y, x] is vol_gt.transpose(2, 0, 1)[::-1, ::-1]; lengths in mm are units of the scene"
+
+
+def _scene_of(path: Path) -> Path | None:
+    """The folder of a scene, by itself or by its file; None for another path."""
+    folder = path.parent if path.name == _META else path
+    file = folder / _META
+    return folder if file.is_file() and '"proj_train"' in text_in(file) else None
+
+
+def _open_scene(folder: Path) -> ScanSource:
+    """The scan in the folder of a scene of R²-Gaussian (Zha et al. 2024, NeurIPS, github.com/Ruyi-Zha/r2_gaussian).
+
+    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume. Views
+    and angles are taken as they stand. There the first row of a view is the highest z, and the source stands at
+    (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
+
+    Raises:
+        DataError: views are not there, or it is no cone or parallel beam.
+    """
+    meta: dict[str, Any] = json.loads(text_in(folder / _META))
+    scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
+    beams = {"cone": (float(scanner["DSO"]), float(scanner["DSD"])), "parallel": None}
+    if (mode := scanner["mode"]) not in beams or not angles:
+        raise DataError(f"{folder / _META} states {len(angles)} views in the mode {mode!r}; expected cone or parallel.")
+    if lost := [name for name in angles if not is_below(folder, name)]:
+        raise DataError(
+            f"{folder / _META} names {len(angles)} views, of which {len(lost)} are not there, such as {lost[0]}. Fetch "
+            "them, or take them out of its list. Nothing was read."
+        )
+    source = TiffSeriesSource(folder, listed=[*angles])
+    source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
+    source.angles = np.array([angles[name] for name in source.names])
+    source.cone = beams[mode]
+    size, n = np.broadcast_to(scanner.get("sDetector", 0), 2), np.broadcast_to(scanner["nDetector"], 2)
+    height, width = map(float, np.broadcast_to(scanner.get("dDetector", size / n), 2))
+    source.pixel_size_mm, source.row_pitch_mm = width, differing(height, width)
+    moved = {name: scanner[name] for name in ("offDetector", "offOrigin") if np.any(scanner.get(name, 0))}
+    source.axis_col = None if "offDetector" in moved else (source.shape[1] - 1) / 2
+    source.facts = {**source.facts, "axes": _AXES}
+    source.not_used += tuple(NotUsed(f"scanner/{name}", str(value), _MOVED, True) for name, value in moved.items())
+    if test := meta.get("proj_test"):
+        source.not_used += (NotUsed("proj_test", f"{len(test)} views", _TEST, False),)
+    return source
+
+
+_MOVED = "the axis is searched, and the central ray meets the middle row; --axis states the axis"
+_BESIDE = "a view half a turn from the first, taken beside the series: the axis is found by the series itself"
+
+
+def _open(path: Path, opening: Opening) -> ScanSource:
+    scene = _scene_of(path)
+    return TiffSeriesSource(path, one_series=opening.one_series) if scene is None else _open_scene(scene)
 
 
 FORMAT = ScanFormat(
-    "a folder or .zip of TIFFs",
-    lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
-    lambda path, opening: TiffSeriesSource(path, one_series=opening.one_series),
+    "a folder or .zip of images (TIFF, .npy or PNG), or a scene of R²-Gaussian",
+    lambda path, opening: (
+        (path.is_dir() and zarr_root(path) is None)
+        or (path.is_file() and path.suffix.lower() == ".zip" and zarr_root(path) is None)
+        or _scene_of(path) is not None
+    ),
+    _open,
 )

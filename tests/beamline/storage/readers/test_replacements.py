@@ -226,7 +226,7 @@ def test_one_of_several_is_named_and_a_single_image_is_one_frame(tmp_path: Path)
 
 def test_what_is_no_images_is_refused(tmp_path: Path) -> None:
     (tmp_path / "t.txt").write_text("1 2 3")
-    with pytest.raises(DataError, match="TIFFs"):
+    with pytest.raises(DataError, match="as images of one shape"):
         load_images(tmp_path / "t.txt", FrameKind.DARK)
     tifffile.imwrite(tmp_path / "t.tif", IMAGES, photometric="minisblack")
     with pytest.raises(DataError, match="not an HDF5 file"):

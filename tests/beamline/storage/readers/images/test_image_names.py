@@ -9,9 +9,10 @@ import pytest
 import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.images.image_names import kinds_of
+from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.replacements import load_images
 from drivers.base.frame import FrameKind
@@ -118,3 +119,52 @@ def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
         assert source.image_key.tolist() == [2, 2, 0, 0, 0]
         np.testing.assert_allclose(np.degrees(source.angles[2:]), [0, 1, 2])
     assert len(load_images(tmp_path, DARK)) == 5
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "beside"),
+    [
+        ("Flat_Before", "Flat_After", "180deg"), ("flats_before", "Flats_after", "Proj_180deg"),
+        ("OB_pre", "OB_post", "180_deg_after"), ("FlatBefore", "FlatAfter", "tomo_180deg"),
+    ],
+)  # fmt: skip
+def test_references_named_after_the_views_come_after_them(tmp_path: Path, before: str, after: str, beside: str) -> None:
+    """As folders of IMAT are called, with numbers of their own; a view at 180 degrees apart is no frame of the scan."""
+    for number, (folder, n) in enumerate({"Tomo": 12, before: 2, after: 2, "Dark_Before": 3, beside: 1}.items()):
+        (tmp_path / folder).mkdir()
+        for i in range(n):
+            image = np.full(SHAPE, number, np.uint16)
+            tifffile.imwrite(tmp_path / folder / f"IMAT0002673{number}_bone_{folder}_{i:04d}.tif", image)
+    with open_scan(tmp_path) as source:
+        assert source.image_key.tolist() == [2] * 3 + [1] * 2 + [0] * 12 + [1] * 2 + [3]
+        assert source.read(slice(None))[:, 0, 0].tolist() == [3] * 3 + [1] * 2 + [0] * 12 + [2] * 2 + [4]
+        assert [field.value for field in source.not_used] == ["1 image"] and source.ending.missing == ()
+
+
+def test_a_scan_with_a_folder_for_each_angle_is_whole() -> None:
+    names = [f"{angle}deg/image.tif" for angle in range(0, 361, 20)]
+    assert _half_a_turn_on(names) == [] == _half_a_turn_on([f"run_180deg/{i}.tif" for i in range(9)])
+
+
+def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
+    for suffix, picture in (("jpg", np.zeros(SHAPE, np.uint8)), ("png", np.zeros((*SHAPE, 3), np.uint8))):
+        (tmp_path / suffix).mkdir()
+        Image.fromarray(picture).save(tmp_path / suffix / f"p_1.{suffix}")
+    np.savez(tmp_path / "s.npz", a=picture)
+    (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'touch /tmp/x'\ntR.")
+    for name, message in {
+        "jpg": r"pictures such as p_1.jpg, .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
+        "png": "its pixels are RGB, 6 x 4; expected grey ones",
+        "s.npz": "arrays saved by Python.*np.save",
+        "s.pickle": "is a pickle, which is never opened here.*np.save",
+    }.items():
+        with pytest.raises(DataError, match=message):
+            open_scan(tmp_path / name)
+
+
+def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
+    _written(tmp_path, [f"p_{i}.tif" for i in range(4)])
+    np.save(tmp_path / "theta.npy", np.arange(4.0))
+    Image.fromarray(np.zeros(SHAPE, np.uint8)).save(tmp_path / "preview.png")
+    with open_scan(tmp_path) as source:
+        assert source.image_key.tolist() == [0] * 4
