@@ -122,7 +122,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
 
     Raises:
-        ConfigError: a cone beam's pixel size is not known.
+        ConfigError: a cone beam's pixel size is not known, or its distances cannot be.
     """
     rows = rows_of(source, selection)
     full = (rows.stop - rows.start, source.shape[1])
@@ -135,7 +135,11 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
             )
         # The central ray meets the middle of the detector, whatever rows are read.
         axis_row = (source.shape[0] - 1) / 2 - rows.start
-        return Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row).binned(selection.binning)
+        try:
+            geometry = Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row)
+        except ValueError as error:
+            raise ConfigError(f"{source.path}: {error}. Give the distances with --cone SOD:SDD.") from error
+        return geometry.binned(selection.binning)
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )
