@@ -57,7 +57,7 @@ def event_model() -> Any:
     try:
         import event_model as library
     except ImportError as error:
-        raise ConfigError('bluesky needs: pip install "splatline[bluesky]". Nothing was started.') from error
+        raise ConfigError(f'bluesky needs ({error}): pip install "splatline[bluesky]". Nothing was started.') from error
     return library
 
 
@@ -220,7 +220,7 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
         from bluesky.callbacks.zmq import Publisher
         from zmq import ZMQError  # type: ignore[attr-defined,unused-ignore]
     except ImportError as error:
-        raise ConfigError('0MQ needs: pip install "splatline[bluesky]". Nothing was started.') from error
+        raise ConfigError(f'0MQ needs ({error}): pip install "splatline[bluesky]". Nothing was started.') from error
     try:
         url = urlsplit(address)
         if url.scheme != "tcp" or not url.hostname or url.port is None:

@@ -29,7 +29,7 @@ from beamline.core.errors import (
 )
 from beamline.core.installed import version
 from beamline.core.text import printable
-from recon.base.registry import ADD_ONS, Registry, did_you_mean, tables_in_folders
+from recon.base.registry import ADD_ONS, Registry, add_on_missing, did_you_mean, tables_in_folders
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class LazyGroup(click.Group):
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:
-                ctx.fail(f"`beamline {args[0]}`: install {ADD_ONS[args[0]]}.")
+                ctx.fail(f"`beamline {args[0]}` {add_on_missing(args[0])}.")
             ctx.fail(f"There is no command {args[0]!r}{did_you_mean(args[0], commands())}.")
         return super().resolve_command(ctx, args)
 

@@ -225,16 +225,6 @@ class ReconSection(Section):
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
 
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_stop_when(cls, data: Any) -> Any:
-        if isinstance(data, dict) and "stop_when" in data:
-            raise ValueError(
-                "stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db: 0.5} ends a "
-                "scan when all views to come would add 0.5 dB at most"
-            )
-        return data
-
 
 class Speed(Section):
     speed: Annotated[float, Field(gt=0, le=1e6)] = Field(description="Simulated seconds per real second.")

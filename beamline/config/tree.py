@@ -129,6 +129,16 @@ def override(
 
 
 Schema = Mapping[str, Any]
+_OWN_VIEWS = "Every reconstruction of 25 views or more compares its own views"
+REMOVED = {
+    "monitor.model": _OWN_VIEWS,
+    "monitor.policy.model": _OWN_VIEWS,
+    "monitor.dark.light": "references.light_in_darks is the fraction of the flats from which darks have light",
+    "recon.stop_when": "scan.decide: do with scan.wish: {quality_db: 0.5} ends a scan when all views to come would add "
+    "0.5 dB at most",
+    "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
+}
+"""Keys of 1.0.0 that are none any more, each with what does the same."""
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
 
 
@@ -184,6 +194,8 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
     if kind == "value_error":
         sentence = message.removeprefix(_OF_VALIDATOR)
         return f"{name}: {sentence}" if path else sentence
+    if kind == "extra_forbidden" and name in REMOVED:
+        return f"{name} is no key any more; leave it out. {REMOVED[name]}"
     if kind == "extra_forbidden":
         keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
         others = [key for key in _value(data, path[:-1]) if key not in keys]

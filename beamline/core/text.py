@@ -31,10 +31,10 @@ def rounded(value: float, *, up: bool = False) -> float:
 
 
 def printable(text: str) -> str:
-    """The text for a terminal: control characters become `\\x1b`, except line ends and tabs, so that none acts."""
+    """The text for a terminal: control characters become `\\x1b` or `\\t`, except line ends, so that none acts."""
     if text.isprintable():  # also where it has 50 MB
         return text
-    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 SENTENCE = 10_000  # characters of the longest one that is shown in one line
@@ -111,14 +111,19 @@ def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
 
 NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 """The regular expression of a decimal number without a sign."""
-_FORMULA = re.compile(rf"[=@\t\r\n]|[+-](?!$|{NUMBER}$|inf$|nan$)", re.IGNORECASE)
+_FORMULA = re.compile(rf"[=@\n]|[+-](?!$|{NUMBER}$|inf$|nan$)", re.IGNORECASE)
+
+
+def _cell(value: object) -> str:
+    return "" if value is None else printable(str(value))
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV, one line per row; text that a spreadsheet would compute begins with `'`."""
+    """Rows of cells as CSV, one line per row, without control characters; text that a spreadsheet would compute begins
+    with `'`."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\r\n").writerows(  # which quotes cells with either of these
-        [f"'{cell}" if _FORMULA.match(str(cell)) else cell for cell in row] for row in rows
+        [f"'{text}" if _FORMULA.match(text) else text for text in map(_cell, row)] for row in rows
     )
     return out.getvalue().replace("\r\n", "\n")
 

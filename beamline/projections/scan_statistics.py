@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.report.figures import finish, one_panel, png
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, measured
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.matter import absorbed_dose
@@ -68,7 +68,7 @@ def statistics_of(
         nonlocal done
         done += 1
         progress(done, total)
-        return source.read([row])[0]
+        return measured(source.read([row]))[0]
 
     return [_of_kind(kind, rows, of, image, source.dtype) for kind, (rows, of) in chosen.items()]
 
@@ -209,7 +209,7 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
         (
             each.kind.name.lower(), f"{each.frames} of {each.of}",
             *(f"{v:.6g}" for v in (each.minimum, *each.percentiles, each.maximum, each.mean, each.deviation)),
-            f"{each.absolute:.6g}", f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.2g} %",
+            f"{each.absolute:.6g}", f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.3g} %",
         )
         for each in statistics
     ]  # fmt: skip

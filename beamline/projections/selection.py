@@ -124,7 +124,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
 
     Raises:
-        ConfigError: a cone beam's pixel size is not known; a central row of a parallel beam.
+        ConfigError: a cone beam's pixel size is not known, or its distances cannot be; a central row of a parallel beam.
     """
     rows = rows_of(source, selection)
     full = (rows.stop - rows.start, source.shape[1])
@@ -138,9 +138,15 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
         # The central ray meets the same row of the detector, whatever rows are read.
         meets = (source.shape[0] - 1) / 2 if selection.central_row is None else selection.central_row
         axis_row = meets - rows.start
-        return Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row).binned(selection.binning)
+        try:
+            geometry = Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row)
+        except ValueError as error:
+            raise ConfigError(f"{source.path}: {error}. Give the distances with --cone SOD:SDD.") from error
+        return geometry.binned(selection.binning)
     if selection.central_row is not None:
-        raise ConfigError(f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone.")
+        raise ConfigError(
+            f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone."
+        )
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )

@@ -20,7 +20,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import Method, candidates_of, volumes_of
 from recon.base.method import for_part as method_for_part
-from recon.base.registry import ADD_ONS, plugins
+from recon.base.registry import add_on_missing, plugins
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
@@ -229,7 +229,7 @@ def cluster(spec: str) -> AbstractContextManager[Any]:
     """
     found = plugins("workers", ())
     if "cluster" not in found:
-        raise ConfigError(f"--cluster: install {ADD_ONS['cluster']}. Nothing was read.")
+        raise ConfigError(f"--cluster {add_on_missing('cluster')}. Nothing was read.")
     connected: AbstractContextManager[Any] = found["cluster"](spec)
     return connected
 

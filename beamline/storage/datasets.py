@@ -57,9 +57,9 @@ def text(value: Any) -> str:
         value = value.reshape(-1)[0] if value.size else ""
     raw = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogateescape")
     try:
-        return printable(raw.decode())
+        return printable(raw.decode().expandtabs(1))
     except UnicodeDecodeError:
-        return printable(raw.decode("latin-1"))
+        return printable(raw.decode("latin-1").expandtabs(1))
 
 
 def attribute(item: h5py.HLObject, name: str) -> str:

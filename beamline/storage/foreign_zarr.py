@@ -79,7 +79,9 @@ def zarr_library(path: Path) -> Any:
     try:
         import zarr
     except ImportError as error:
-        raise DataError(f"{path}: a Zarr needs the package zarr: pip install splatline[zarr]") from error
+        raise DataError(
+            f"{path}: a Zarr needs zarr, which cannot be loaded here ({error}): pip install splatline[zarr]."
+        ) from error
     return zarr
 
 

@@ -152,7 +152,8 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
         import nibabel
     except ImportError as error:
         raise DataError(
-            f"{path} is a NIfTI volume; install nibabel to read it: pip install splatline[nifti]."
+            f"{path} is a NIfTI volume, which needs nibabel, and that cannot be loaded here ({error}): pip install "
+            "splatline[nifti]."
         ) from error
     image: Any = nibabel.load(path)
     shape, unit = image.shape, LENGTHS.get(int(image.header["xyzt_units"]) & 7)

@@ -77,7 +77,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
     except ImportError as error:
         raise DeviceError(
             device,
-            f"{url} needs the library {error.name}, which is not installed",
+            f"{url} needs the library {error.name}, which cannot be loaded here ({error})",
             advice='pip install "splatline[epics]"',
             state="Nothing was asked",
         ) from error

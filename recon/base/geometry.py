@@ -41,6 +41,7 @@ from recon.base.ray_width import NO_WIDTH, RayWidth
 
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
+_LENGTHS = 1e-12, 1e9  # mm, from far below an atom to 1000 km: between them float32 holds what is computed
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 
 
@@ -81,6 +82,13 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_settings(self)
+        lengths = {"pixel_pitch": self.pixel_pitch, "a pixel at the axis": self.sample_pitch}
+        for name, length in {**lengths, **({"sod": self.sod, "sdd": self.sdd} if self.is_cone else {})}.items():
+            if not _LENGTHS[0] <= length <= _LENGTHS[1]:
+                raise ValueError(
+                    f"{name} is {length:.3g} mm; expected {_LENGTHS[0]:g} to {_LENGTHS[1]:g} mm"
+                    + (". A source farther away gives parallel rays: take a parallel beam" if name[:1] == "s" else "")
+                )
         if not self.centres.any():
             object.__setattr__(self, "centres", frozen(np.zeros((self.angles.size, 3))))
         elif not self.is_cone or self.width.arc:

@@ -39,10 +39,24 @@ def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
     Args:
         kind: what the name is of, such as "method"; empty where the sentence goes on from that.
     """
-    if (package := ADD_ONS.get(str(name))) is not None:
-        return f"{kind} {name!r} needs a package that is not installed: pip install {package}".lstrip()
+    if str(name) in ADD_ONS:
+        return f"{kind} {name!r} {add_on_missing(str(name))}".lstrip()
     names = list(legal)
     return f"{kind} {name!r} is unknown; legal: {', '.join(names) or 'none'}{did_you_mean(name, names)}".lstrip()
+
+
+def add_on_missing(name: str) -> str:
+    """Why an add-on of `ADD_ONS` is not there, and what to do, as the end of a sentence without a full stop."""
+    for point in entry_points_announced():
+        if point.name == name:
+            why = "a warning says why it was left out"
+            try:
+                point.load()
+            except (Exception, SystemExit) as error:
+                why = _one_line(f"{type(error).__name__}: {error}")
+            package = ADD_ONS[name] if point.dist is None else point.dist.name
+            return f"is installed, but does not work ({point.value}: {why}): pip install --force-reinstall {package}"
+    return f"needs a package that is not installed: pip install {ADD_ONS[name]}"
 
 
 def did_you_mean(name: object, legal: Iterable[str]) -> str:

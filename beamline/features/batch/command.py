@@ -21,7 +21,7 @@ from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned
 from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import SENTENCE, csv_text, one_line, safe_name
+from beamline.core.text import SENTENCE, csv_text, one_line, printable, safe_name
 from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
 
@@ -159,9 +159,13 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
     from beamline.storage.interrupted import whole_scan  # here: help needs none of it
 
-    rows = [row if row.has_volume else replace(row, scan=str(whole_scan(Path(row.scan)))) for row in earlier]
-    old = {row.scan for row in rows}
-    new = [path for path in dict.fromkeys(map(whole_scan, scans)) if str(path) not in old]
+    given = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
+    rows = [
+        row if row.has_volume else replace(row, scan=str(whole_scan(given.get(row.scan, Path(row.scan)))))
+        for row in earlier
+    ]
+    old = {printable(row.scan) for row in rows}
+    new = [path for shown, path in given.items() if shown not in old]
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 

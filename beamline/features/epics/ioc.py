@@ -53,7 +53,8 @@ class RunServer:
             from p4p.server.thread import SharedPV
         except ImportError as error:
             raise ConfigError(
-                'EPICS needs the library p4p: pip install "splatline[epics]". Nothing was started.'
+                f'EPICS needs p4p, which cannot be loaded here ({error}): pip install "splatline[epics]". Nothing was '
+                "started."
             ) from error
         self._say, self._now, self._beats = say, now, 0
         self._run = FollowedRun(runs, now)

@@ -97,6 +97,7 @@ def _described(facts: Mapping[str, Any]) -> list[str]:
 
 
 def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:
+    from beamline.monitor.digest import LARGEST
     from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
 
@@ -113,6 +114,10 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
             write_whole(output, histograms(statistics))
         facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
         lines = [aligned(rows, ">"), *(f"light   {line}" for line in dose)]
+        beyond = (
+            f"! No data are pixels that are no number, or beyond {LARGEST:g}, as no detector counts: left out above."
+        )
+        lines += [beyond] * any(each.not_finite for each in statistics)
         lines += [] if output is None else [f"output  {output}"]
         answer.done({**facts, "light": dose, "output": output}, *lines)
 

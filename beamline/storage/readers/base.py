@@ -273,13 +273,13 @@ def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOL
     A real number beyond LARGEST, which no detector counts and which float32 may not hold, is NaN, too.
     """
     try:
-        return _measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
+        return measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
     except UnreadableError:
         indices = frame_indices(frames, int(source.image_key.size))
     out = np.zeros((indices.size, len(range(source.shape[0])[rows]), source.shape[1]), source.dtype)
     for image, row in zip(out, indices.tolist(), strict=True):
         try:
-            image[...] = _measured(source.read([row], rows))[0]
+            image[...] = measured(source.read([row], rows))[0]
         except UnreadableError as error:
             source.unreadable = {**source.unreadable, row: str(error)}
             if source.dtype.kind == "f":
@@ -287,7 +287,7 @@ def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOL
     return out
 
 
-def _measured(pixels: NDArray[Any]) -> NDArray[Any]:
+def measured(pixels: NDArray[Any]) -> NDArray[Any]:
     """Pixels [frame, row, col] with NaN for real numbers beyond LARGEST."""
     if pixels.dtype.kind != "f":
         return pixels

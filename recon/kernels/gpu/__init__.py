@@ -17,7 +17,8 @@ try:
     import triton
 except ImportError as error:
     raise ImportError(
-        "the GPU kernels need triton, which is not installed; install splatline[gpu] (Linux), or fit on the cpu"
+        f"the GPU kernels need triton, which cannot be loaded here ({error}); install splatline[gpu] (Linux), or fit "
+        "on the cpu"
     ) from error
 
 import torch

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
+from recon.voxels.direct import fdk
+from recon.voxels.fbp import fbp
 
 
 def test_an_axis_is_never_taken_for_a_pitch() -> None:
@@ -32,9 +34,24 @@ def test_the_axis_is_in_the_middle_unless_told() -> None:
         ({"angles": [0.0, np.nan]}, "not finite"),
         ({"detector_shape": (0, 4)}, "detector_shape"),
         ({"pixel_pitch": -1.0}, "pixel_pitch"),
+        ({"pixel_pitch": 1e-300}, "pixel_pitch is 1e-300 mm; expected 1e-12 to"),
+        ({"pixel_pitch": 1e10}, "pixel_pitch is 1e\\+10 mm"),
         ({"axis_col": np.inf}, "axis_col"),
     ],
 )
 def test_impossible_geometries_are_refused(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Geometry.parallel(**({"angles": [0.0], "detector_shape": (4, 4)} | arguments))  # type: ignore[arg-type]
+
+
+def test_distances_that_float32_does_not_hold_are_refused() -> None:
+    """FDK from 1e20 mm gave zeros; the farthest that is taken gives what a parallel beam does."""
+    with pytest.raises(ValueError, match=r"sod is 1e\+20 mm; .* parallel beam"):
+        Geometry.cone([0.0], (4, 4), 1.0, 1e20, 1e20)
+    with pytest.raises(ValueError, match="a pixel at the axis is 1e-18 mm"):
+        Geometry.cone([0.0], (4, 4), 1.0, 1e-9, 1e9)
+    angles, sinogram = np.linspace(0, 2 * np.pi, 40, endpoint=False), np.zeros((40, 4, 16), np.float32)
+    sinogram[:, :, 5:11] = 1
+    far, parallel = Geometry.cone(angles, (4, 16), 1.0, 1e9, 1e9), Geometry.parallel(angles, (4, 16))
+    expected = fbp(sinogram, parallel)
+    np.testing.assert_allclose(fdk(sinogram, far), expected, atol=0.03 * np.abs(expected).max())

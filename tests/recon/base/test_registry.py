@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -102,3 +103,16 @@ def test_a_name_that_there_is_not_is_told_with_those_that_there_are(
         registry[name]
     assert str(unknown.value) == said and isinstance(unknown.value, ValueError)
     assert registry.get(name) is None and name not in registry
+
+
+def test_an_add_on_that_is_installed_and_broken_says_what_broke(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, announced: list[EntryPoint]
+) -> None:
+    (tmp_path / "half_an_add_on.py").write_text("raise ImportError('libcudart.so.12: no such file\\x1b[2J')")
+    monkeypatch.syspath_prepend(tmp_path)
+    announced.append(_point("naf", "half_an_add_on:ENTRY", "method"))
+    with pytest.warns(UserWarning, match="left out"), pytest.raises(UnknownNameError) as refused:
+        Registry("method", {})["naf"]
+    said = str(refused.value)
+    assert "is installed, but does not work" in said and r"libcudart.so.12: no such file\x1b[2J" in said
+    assert "--force-reinstall splatline-neural" in said

@@ -39,7 +39,8 @@ class TxrmFile:
             import olefile
         except ImportError as error:
             raise DataError(
-                f'{path} is a .txrm file, which needs the library olefile: pip install "splatline[txrm]".'
+                f"{path} is a .txrm file, which needs olefile, and that cannot be loaded here ({error}): pip install "
+                '"splatline[txrm]".'
             ) from error
         self._ole = olefile.OleFileIO(path)
 

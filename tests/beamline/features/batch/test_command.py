@@ -193,6 +193,7 @@ def test_names_that_mean_something_else_are_only_names(folder: Path) -> None:
     assert all(name == safe_name(name) for name in table)
     made = {name for name, row in table.items() if row["state"] == "done"}
     assert left(folder / "out") == {"batch.csv", "recipe.yaml", *made}
+    assert "\x1b" not in Path("out/batch.csv").read_text()
 
 
 @pytest.mark.usefixtures("in_this_process")
