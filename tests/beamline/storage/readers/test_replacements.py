@@ -53,7 +53,7 @@ class Frames(StacksSource):
     def __init__(self, key: list[int], *, in_order: bool = True, numbers: list[int] | None = None) -> None:
         self.path, self.image_key, self.in_order = Path("scan"), np.array(key, np.int32), in_order
         self.numbers = None if numbers is None else np.array(numbers, np.int64)
-        self.facts = {"missing_numbers": "some"}
+        self.facts, self.shape = {"missing_numbers": "some"}, (1, 1)
 
 
 def test_one_angle_a_projection_or_one_a_frame() -> None:

@@ -67,7 +67,7 @@ def test_a_scene_gives_the_volume_of_its_authors(tmp_path: Path) -> None:
     ours = recon.reconstruct(views, geometry, "fbp").volume.data
     theirs = _volume().transpose(2, 0, 1)[::-1, ::-1]
     alike = {at: np.corrcoef(ours.ravel(), np.flip(theirs, at).ravel())[0, 1] for at in ((), 0, 1, 2)}
-    assert alike.pop(()) > 0.85 > 2 * max(alike.values())
+    assert alike.pop(()) > 0.85 > 1.5 * max(alike.values())
 
 
 @pytest.mark.parametrize(
