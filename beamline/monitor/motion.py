@@ -189,15 +189,15 @@ class MotionCheck(Logged):
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
                 "on its holder, or something touched it. Fix it if it may go on. The views are of use: "
-                "`beamline recon` corrects those after the jump by shifts, or leaves them out (cones: choose one "
-                "side with --views)."
+                "`beamline recon` leaves out those of the shorter side; --jumps ignore --calibrate shifts corrects "
+                "them (cones: choose one side with --views)."
             )
         elif abs(turn) > limit_turn:
             score, limit = turn, limit_turn
             advice = (
                 f"The sample turned by {turn:+.1f} steps more than its step: triggers were lost, the stage slipped, or "
-                "the sample turned on its holder. Compare the stage's encoder with the plan; `beamline recon` turns "
-                "the views from here on to fit the others, or leaves them out."
+                "the sample turned on its holder. Compare the stage's encoder with the plan; `beamline recon` leaves "
+                "out the views of the shorter side."
             )
         else:
             return None

@@ -179,8 +179,9 @@ class OppositeCheck(Logged):
             else f"parts of it differ as if all had moved by {fit.remainder:.1f} px: it shrank, bent or lost something"
         )
         advice = (
-            f"Against {other}, {change}. Look at both. A jump that `motion` saw in between is corrected by `beamline "
-            "recon`. A sample that crept or changed is followed by `beamline recon --time N`; or scan again, faster."
+            f"Against {other}, {change}. Look at both. Of views around a jump that `motion` saw, `beamline recon` "
+            "leaves out the shorter side. A sample that crept or changed is followed by `beamline recon --time N`; or "
+            "scan again, faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 

@@ -161,7 +161,7 @@ class JumpStep(Protocol):
 
     @property
     def corrects_jumps(self) -> bool:
-        """Whether the step corrects views for jumps, in a finished scan."""
+        """Whether the step leaves out views beyond a jump, in a finished scan."""
 
 
 class GeometryLearnt(Protocol):

@@ -317,7 +317,7 @@ class ScanFollower:
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
-                "`beamline recon` on the finished file corrects them, or leaves them out."
+                "`beamline recon` on the finished file leaves out the views of the shorter side."
             )
         self.correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
         return self._prepared(self.axis_col, usable)

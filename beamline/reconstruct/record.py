@@ -208,7 +208,7 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
         **done,
-        **_pose_parameters(geometry, "jumps" in done),
+        **_pose_parameters(geometry),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),
@@ -227,10 +227,10 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
     return parameters | {name: text for name, text in texts.items() if text}
 
 
-def _pose_parameters(geometry: Geometry, jumps: bool) -> dict[str, Value]:
+def _pose_parameters(geometry: Geometry) -> dict[str, Value]:
     """Where views were displaced, rolled or tilted, and slices that few views see."""
     parameters: dict[str, Value] = {}
-    if jumps or geometry.shifts.any():
+    if geometry.shifts.any():
         parameters["view_shifts_px"] = geometry.shifts
     if (few := partly_seen(geometry)).size:
         parameters["slices_partly_seen"] = few

@@ -64,7 +64,7 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
     flags = flags.without(MotionCheck.bit)
-    if jumped.size:  # what views from the other side show of the jump is corrected with it
+    if jumped.size:  # what views from the other side show of the jump goes with the views beyond it
         flags = flags.without(OppositeCheck.bit)
     local = flagged_in_part(flags, shape)
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
