@@ -30,7 +30,8 @@ _TOO_MUCH = (
     f"this is more than settings hold: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} groups within each "
     f"other, numbers of {_DIGITS} digits. Nothing was started."
 )
-_QUOTED = re.compile(r"""(?s)"(?:\\.|[^"\\])*"|'[^']*'|(?m:(?:^|(?<=\s))#.*$)""")  # and remarks
+_QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
+_BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
 _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
 
 
@@ -79,10 +80,12 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 def yaml_faults(text: str, name: str) -> Iterator[None]:
     """A context that reads YAML: ConfigError for its faults, and before for what would take longer than a second."""
     depth = 0
+    if len(text) > _LONGEST or _BRACKETS.search(text):
+        raise ConfigError(f"{name}: {_TOO_MUCH}")
     try:
-        for n, event in enumerate(yaml.parse(text[: _LONGEST + 1], yaml.SafeLoader)):
+        for n, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if n > _MOST or depth > _DEEPEST or len(text) > _LONGEST:
+            if n > _MOST or depth > _DEEPEST:
                 raise ConfigError(f"{name}:{event.start_mark.line + 1}: {_TOO_MUCH}")
         yield
     except RecursionError:
@@ -105,7 +108,11 @@ def _in_words(error: Exception, text: str) -> tuple[int, str]:
     bare = _QUOTED.sub("", text)
     is_open = opened in ("[", "{") and sum(map(bare.count, "[{")) > sum(map(bare.count, "]}"))
     is_quote = opened in ("'", '"') and "scalar" in str(getattr(error, "context", ""))
-    quoted = [each for each in _QUOTED.finditer(text[: mark.index]) if not text[each.end() : mark.index].strip(" ")]
+    quoted = [
+        each
+        for each in _QUOTED.finditer(text[: mark.index])
+        if each[0][0] != "#" and not text[each.end() : mark.index].strip(" ")
+    ]
     of_key = "mapping values" in problem or "expected ':'" in problem
     deeper = len(this) - len(this.lstrip()) > len(above) - len(above.lstrip())
     told = (

@@ -32,7 +32,7 @@ ATTACKS = {
 @pytest.mark.parametrize("name", ATTACKS)
 def test_what_would_take_long_is_refused_at_once(name: str) -> None:
     begin = time.process_time()
-    with pytest.raises(ConfigError, match=r"my\.yaml:.*more than settings hold"):
+    with pytest.raises(ConfigError, match=r"my\.yaml(:\d+)?: .*more than settings hold"):
         read(ATTACKS[name], "my.yaml")
     assert time.process_time() - begin < 1.5  # a third of that on an idle core
 
@@ -73,7 +73,7 @@ FAULTS = {
     "between": ("scan:\n    mode: step\n  views: 3\n", 3, "the indentation of this line is that of no group above"),
     "at": ("sample:\n  name: @x\n", 2, "a value begins with '@'; put it into quotes"),
     "star": ("sample:\n  name: *x\n", 2, "text that begins with * or & needs quotes"),
-    "backslash": ('a: 1\nb: "C:\\data"\n', 2, "a backslash begins a special character"),
+    "backslash": ('a: 1\nb: "C:\\data"\n', 2, "in double quotes, a backslash begins a special character"),
 }
 
 
