@@ -7,13 +7,13 @@ first use: a program that only plans a scan starts quickly.
 from __future__ import annotations
 
 import os
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
+from recon.base.registry import loaded
 from recon.base.vectors import geometry_of_vectors, vectors_of
 from recon.base.volume import Grid, Volume
 from recon.compiled import use_compiled_kernels
@@ -24,6 +24,7 @@ use_compiled_kernels()  # before numba is imported, which happens where somethin
 # libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+
 
 if TYPE_CHECKING:
     from recon.auto import Auto
@@ -129,7 +130,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
+        return getattr(loaded(_LAZY[name]), name)
     if name == "__version__":
         from importlib.metadata import version
 

@@ -13,7 +13,7 @@ from typing import Any
 from recon.base.choices import AUTO
 from recon.base.declared_types import is_of_type, refusal, types_of
 from recon.base.method import Method
-from recon.base.registry import Lengths, MethodEntry, Registry, in_folders, unknown
+from recon.base.registry import Lengths, MethodEntry, Registry, in_folders, loaded, unknown
 
 REGISTRY: dict[str, MethodEntry] = {
     "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
@@ -81,7 +81,7 @@ def by_name(name: str) -> type[Method]:
         ValueError: for an unknown name.
     """
     entry = METHODS[name]
-    return getattr(import_module(entry.module), entry.cls)
+    return getattr(loaded(entry.module), entry.cls)
 
 
 def taking(field: str) -> tuple[str, ...]:

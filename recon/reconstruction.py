@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,7 +87,7 @@ def reconstruct(
     begin = control.now()
     result = run_in_box_of_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
     return replace(
-        result, settings=MappingProxyType(dict(result.settings)), method=result.method or chosen.name,
+        result, settings=dict(result.settings), method=result.method or chosen.name,
         seconds=result.seconds or control.now() - begin,
     )  # fmt: skip
 

@@ -7,13 +7,13 @@ its modules at its first call.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, ReferencesError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest, to_stderr
 from drivers.base.errors import DeviceError
+from recon.base.registry import loaded
 
 if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan
@@ -60,5 +60,5 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
+        return getattr(loaded(_LAZY[name]), name)
     raise AttributeError(f"module 'beamline.api' has no attribute {name!r}")

@@ -58,12 +58,13 @@ def _send(run: Path | None, word: str) -> None:
 
 
 def _decisions(run: Path) -> list[Mapping[str, Any]]:
-    """What the scan of the newest part of a run has chosen so far, oldest first."""
+    """What the scan of the newest part of a run has chosen so far, oldest first; nothing where it has no log."""
     from beamline.core.event_lines import event_in
-    from beamline.core.files import EVENTS, parts_of
+    from beamline.core.files import EVENTS, open_below, parts_of
 
-    with (parts_of(run)[-1] / EVENTS).open("rb") as log:
+    with suppress(OSError), open_below(parts_of(run)[-1], EVENTS) as log:
         return [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
+    return []
 
 
 def _require_chosen(run: Path, choice: str, before: int) -> None:

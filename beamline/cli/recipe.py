@@ -16,6 +16,7 @@ from click.core import ParameterSource
 
 from beamline.cli.options import Declared, Decorator, name_of
 from beamline.cli.options import option as declared_option
+from beamline.config.tree import yaml_faults
 from beamline.core.files import SETTINGS, require_regular, text_in
 from recon.base.registry import unknown
 
@@ -127,11 +128,10 @@ def _read(path: Path) -> Mapping[str, Any]:
     """The content of a recipe, all values as text: YAML's own rules would turn 61:04 into 3664."""
     try:
         text = _text(path)
-        content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise click.BadParameter(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    with yaml_faults(text, str(path)):
+        content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     if not isinstance(content, dict):
         raise click.BadParameter(f"{path} is not a recipe; expected lines such as method: fbp")
     return content

@@ -5,7 +5,9 @@ Faults are pydantic's findings with file and line, the key, its value and the le
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +23,16 @@ ENVIRONMENT_PREFIX = "BEAMLINE_"
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
+
+_LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
+"""Of a YAML text: characters, values (as often as aliases repeat them), groups within groups, digits of a number."""
+_TOO_MUCH = (
+    f"this is more than settings hold: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} groups within each "
+    f"other, numbers of {_DIGITS} digits. Nothing was started."
+)
+_QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
+_BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
+_NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
 
 
 @dataclass(frozen=True)
@@ -56,26 +68,78 @@ def read(text: str, name: str) -> Tree:
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
-    try:
+    with yaml_faults(text, name):
         node = yaml.compose(text, yaml.SafeLoader)
         if node is None:
             return None, origins
         _locate(node, (), name, origins)
         return yaml.SafeLoader("").construct_document(node), origins
+
+
+@contextmanager
+def yaml_faults(text: str, name: str) -> Iterator[None]:
+    """A context that reads YAML: ConfigError for its faults, and before for what would take longer than a second."""
+    depth = 0
+    if len(text) > _LONGEST or _BRACKETS.search(text):
+        raise ConfigError(f"{name}: {_TOO_MUCH}")
+    try:
+        for n, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if n > _MOST or depth > _DEEPEST:
+                raise ConfigError(f"{name}:{event.start_mark.line + 1}: {_TOO_MUCH}")
+        yield
     except RecursionError:
-        raise ConfigError(f"{name}: a value contains itself or is nested too deeply. Nothing was started.") from None
+        raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
-        what = getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__
-        if "expected ':'" in what or "mapping values" in what:
-            what = "a colon is missing after a key of this line or the one above"
+        line, what = _in_words(error, text)
+        place = f"{name}:{line}" if line and "\n" in text else name
         raise ConfigError(f"{place}: this is not YAML ({what}). Nothing was started.") from None
+
+
+def _in_words(error: Exception, text: str) -> tuple[int, str]:
+    """The line of a fault of YAML, 0: not known, and what is wrong with it, for who does not know YAML."""
+    mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
+    problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
+    if mark is None:
+        return 0, problem
+    lines = [*text.split("\n"), ""]
+    this, above = lines[mark.line], next((each for each in lines[: mark.line][::-1] if each.strip()), "")
+    opened = text[context.index : context.index + 1] if context else ""
+    bare = _QUOTED.sub("", text)
+    is_open = opened in ("[", "{") and sum(map(bare.count, "[{")) > sum(map(bare.count, "]}"))
+    is_quote = opened in ("'", '"') and "scalar" in str(getattr(error, "context", ""))
+    quoted = [
+        each
+        for each in _QUOTED.finditer(text[: mark.index])
+        if each[0][0] != "#" and not text[each.end() : mark.index].strip(" ")
+    ]
+    of_key = "mapping values" in problem or "expected ':'" in problem
+    deeper = len(this) - len(this.lstrip()) > len(above) - len(above.lstrip())
+    told = (
+        (is_quote and "end of stream" in problem, f"the {opened} of this line is never closed"),
+        (is_open, f"the {opened} of this line is never closed"),
+        ("'\\t'" in problem and not this[: mark.column].strip(), "this line begins with a tab; indent it with spaces"),
+        (quoted, "text goes on behind a closing quote; a quote that belongs to a text is written twice"),
+        ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it into quotes"),
+        ("escape" in problem, "in double quotes, a backslash begins a special character; use single quotes"),
+        (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
+        (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
+        (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
+        (of_key and ": " in this[: mark.column], "a colon is missing, or a value that has a colon needs quotes"),
+        (of_key and deeper and ": " in above, "this line is indented deeper than the one above, which has its value"),
+        (of_key, "a colon is missing after a key of this line or the one above"),
+        ("<block end>" in problem, "the indentation of this line is that of no group above it"),
+    )
+    at = context if (is_open or is_quote) and context else mark
+    return at.line + 1, next((sentence for holds, sentence in told if holds), problem)
 
 
 def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
     """Enter the place of each value below a node."""
-    origins.setdefault(path, f"{name}:{node.start_mark.line + 1}")
+    place = f"{name}:{node.start_mark.line + 1}"
+    origins.setdefault(path, place)
+    if len(origins) > _MOST or (node.tag.endswith((":int", ":float")) and len(node.value) > _DIGITS):
+        raise ConfigError(f"{place}: {_TOO_MUCH}")
     of_keys = isinstance(node, yaml.MappingNode)
     for index, item in enumerate([] if isinstance(node, yaml.ScalarNode) else node.value):
         key, child = item if of_keys else (item, item)

@@ -21,6 +21,8 @@ class BeamlineError(Exception):
 
     exit_code = 1
 
+    __reduce__ = DeviceError.__reduce__
+
 
 class ConfigError(BeamlineError):
     """Wrong usage or configuration; nothing was started."""

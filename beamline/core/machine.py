@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 
 from beamline.core.text import count
+from recon.base.registry import loaded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +66,7 @@ _CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usa
 
 def machine() -> dict[str, str | int]:
     """Processor, cores this process may use, numba's threads, and the versions of computing libraries."""
-    import numba  # not for callers that only ask for memory
-    import torch
-
+    numba, torch = loaded("numba"), loaded("torch")  # not for callers that only ask for memory
     return {
         "processor": processor(),
         "cores": usable_cores(),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copyreg import __newobj__  # type: ignore[attr-defined]
+from typing import Any
+
 
 class DeviceError(Exception):
     """A device did not carry out a request.
@@ -43,6 +46,10 @@ class DeviceError(Exception):
         )
         parts = [f"{device}: {problem}", *(form.format(text) for form, text in formatted if text)]
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # As a worker process sends it: with its parts, from which no message is made anew.
+        return __newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
         """The same error, reported by a device that uses the failed one. changed: parts of the error to replace."""

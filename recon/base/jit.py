@@ -6,12 +6,12 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+from recon.base.registry import loaded
+
 
 def thread_count() -> int:
     """Threads that numba uses, by NUMBA_NUM_THREADS."""
-    import numba
-
-    return int(numba.config.NUMBA_NUM_THREADS)
+    return int(loaded("numba").config.NUMBA_NUM_THREADS)
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -25,9 +25,7 @@ class _Kernel:
 
     @cached_property
     def _dispatcher(self) -> Any:
-        import numba
-
-        around = self._function.__globals__
+        numba, around = loaded("numba"), self._function.__globals__
         for name in self._function.__code__.co_names:  # from a kernel, numba calls only its own kernels
             if isinstance(kernel := around.get(name), _Kernel) and kernel is not self:
                 around[name] = kernel._dispatcher

@@ -1,4 +1,4 @@
-"""Registry: entries of one kind by name: ours, and those that other installed packages add by entry points.
+"""Registry: entries of one kind by name: ours, and those that other installed packages add by entry points; loaded.
 
 Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check,
 effect or command; the entry point's name is the name of the addition.
@@ -6,11 +6,13 @@ effect or command; the entry point's name is the name of the addition.
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
@@ -69,6 +71,31 @@ def nearest(name: object, legal: Iterable[str]) -> str:
     from difflib import get_close_matches  # here: only errors need it
 
     return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_NEAR)), "")
+
+
+@contextmanager
+def signals_waiting() -> Iterator[None]:
+    """Handlers of signals are called when the context ends. Python runs them in the main thread, so only it waits.
+
+    An exception of a handler in the middle of an import leaves half of a library: numba and torch then fail until
+    Python is started anew.
+    """
+    came = list[tuple[int, Any]]()
+    with ExitStack() as stack:
+        if threading.current_thread() is threading.main_thread():
+            handlers = {s: handler for s in signal.valid_signals() if callable(handler := signal.getsignal(s))}
+            stack.callback(lambda: [handlers[s](s, frame) for s, frame in came])  # at last
+            for number, handler in handlers.items():
+                stack.callback(signal.signal, number, handler)
+                signal.signal(number, lambda s, frame: came.append((s, frame)))
+        yield
+
+
+@cache
+def loaded(module: str) -> Any:
+    """The module, as `importlib.import_module`; its first import ends before a signal is handled."""
+    with signals_waiting():
+        return import_module(module)
 
 
 class UnknownNameError(ValueError, KeyError):
@@ -150,7 +177,7 @@ def plugins(
             if point.name in taken or times[point.name] > 1:
                 by = "splatline" if point.name in taken else "another plug-in"
                 raise ValueError(f"the name is taken by {by}; expected another name")
-            with redirect_stdout(sys.stderr):  # stdout is for results
+            with signals_waiting(), redirect_stdout(sys.stderr):  # stdout is for results
                 found[point.name] = made(point.name, point.load())
         except (Exception, SystemExit) as error:  # another package's fault must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""

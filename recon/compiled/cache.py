@@ -4,6 +4,8 @@ A kernel is read from the archive that comes with the package, where it lies, el
 it is compiled. A file that is damaged counts as absent and is written anew. Where no folder can be written, or a disk
 is full, kernels are compiled in memory, with one warning.
 
+A process that is forked after parallel kernels have run computes the same by them, on the thread that calls.
+
 numba imports this module when it makes its first cache, as LOCATORS names it; nothing else need be imported for it.
 """
 
@@ -13,13 +15,17 @@ import io
 import os
 import pickle
 import re
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+import llvmlite.binding as llvm
 from numba.core import caching
+from numba.core.compiler_lock import global_compiler_lock
+from numba.np.ufunc import parallel
 
 from recon.compiled.archive import carried, sealed, unsealed
 
@@ -98,3 +104,50 @@ _told = list[str]()
 os.environ.pop("NUMBA_CACHE_LOCATOR_CLASSES", None)  # programs begun from here may know numba, and not this module
 caching.IndexDataCacheFile = KernelCacheFile
 caching.Cache._guard_against_spurious_io_errors = _in_memory_where_refused
+
+_LOOP = """
+declare i32 @getpid()
+define void @run(ptr %work, ptr %args, ptr %n, ptr %steps, ptr %data, i64 %inner, i64 %arrays, i32 %threads) {{
+  %process = call i32 @getpid()
+  %is_here = icmp eq i32 %process, {process}
+  br i1 %is_here, label %here, label %forked
+here:
+  call void inttoptr (i64 {threaded} to ptr)(ptr %work, ptr %args, ptr %n, ptr %steps, ptr %data, i64 %inner,
+                                             i64 %arrays, i32 %threads)
+  ret void
+forked:
+  call void %work(ptr %args, ptr %n, ptr %steps, ptr %data)
+  ret void
+}}
+"""
+"""numba's parallel loop, as its `omppool.cpp` declares it, where this is not {process}: one `work` does all `n`.
+
+A fork copies one thread. GNU OpenMP, by which numba runs the parts of a kernel, would wait for the others, so numba
+ends such a process.
+"""
+_IMPORTED_IN = os.getpid()
+_loops = list[Any]()  # whose machine code lives as long
+
+
+def _launch_threads() -> None:
+    """As numba, with the loop above before that of the threads."""
+    if _loops:
+        return
+    process = _IMPORTED_IN if parallel._is_initialized else os.getpid()  # others may have launched them
+    _launch()
+    loop = llvm.parse_assembly(_LOOP.format(process=process, threaded=llvm.address_of_symbol("numba_parallel_for")))
+    _loops.append(llvm.create_mcjit_compiler(loop, llvm.Target.from_default_triple().create_target_machine()))
+    llvm.add_symbol("numba_parallel_for", _loops[0].get_function_address("run"))
+    # A kernel that another thread compiles is finished before the fork: its lock would stay locked in the child.
+    lock = global_compiler_lock
+    os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=_forked)
+
+
+def _forked() -> None:
+    global_compiler_lock.release()
+    if hasattr(torch := sys.modules.get("torch"), "set_num_threads"):
+        torch.set_num_threads(1)  # its OpenMP would wait, too
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    _launch, parallel._launch_threads = parallel._launch_threads, _launch_threads

@@ -7,7 +7,6 @@ reading them. Losses are values that `float` converts: on a GPU that waits for t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
 from typing import Any, Protocol, SupportsFloat, TypeVar
 
 import numpy as np
@@ -17,6 +16,7 @@ from recon.base.arrays import F32
 from recon.base.choices import refuse_unknown_device
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
+from recon.base.registry import loaded
 from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.adam import adam_all, add_lengths
@@ -143,7 +143,7 @@ def backend_for(device: str) -> Backend[Any]:
     refuse_unknown_device(device)
     if device == "cpu":
         return Cpu()
-    Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
+    Gpu: Any = loaded("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
 
     return Gpu(device)
 

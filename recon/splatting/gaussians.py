@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+from recon.base.registry import loaded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -163,9 +164,8 @@ def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
-    from torch import from_numpy
-
-    return from_numpy(np.ascontiguousarray(values, np.float32).copy())
+    tensor: Tensor = loaded("torch").from_numpy(np.ascontiguousarray(values, np.float32).copy())
+    return tensor
 
 
 NEEDLES_LIMIT = 0.2  # Share of the mass above which a warning of needles is given, see docs/published.md

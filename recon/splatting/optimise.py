@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+from recon.base.registry import loaded
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.engine import Active
 from recon.kernels.fused_step import FusedStep, StepInputs, StepModel, StepPlan
@@ -270,10 +271,8 @@ def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: 
 
 def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussians:
     """A copy of the model."""
-    import torch
-
     settle(state)
-    device = backend or Cpu()
+    torch, device = loaded("torch"), backend or Cpu()
     means, log_scales, quaternions, raw = (torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES)
     return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
 

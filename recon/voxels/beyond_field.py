@@ -71,14 +71,22 @@ def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunCont
     before = np.rint(np.subtract(grid.first, box.first) / grid.spacing).astype(int)
     field = tuple(slice(first, first + n) for first, n in zip(before, grid.shape, strict=True))
     whole = result.volume.data
-
-    def outside(views: Geometry) -> F32:
-        matter = np.maximum(whole, 0)
-        matter[field] = 0
-        return Projector(views, box).forward(matter)
-
     volume, radius = Volume(np.ascontiguousarray(whole[field]), grid), {} if sample is None else sample.settings
-    return replace(result, volume=volume, settings={**result.settings, **radius}, outside=outside)
+    return replace(result, volume=volume, settings={**result.settings, **radius}, outside=_Outside(whole, box, field))
+
+
+@dataclass(frozen=True, eq=False)
+class _Outside:
+    """`Reconstruction.outside`: the matter of a box beyond its field; a value, which another process can be sent."""
+
+    whole: F32
+    box: Grid
+    field: tuple[slice, ...]
+
+    def __call__(self, views: Geometry) -> F32:
+        matter = np.maximum(self.whole, 0)
+        matter[self.field] = 0
+        return Projector(views, self.box).forward(matter)
 
 
 def knows_outside(traits: Traits) -> bool:

@@ -6,13 +6,13 @@ are made on the CPU.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.choices import refuse_unknown_device
+from recon.base.registry import loaded
 from recon.kernels.cpu import patches, tv, vectors
 from recon.kernels.cpu.tv import Weights
 from recon.voxels.projector import Projector, views_of_exposure
@@ -111,7 +111,7 @@ def voxel_device(device: str) -> VoxelDevice[Any]:
     refuse_unknown_device(device)
     if device == "cpu":
         return CPU
-    gpu: VoxelDevice[Any] = import_module("recon.kernels.gpu.volumes").GpuVolumes(device)  # loads triton
+    gpu: VoxelDevice[Any] = loaded("recon.kernels.gpu.volumes").GpuVolumes(device)  # loads triton
     return gpu
 
 
@@ -125,7 +125,7 @@ class _GpuProjector:
 
     def __init__(self, projector: Projector, device: Any) -> None:
         self._projector, self._device, geometry = projector, device, projector.geometry
-        self._joseph = import_module("recon.kernels.gpu.joseph")
+        self._joseph = loaded("recon.kernels.gpu.joseph")
         moments = views_of_exposure(geometry) if geometry.is_straight and not geometry.skew else []
         self._moments = [self._joseph.JosephRays.of(views, projector.grid, device.device) for views in moments]
 

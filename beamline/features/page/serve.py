@@ -10,9 +10,11 @@ import ipaddress
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from threading import Event
 
@@ -23,12 +25,17 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.features.page.app import Access, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, cells, describe, runs_in
 
+CONNECTIONS = 96
+"""Beyond so many, the oldest one in which nothing is answered is closed for a new one. A browser opens six, and a
+process of macOS may open 256 files."""
+_AT_ONCE, _WAITING = 32, 1024  # connections that asyncio accepts before it serves them; that wait in the system
 OPEN_RUNS = 8
 """Runs whose files stay open without anybody who watches."""
 
@@ -118,12 +125,29 @@ def open_port(bind: str, port: int) -> socket.socket:
     raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
 
 
+class _Connection(H11Protocol):
+    """A connection that gives way to newer ones while it is idle, so that nobody who sends nothing locks others out."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self.since = time.monotonic()
+        there = [each for each in self.connections if not each.transport.is_closing()]
+        idle = [each for each in there if each.cycle is None or each.cycle.response_complete]
+        if idle and len(there) > CONNECTIONS:
+            min(idle, key=attrgetter("since")).transport.abort()
+
+
 class _Server(uvicorn.Server):
     """A server that says when it ends, so that feeds of open pages end by themselves."""
 
     def __init__(self, config: uvicorn.Config, ended: Event) -> None:
         super().__init__(config)
         self._ended = ended
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for listening in sockets or ():
+            listening.listen(_WAITING)  # asyncio has set its own number
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._ended.set()
@@ -139,7 +163,7 @@ class PageServer:
         self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
         self._server = _Server(
             uvicorn.Config(
-                app, log_level="warning", access_log=False, lifespan="off",
+                app, log_level="warning", access_log=False, lifespan="off", http=_Connection, backlog=_AT_ONCE,
                 timeout_graceful_shutdown=1, server_header=False, proxy_headers=False,
             ),
             access.ended,

@@ -121,7 +121,7 @@ FAULTS = {
         ("  exposure_s: 0.01\n", "  exposure_s: 0.01\n  exposure_s: 0.02\n"),
         "my.yaml:5: scan.exposure_s appears twice (also in line 4)",
     ),
-    "no YAML": (("exposure_s: 0.01", "exposure_s: [0.01"), "my.yaml:5: this is not YAML"),
+    "no YAML": (("exposure_s: 0.01", "exposure_s: [0.01"), "my.yaml:4: this is not YAML (the [ of this line"),
     "number as key": (("sample: {name: test}", "sample: {name: test, 1: 2}"), "my.yaml:1: sample"),
 }
 

@@ -2,18 +2,20 @@
 
 import http.client
 import json
+import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.features.page.serve import open_port
+from beamline.features.page.serve import CONNECTIONS, open_port
 from beamline.monitor.check import Level
 from beamline.page.recording import Recording
 from beamline.scan.control import verbs_taken
@@ -115,6 +117,34 @@ def test_a_choice_reaches_a_scan_that_asks_and_no_other(tmp_path: Path) -> None:
             assert act(page, "again") == 403 and answers == []
             assert act(page, "again", **headers) == 200 and answers == ["again"]
             assert act(page, "enough", **headers) == 404 and answers == ["again"]  # it asks no more
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: ", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"])
+def test_connections_without_the_token_lock_nobody_out(
+    run: Path, sent: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Three times as many as are kept, which say nothing, stop in the middle of a request, or stay after an answer."""
+    with served(run, control=True) as page, ExitStack() as stack:
+        host, port = page.host.rsplit(":", 1)
+        with page_feed(page) as feed:
+            opened = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(3 * CONNECTIONS)]
+            for connection in opened:
+                with suppress(OSError):  # closed for a later one
+                    connection.sendall(sent)
+            begin = time.monotonic()
+            assert page.ask("/api/facts")[0] == 200
+            assert act(page, "stop") == 403  # without the token for acting
+            assert time.monotonic() - begin < 2
+            assert feed.read(1)  # a page that is open stays so
+    assert len(capfd.readouterr().err) < 1000
+
+
+@contextmanager
+def page_feed(page: Served) -> Iterator[http.client.HTTPResponse]:
+    """The feed of events of a page that is open."""
+    with closing(http.client.HTTPConnection(page.host, timeout=20)) as connection:
+        connection.request("GET", "/api/feed", headers={"Cookie": f"{page.cookie}={page.token}"})
+        yield connection.getresponse()
 
 
 def test_a_page_without_control_has_no_token_for_acting(page: Served) -> None:

@@ -1,0 +1,85 @@
+"""YAML: what would take long is refused at once, and a fault is said in words, with the line that has to be mended."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from beamline.config.tree import override, read
+from beamline.core.errors import ConfigError
+from beamline.scenes.scene_file import open_scene
+from tests.beamline.cli.small_scan import beamline
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+MERGED = "a: &a {x: 1}\n" + "".join(
+    f"{name}: &{name} {{<<: [{', '.join(9 * [f'*{before}'])}]}}\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+ATTACKS = {
+    "aliases": LAUGHS,
+    "merged aliases": MERGED,
+    "sexagesimal": f"a: {':'.join(100_000 * '1')}\n",
+    "sexagesimal fraction": f"a: {':'.join(20_000 * '1')}.5\n",
+    "digits": f"a: {2_000_000 * '9'}\n",
+    "hexadecimal": f"a: 0x{200_000 * 'f'}\n",
+    "groups": f"a: {5000 * '['}\n",
+    "keys": "".join(f"k{n}: 1\n" for n in range(30_000)),
+}
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_what_would_take_long_is_refused_at_once(name: str) -> None:
+    begin = time.process_time()
+    with pytest.raises(ConfigError, match=r"my\.yaml(:\d+)?: .*more than settings hold"):
+        read(ATTACKS[name], "my.yaml")
+    assert time.process_time() - begin < 1.5  # a third of that on an idle core
+
+
+def test_overrides_scenes_and_recipes_are_read_alike(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="more than settings hold"):
+        override(read("a: 1\n", "my.yaml"), [f"a={':'.join(1000 * '1')}"], {})
+    path = tmp_path / "it.yaml"
+    path.write_text(LAUGHS)
+    with pytest.raises(ConfigError, match="more than settings hold"):
+        open_scene(str(path))
+    path.write_text("method: {a: fbp\nrings: vo\n")
+    said = " ".join(beamline("recon", "scan.h5", "--config", path).stderr.split())
+    assert "it.yaml:1: this is not YAML (the { of this line is never closed)" in said
+    path.write_text("a: " + 100 * "[")
+    assert "more than settings hold" in beamline("recon", "scan.h5", "--config", path).stderr
+
+
+def test_aliases_and_long_texts_of_a_person_are_read() -> None:
+    text = f"beam: &beam {{energy: 25}}\nother: {{<<: *beam, name: '{5000 * 'x'}'}}\ntime: 1:30\n"
+    assert read(text, "my.yaml").data["other"]["energy"] == 25 and read(text, "my.yaml").data["time"] == 90
+
+
+FAULTS = {
+    "tab": ("scan:\n\tmode: step\n", 2, "this line begins with a tab"),
+    "tab below": ("scan:\n  mode: step\n\tviews: 3\n", 3, "this line begins with a tab"),
+    "brace": ("a: 1\nscan: {mode: step\nsample:\n  name: {x: 1}\n", 2, "the { of this line is never closed"),
+    "bracket": ("scan:\n  roi: [1, 2\nsample: 3\n", 2, "the [ of this line is never closed"),
+    "bracket at the end": ("scan:\n  roi: [1, 2\n", 2, "the [ of this line is never closed"),
+    "bracket in a brace": ("scan: {roi: [1, 2}\n", 1, "the [ of this line is never closed"),
+    "quote": ('sample:\n  name: "x\n  title: y\n', 2, 'the " of this line is never closed'),
+    "apostrophe": ("sample:\n  name: 'it's'\n", 2, "text goes on behind a closing quote"),
+    "space": ("scan:\n  mode:step\n  views: 3\n", 3, "a space is missing after the colon of the line above"),
+    "space of the first": ("mode:step\nviews: 3\n", 2, "a space is missing after the colon of the line above"),
+    "colon": ("scan:\n  mode step\n  views: 3\n", 3, "a colon is missing after a key"),
+    "two colons": ("sample:\n  name: a: b\n", 2, "a colon is missing, or a value that has a colon needs quotes"),
+    "deeper": ("scan:\n  mode: step\n    views: 3\n", 3, "this line is indented deeper than the one above"),
+    "between": ("scan:\n    mode: step\n  views: 3\n", 3, "the indentation of this line is that of no group above"),
+    "at": ("sample:\n  name: @x\n", 2, "a value begins with '@'; put it into quotes"),
+    "star": ("sample:\n  name: *x\n", 2, "text that begins with * or & needs quotes"),
+    "backslash": ('a: 1\nb: "C:\\data"\n', 2, "in double quotes, a backslash begins a special character"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_said_in_words_with_its_line(name: str) -> None:
+    text, line, said = FAULTS[name]
+    with pytest.raises(ConfigError) as raised:
+        read(text, "my.yaml")
+    assert str(raised.value).startswith(f"my.yaml:{line}: this is not YAML ({said}"), raised.value
