@@ -131,7 +131,8 @@ def taken(item: Any, where: Any) -> Any:
     try:
         return item[where]
     except OSError as error:
-        if lacking := next(_not_installed(getattr(item, "item", item)), None):
+        stored = getattr(item, "item", item)
+        if lacking := next(_not_installed(stored), "") if isinstance(stored, h5py.Dataset) else "":
             folders = os.environ.get("HDF5_PLUGIN_PATH") or "not set"
             raise DataError(
                 f"{lacking}, which is not installed here. Put its HDF5 plugin into a folder that HDF5_PLUGIN_PATH "
