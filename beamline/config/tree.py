@@ -86,7 +86,7 @@ def yaml_faults(text: str, name: str) -> Iterator[None]:
         for n, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if n > _MOST or depth > _DEEPEST:
-                raise ConfigError(f"{name}:{event.start_mark.line + 1}: {_TOO_MUCH}")
+                raise ConfigError(f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}: {_TOO_MUCH}")
         yield
     except RecursionError:
         raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None

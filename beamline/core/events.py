@@ -69,15 +69,19 @@ class Event:
         return values
 
     def to_json(self) -> str:
-        """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
-        from pydantic_core import to_jsonable_python  # here, because most commands write no line
-
-        values = {"event": self.event, "time": round(self.time, 6), **self.data}
-        line = to_jsonable_python(values, inf_nan_mode="null", fallback=_of_no_json_type)
-        return json.dumps(line, allow_nan=False)
+        """One line of JSON, see `json_of`."""
+        return json_of({"event": self.event, "time": round(self.time, 6), **self.data})
 
 
 Sink = Callable[[Event], None]  # Takes events
+
+
+def json_of(values: Mapping[str, Any]) -> str:
+    """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
+    from pydantic_core import to_jsonable_python  # here, because most commands write no line
+
+    plain = to_jsonable_python(values, inf_nan_mode="null", fallback=_of_no_json_type)
+    return json.dumps(plain, allow_nan=False)
 
 
 def _of_no_json_type(value: Any) -> Any:

@@ -49,7 +49,7 @@ class DeviceError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # As a worker process sends it: with its parts, from which no message is made anew.
-        return __newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
+        return __newobj__, (type(self), *self.args), vars(self)
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
         """The same error, reported by a device that uses the failed one. changed: parts of the error to replace."""

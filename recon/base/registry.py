@@ -80,7 +80,7 @@ def signals_waiting() -> Iterator[None]:
     An exception of a handler in the middle of an import leaves half of a library: numba and torch then fail until
     Python is started anew.
     """
-    came = list[tuple[int, Any]]()
+    came = list[tuple[Any, Any]]()
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():
             handlers = {s: handler for s in signal.valid_signals() if callable(handler := signal.getsignal(s))}

@@ -145,7 +145,8 @@ def _launch_threads() -> None:
 
 def _forked() -> None:
     global_compiler_lock.release()
-    if hasattr(torch := sys.modules.get("torch"), "set_num_threads"):
+    torch: Any = sys.modules.get("torch")
+    if hasattr(torch, "set_num_threads"):
         torch.set_num_threads(1)  # its OpenMP would wait, too
 
 

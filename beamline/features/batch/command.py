@@ -42,7 +42,7 @@ class BatchRow:
         state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
             one; "waiting": not tried yet.
         residual: of the volume, of views held out where there were any.
-        message: why it failed, or is poor.
+        message: why it failed, or is poor; what its reconstruction warned of.
     """
 
     name: str
@@ -171,7 +171,7 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
 
 def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> BatchRow:
     """Reconstruct a scan."""
-    began, last = clock.now(), dict[str, Any]()
+    began, last, warned = clock.now(), dict[str, Any](), list[str]()
 
     def pass_on(line: str) -> None:
         nonlocal last
@@ -183,6 +183,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
             last = event.data
         else:
             sink(replace(event, scan=row.scan))
+            warned.extend([event.message] if isinstance(event, Warned) else [])
 
     place = options.folder / row.name
     if (place / RECON).is_file():
@@ -206,7 +207,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
         residual=last.get("residual_held_out", last.get("residual")),
-        message="" if state == "done" else one_line(reason, SENTENCE),
+        message=one_line(" ".join(warned) if state == "done" else reason, SENTENCE),
     )  # fmt: skip
 
 

@@ -8,7 +8,6 @@ token for acting in a header. No data of a client reach the file system.
 from __future__ import annotations
 
 import asyncio
-import json
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -29,6 +28,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
+from beamline.core.events import json_of
 from beamline.core.files import bytes_below
 from beamline.features.page.viewer import reader_of, scan_routes, viewer_routes
 from beamline.page.recording import Recording
@@ -182,7 +182,7 @@ class _Server:
             for number in range(first, len(lines)):
                 yield f"id: {number}\nevent: run\ndata: {lines[number]}\n\n"
             first = max(first, len(lines))
-            now = json.dumps(state)
+            now = json_of(state)
             if now != sent:
                 sent = now
                 yield f"event: state\ndata: {now}\n\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.events import json_of
 from beamline.core.files import bring_to_disk, whole_file
 from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
@@ -135,7 +135,7 @@ class Nrrd:
         z, y, x = (float(centres[0]) for centres in grid.coordinates())
         dz, dy, dx = (float(edge) for edge in grid.spacing)
         units = f'space units: "{record.length_unit}" "{record.length_unit}" "{record.length_unit}"\n'
-        facts = json.dumps(facts_of(record, slices.pixels))
+        facts = json_of(facts_of(record, slices.pixels))
         header = (
             f"NRRD0004\ntype: {_TYPES[slices.pixels.bits]}\ndimension: 3\nspace dimension: 3\nsizes: {nx} {ny} {nz}\n"
             f"space directions: ({dx!r},0,0) (0,{dy!r},0) (0,0,{dz!r})\nkinds: space space space\nendian: little\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.events import json_of
 from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.structure import dtype_of, shape_of
@@ -39,7 +39,7 @@ class TiffVolume:
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         dtype = slices.pixels.dtype
         big = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize >= CLASSIC_TIFF_BYTES
-        facts = json.dumps(facts_of(record, slices.pixels) | {"shape": slices.shape})
+        facts = json_of(facts_of(record, slices.pixels) | {"shape": slices.shape})
         ome = big or slices.shape[2] == 1  # tifffile takes a single column of ImageJ's for samples of a pixel
         tags = _ome(record, facts) if ome else _imagej(record, facts)
         with tifffile.TiffWriter(path, bigtiff=big, ome=ome, imagej=not ome, byteorder="<") as tif:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.events import json_of
 from beamline.core.files import SETTINGS, bytes_below
 from beamline.storage.foreign_zarr import open_zarr, zarr_library
 from beamline.storage.readers.tiff import VOLUME
@@ -61,7 +62,7 @@ class OmeZarr:
             for z in range(0, coarser.shape[0], _CHUNK[0]):
                 end = min(z + _CHUNK[0], coarser.shape[0])
                 coarser[z:end] = _means(finer, coarser, z, end)
-        group.attrs.update({"ome": _ome(record, levels), _KEY: json.dumps(facts_of(record, slices.pixels))})
+        group.attrs.update({"ome": _ome(record, levels), _KEY: json_of(facts_of(record, slices.pixels))})
 
     def holds(self, path: Path) -> bool:
         return path.is_dir() and _facts(path) is not None
