@@ -140,7 +140,9 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
         axis_row = meets - rows.start
         return Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row).binned(selection.binning)
     if selection.central_row is not None:
-        raise ConfigError(f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone.")
+        raise ConfigError(
+            f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone."
+        )
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )

@@ -38,7 +38,10 @@ def definition_stated(places: Places) -> Iterator[Finding]:
         yield Finding("info", "definition", f"{definition}: float frames in NXtomo's places, on purpose not an NXtomo.")
     elif definition != layout.NXTOMO:
         yield Finding("warning", "definition", f"{places.entry.name}/definition is {definition!r}, expected 'NXtomo'.")
-    if places.data.id.dtype.kind not in "iu" and datasets.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION:
+    if (
+        places.data.id.dtype.kind not in "iu"
+        and datasets.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION
+    ):
         message = f"Frames are {places.data.dtype}; NXtomo demands integers, as the camera counted."
         yield Finding("error", "integer-frames", message)
 

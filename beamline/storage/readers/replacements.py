@@ -28,8 +28,8 @@ from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
-from beamline.storage.readers.transforms import type_wrapped, unsigned
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, is_untyped, opened, read_image
+from beamline.storage.readers.transforms import real_type, type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
@@ -220,12 +220,14 @@ def _of_tiffs(path: Path) -> NDArray[Any]:
     if not files:
         raise DataError(f"{path} holds no .tif or .tiff file.")
     try:
+        with opened(files[0]) as tif:
+            untyped = is_untyped(tif)
         parts = [read_image(file) for file in files]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
         wanted = "" if isinstance(error, OSError) and error.errno else " as TIFFs of one shape, nor as HDF5"
         raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
-    return _stack(stack, str(path))
+    return _stack(stack, str(path), untyped)
 
 
 def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: tuple[int, int] | None) -> NDArray[Any]:
@@ -276,9 +278,9 @@ def _read(path: Path, item: h5py.Dataset) -> NDArray[Any]:
     return _stack(out, f"{item.name} in {path}")
 
 
-def _stack(images: NDArray[Any], name: str) -> NDArray[Any]:
+def _stack(images: NDArray[Any], name: str, untyped: bool = False) -> NDArray[Any]:
     require_real(images.dtype, name)
-    if (dtype := type_wrapped(images)) is not None:
+    if (dtype := real_type(images, False) if untyped else type_wrapped(images)) is not None:
         images = unsigned(images, dtype)
     return images[None] if images.ndim == 2 else images
 

@@ -18,7 +18,6 @@ from beamline.storage.rules.pixels import darks_measured, pixels_measured, quant
 from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, views_first
 from drivers.base.frame import FrameKind
 
-
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
