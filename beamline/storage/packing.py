@@ -45,7 +45,8 @@ def packing(
 ) -> Callable[[Any], NDArray[Any]] | None:
     """What makes values of packed numbers [...] of a type, NaN of those that are none; None where they are the values.
 
-    Values are real numbers of a type that holds all that are stored. By CF value = stored * scale_factor + add_offset, by CIL value = (stored - offset) / scale.
+    Values are of a real type that holds all that is stored: by CF stored * scale_factor + add_offset, by CIL (stored -
+    offset) / scale.
 
     Args:
         said: the attributes of the numbers.
@@ -63,8 +64,8 @@ def packing(
             f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, given, strict=True)
         )
         raise DataError(
-            f"{where} has the attributes {shown}, and nothing says how its numbers are read by them. In a copy, name them "
-            "scale_factor and add_offset, where value = stored * scale_factor + add_offset, or store the values."
+            f"{where} has the attributes {shown}, and nothing says how its numbers are read by them. In a copy, name "
+            "them scale_factor and add_offset, where value = stored * scale_factor + add_offset, or store the values."
         )
     if pair is _CIL:
         scale, offset = 1 / scale, -offset / scale
@@ -81,7 +82,7 @@ def packing(
         return None
 
     def values(stored: Any) -> NDArray[Any]:
-        numbers = np.asarray(stored).view(signed)
+        numbers = np.asarray(stored, dtype).view(signed)  # a single number comes in the order of this machine
         made = np.asarray(numbers.astype(real) * scale + offset, real)
         made[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
         return made

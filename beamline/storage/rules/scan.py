@@ -106,7 +106,7 @@ def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = Non
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"The file states that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
+                f"The file says that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
                 f"of {n}). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
             )
 
