@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -227,14 +227,9 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """The first number in the unit of this program; None as `in_units`, and if it is not finite."""
-    item = dataset(group, path)
-    values = None if item is None else _converted(item, units, first_of)
-    return float(values[0]) if values is not None and values.size and np.isfinite(values[0]) else None
-
-
-def typical(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """The median of a size that may be stated for each frame, in the unit of this program; None as `scalar`."""
+    """The number in the unit of this program, of a list the median of what is above 0, or else of all; None as
+    `in_units`, and if none is finite.
+    """
     values = in_units(dataset(group, path), units)
     known = np.empty(0) if values is None else values[np.isfinite(values)]
     return float(np.median(known[known > 0] if (known > 0).any() else known)) if known.size else None
@@ -245,27 +240,21 @@ def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[n
 
     None if there is no dataset of real numbers, or if its unit is unknown or missing.
     """
-    return None if item is None else _converted(item, units, values_of)
-
-
-def _converted(
-    item: h5py.Dataset, units: Mapping[str, float], read: Callable[[h5py.Dataset], Any]
-) -> NDArray[np.float64] | None:
-    values, stated = _numbers(item, read)
+    values, stated = (None, set[str]()) if item is None else _numbers(item)
     factors = {factor_of(unit, units) for unit in stated or {""}}
     factor = factors.pop() if len(factors) == 1 else None  # an attribute and a text that disagree say nothing
     return None if values is None or factor is None else values * factor
 
 
-def _numbers(item: h5py.Dataset, read: Callable[[h5py.Dataset], Any]) -> tuple[NDArray[np.float64] | None, set[str]]:
-    """What is read of a dataset, as a list, None where it is no numbers; and the units that its attribute and its text
+def _numbers(item: h5py.Dataset) -> tuple[NDArray[np.float64] | None, set[str]]:
+    """The numbers of a dataset, as a list, None where it is no numbers; and the units that its attribute and its text
     state."""
-    stated = {attribute(item, "units")} - {""}
+    stated = {attribute(item, "units") or attribute(item, "angle_unit")} - {""}  # the latter of CIL
     if item.dtype.kind in "uif":
-        return np.ravel(np.asarray(read(item), np.float64)), stated
+        return np.ravel(np.asarray(values_of(item), np.float64)), stated
     if item.dtype.kind not in "SO":
         return None, stated
-    written = [_WRITTEN.fullmatch(text(each).strip()) for each in np.ravel(read(item))]
+    written = [_WRITTEN.fullmatch(text(each).strip()) for each in np.ravel(values_of(item))]
     numbers = [match for match in written if match is not None]
     values = np.array([float(match[1]) for match in numbers])
     return values if len(numbers) == len(written) else None, stated | {match[2] for match in numbers} - {""}
@@ -280,7 +269,7 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     if lost := missing_links(item):
         raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
     where = f"{item.name} in {item.file.filename}"
-    angles, stated = _numbers(item, values_of)
+    angles, stated = _numbers(item)
     if angles is None:
         raise DataError(f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected whole or real numbers.")
     unit = unit or " and ".join(sorted(stated)) or default

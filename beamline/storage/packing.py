@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import printable
 
 _CF, _CIL = ("scale_factor", "add_offset"), ("scale", "offset")
 _NAMES = {*_CF, *_CIL, "_FillValue", "missing_value", "valid_range", "valid_min", "valid_max", "_Unsigned"}
@@ -24,7 +25,7 @@ class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        return values_type(self._stored.dtype)
+        return np.result_type(self._stored.dtype, np.float32)
 
     def __getitem__(self, args: Any, new_dtype: Any = None) -> NDArray[Any]:
         return self._values(self._stored.__getitem__(args, new_dtype))
@@ -39,17 +40,13 @@ def unpacked(item: h5py.Dataset) -> h5py.Dataset:
     return item if values is None else PackedDataset(item, values)
 
 
-def values_type(stored: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of the values of packed numbers: real ones that hold all of them."""
-    return np.result_type(stored, np.float32)
-
-
 def packing(
     said: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
 ) -> Callable[[Any], NDArray[Any]] | None:
     """What makes values of packed numbers [...] of a type, NaN of those that are none; None where they are the values.
 
-    By CF value = stored * scale_factor + add_offset, by CIL value = (stored - offset) / scale.
+    Values are of a real type that holds all that is stored: by CF stored * scale_factor + add_offset, by CIL (stored -
+    offset) / scale.
 
     Args:
         said: the attributes of the numbers.
@@ -58,13 +55,17 @@ def packing(
     Raises:
         DataError: nobody says what they mean, or no number has such a value.
     """
+    real = np.result_type(dtype, np.float32)
     pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*said} and not {*_CF} & {*said} else _CF
-    scale, offset = (float(np.ravel(said.get(name, plain)).item()) for name, plain in zip(pair, (1, 0), strict=True))
+    given = [np.ravel(said.get(name, plain))[:1] for name, plain in zip(pair, (1, 0), strict=True)]
+    scale, offset = (float(each[0]) if each.size and each.dtype.kind in "uif" else np.nan for each in given)
     if not (scale and np.isfinite(scale + offset)) or (pair is _CIL and not by_cil and (scale, offset) != (1, 0)):
+        shown = " and ".join(
+            f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, given, strict=True)
+        )
         raise DataError(
-            f"{where} has the attributes {pair[0]} {scale:g} and {pair[1]} {offset:g}, and nothing says how its numbers "
-            "are read by them. In a copy, name them scale_factor and add_offset, where value = stored * scale_factor + "
-            "add_offset, or store the values."
+            f"{where} has the attributes {shown}, and nothing says how its numbers are read by them. In a copy, name "
+            "them scale_factor and add_offset, where value = stored * scale_factor + add_offset, or store the values."
         )
     if pair is _CIL:
         scale, offset = 1 / scale, -offset / scale
@@ -81,8 +82,8 @@ def packing(
         return None
 
     def values(stored: Any) -> NDArray[Any]:
-        numbers = np.asarray(stored).view(signed)
-        made = np.asarray(numbers.astype(values_type(dtype)) * scale + offset, values_type(dtype))
+        numbers = np.asarray(stored, dtype).view(signed)  # a single number comes in the order of this machine
+        made = np.asarray(numbers.astype(real) * scale + offset, real)
         made[np.isin(numbers, fills) | (numbers < low) | (numbers > high)] = np.nan
         return made
 

@@ -37,6 +37,8 @@ class ArraySource:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
+    central: tuple[float, float] | None = None
+    untyped = False
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
     row_pitch_mm: float | None = None

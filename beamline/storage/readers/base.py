@@ -57,11 +57,12 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        central: (row, column) that the central ray meets, as the file says of it, NaN where it does not; it is not used.
+        central: (row, column) that the central ray meets, by the file, which is shown and not used; NaN: not stated.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
         row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
             they were taken.
+        untyped: the file does not say whether the bits of pixels are those of whole or of real numbers.
         numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
         pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
@@ -96,6 +97,7 @@ class ScanSource(ABC):
     unreadable: Mapping[int, str] = MappingProxyType({})
     row_pitch_mm: float | None = None
     in_order: bool = True
+    untyped: bool = False
     numbers: NDArray[np.int64] | None = None
     pixel_mask: Mask | None = None
     frames_per_view: int = 1

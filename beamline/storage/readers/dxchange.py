@@ -230,7 +230,7 @@ def _measured(
 
 
 def _positive(file: h5py.File, where: str, units: Mapping[str, float]) -> float | None:
-    value = datasets.typical(file, where, units)
+    value = datasets.scalar(file, where, units)
     return value if value is not None and value > 0 else None
 
 

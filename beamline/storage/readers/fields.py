@@ -193,6 +193,10 @@ NXTOMO: tuple[Entry, ...] = (
         "half turns about the axes, by the direction of `gravity`, mirror the frames; other turns are named",
     ),
     Entry("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
+    Entry(
+        "sample/depends_on",
+        "where sample/rotation_angle is absent: the rotation that changes, at the end of its chain or on the way",
+    ),
     Entry("sample/name", "name in reports"),
     Entry("title", "name in reports"),
     Entry("start_time", "shown"),

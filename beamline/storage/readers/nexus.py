@@ -183,8 +183,8 @@ def read_geometry(places: Places) -> NexusGeometry:
         DataError: distances that cannot be.
     """
     detector, entry = places.detector, places.entry
-    own = [datasets.typical(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
-    at_sample = [datasets.typical(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
+    own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
+    at_sample = [datasets.scalar(entry, f"sample/{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
     pixels = [theirs or ours for theirs, ours in zip(at_sample, own, strict=True)]
     cone, remarks = _cone_of(places, own[0], at_sample[0])
     if cone is not None:  # on the detector

@@ -69,7 +69,7 @@ class NexusSource(ScanSource):
         self.dtype = places.data.dtype
         definition = datasets.text_at(places.entry, "definition") or datasets.attribute(places.entry, "definition")
         self.format = _format(definition, datasets.text_at(places.entry, "program_name"))
-        self.quantity = _quantity(datasets.text_at(file, "/entry/record/quantity"), self.dtype)
+        self.quantity = _quantity(datasets.text_at(file, "/entry/record/quantity"), places.data.id.dtype)
         self.energy_kev = read_energy(places.entry)
         # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
         self.axis_col = datasets.scalar(file, "/entry/record/axis_col", {"pixel": 1.0})

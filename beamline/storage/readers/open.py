@@ -41,6 +41,7 @@ from beamline.storage.readers.transforms import (
     cropped,
     in_parts,
     kinds_and_views,
+    real_type,
     selected,
     turned,
     type_wrapped,
@@ -210,7 +211,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = Frames(base, angles=assign(base, angles, angles_from, of_views=options.angle_rows is not None))
     if views is not None:
         base = selected(base, views)
-    if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
+    if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
         base = as_unsigned(base, dtype)
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
@@ -301,8 +302,14 @@ def _references(base: ScanSource, options: SourceOptions, white: float | None) -
     return nothing, np.ones_like(nothing)
 
 
-def _unsigned_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The type without a sign of counts that wrapped, which holds all of them; None: none has."""
+def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | None:
+    """The real type of pixels that are bits of such, or the type without a sign of counts that wrapped, which holds all
+    of them; None: they are what they are stored as.
+    """
+    if source.dtype.kind == "u":
+        some = [each for each in _some_of_each_kind(source) if each.any()]
+        types = {real_type(each, options.quantity == "transmission") for each in some}
+        return types.pop() if len(types) == 1 else None
     looked_at = [(images, type_wrapped(images)) for images in _some_of_each_kind(source)]
     dtype = max((each for _, each in looked_at if each is not None), key=lambda each: each.itemsize, default=None)
     fits = dtype is not None and all(images.max() <= np.iinfo(dtype).max for images, _ in looked_at)

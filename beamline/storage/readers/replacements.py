@@ -30,8 +30,9 @@ from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, dataset_at, in_order
-from beamline.storage.readers.tiff import DECODERS, UNREADABLE, images_among, no_image, read_image
-from beamline.storage.readers.transforms import type_wrapped, unsigned
+from beamline.storage.readers.tiff import DECODERS, UNREADABLE, images_among, is_untyped, no_image, read_image
+from beamline.storage.readers.tiff import opened as opened_tiff
+from beamline.storage.readers.transforms import real_type, type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike
@@ -288,12 +289,16 @@ def _of_images(path: Path) -> NDArray[Any]:
         if not files:
             raise DataError(no_image(path, names))
     try:
-        parts = [DECODERS.get(file.suffix.lower(), read_image)(file) for file in files]
+        decoders = [DECODERS.get(file.suffix.lower(), read_image) for file in files]
+        if untyped := decoders[0] is read_image:
+            with opened_tiff(files[0]) as tif:
+                untyped = is_untyped(tif)
+        parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
         wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
         raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
-    return _stack(stack, str(path))
+    return _stack(stack, str(path), untyped)
 
 
 def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: tuple[int, int] | None) -> NDArray[Any]:
@@ -343,9 +348,9 @@ def _read(path: Path, item: Any) -> NDArray[Any]:
     return _stack(out, f"{item.name} in {path}")
 
 
-def _stack(images: NDArray[Any], name: str) -> NDArray[Any]:
+def _stack(images: NDArray[Any], name: str, untyped: bool = False) -> NDArray[Any]:
     require_real(images.dtype, name)
-    if (dtype := type_wrapped(images)) is not None:
+    if (dtype := real_type(images, False) if untyped else type_wrapped(images)) is not None:
         images = unsigned(images, dtype)
     return images[None] if images.ndim == 2 else images
 

@@ -220,7 +220,33 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
         names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
-        return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
+        source = StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
+        if "pixel_size_h" in views.attrs and isinstance(
+            config := datasets.resolve(views.parent.parent, "config"), h5py.Group
+        ):
+            _take_geometry(source, float(views.attrs["pixel_size_h"]), config)
+        return source
+
+
+def _take_geometry(source: StacksSource, pixel_mm: float, config: h5py.Group) -> None:
+    """Take the pixel size, the distances of a cone and where its central ray falls as CIL writes them, taken as mm."""
+    source.pixel_size_mm = pixel_mm
+    places = [datasets.dataset(config, f"{name}/{what}") for name, what in _CIL]
+    if None not in places:
+        start, axis, end, across, up = (np.asarray(datasets.values_of(place), np.float64) for place in places)
+        normal = np.cross(across, up)
+        normal *= np.sign(normal @ (end - start))
+        source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
+        foot = start + source.cone[1] * normal - end  # from the middle of the detector
+        middle = (np.array(source.shape) - 1) / 2
+        source.central = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
+
+
+_CIL = (
+    ("source", "position"),
+    ("rotation_axis", "position"),
+    *(("detector", of) for of in ("position", "direction_x", "direction_y")),
+)
 
 
 def open_arrays(path: Path) -> StacksSource:

@@ -85,6 +85,12 @@ def orientation(tif: tifffile.TiffFile) -> int:
     return int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
 
 
+def is_untyped(tif: tifffile.TiffFile) -> bool:
+    """Whether a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
+    tag = images_of(tif)[0].keyframe.tags.get(339)
+    return tag is None or int(np.ravel(tag.value)[0]) not in (1, 2, 3)
+
+
 def upright(images: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Images [..., row, col] with the first row at the top and the first column at the left."""
     images = images.swapaxes(-1, -2) if orientation >= 5 else images

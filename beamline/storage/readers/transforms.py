@@ -208,8 +208,12 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
 
 
 def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
-    """A scan of unsigned counts that `base` stores as a signed type, so that large counts appear negative."""
-    fact = f"int{8 * dtype.itemsize} that wrapped, read as {dtype}"
+    """A scan of the numbers that `base` stores as others: unsigned counts as signed ones, so that large counts appear
+    negative, or reals as whole numbers.
+    """
+    wrapped = f"int{8 * dtype.itemsize} that wrapped"
+    what = "real numbers by their bits, as no SampleFormat in the TIFF says" if dtype.kind == "f" else wrapped
+    fact = f"{what}, read as {dtype}"
     return Frames(
         base,
         pixels=lambda read, frames, rows: unsigned(read(frames, rows), dtype),
@@ -223,6 +227,36 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     if images.dtype.itemsize == dtype.itemsize:
         return images.view(dtype)
     return (images & np.iinfo(dtype).max).astype(dtype)
+
+
+def real_type(images: NDArray[Any], transmission: bool) -> np.dtype[Any] | None:
+    """The real type of whole numbers [..., col] that are the bits of real ones; None where they are whole.
+
+    Real numbers of one quantity lie close together by their bits. Whole numbers would do so only if nearly all of them
+    lay within four per cent of the range of their type, around a quarter or three quarters of it. Those of two bytes
+    all look like real ones: these must be smooth, with both signs, or be transmissions that somebody says they are.
+    """
+    size = images.dtype.itemsize
+    if images.dtype.kind != "u" or size < 2 or images.shape[-1] < 2:
+        return None
+    dtype = np.dtype(f"{images.dtype.byteorder}f{size}")
+    with np.errstate(invalid="ignore"):
+        reals = images.view(dtype).astype(np.float64)
+    known = np.abs(reals[np.isfinite(reals) & (reals != 0)])
+    typical = float(np.median(known)) if known.size else 0.0
+    near = (known > typical / _OCTAVES) & (known < typical * _OCTAVES)
+    if not (1 / _OCTAVES**2 < typical < _OCTAVES**2 and near.sum() > _NEARLY_ALL * (images != 0).sum()):
+        return None
+    if size == 2 and transmission:
+        return dtype if known.max() < _OPEN else None
+    across = (np.abs(np.diff(each, axis=-1)).mean() / each.std() for each in (reals, images.astype(np.float64)))
+    return dtype if size > 2 or (reals.min() < 0 < reals.max() and _SMOOTHER * next(across) < next(across)) else None
+
+
+_OCTAVES = 2.0**20  # a quantity of an image spans less, and its median in any unit lies within its square from 1
+_NEARLY_ALL = 0.99  # of the pixels that are not 0: a few are defective
+_SMOOTHER = 3.0  # as reals than as whole numbers, in which a sign is the largest step
+_OPEN = 2.0  # beyond the transmission of any open beam
 
 
 def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:

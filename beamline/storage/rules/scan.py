@@ -20,7 +20,6 @@ from beamline.storage.rules.pixels import darks_measured, pixels_measured, quant
 from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, views_first
 from drivers.base.frame import FrameKind
 
-
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
@@ -113,7 +112,7 @@ def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = Non
             yield Finding(
                 "warning",
                 f"central-{side}",
-                f"The file states that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
+                f"The file says that the central ray meets {side} {at:.6g} (beam_center, from the centre of the first "
                 f"of {n}). It is taken to meet {taken}: give {option} {at:.6g} where the file is right.",
             )
 

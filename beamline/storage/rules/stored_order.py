@@ -34,7 +34,7 @@ def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
             "(numpy: images.byteswap()).",
         )
     if wrapped := source.attributes.get("pixels"):
-        yield Finding("warning", "pixels", f"The file's label is wrong: counts are {wrapped}.")
+        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
 
 
 def _roughness(views: NDArray[Any]) -> float:

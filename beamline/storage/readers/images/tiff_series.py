@@ -30,7 +30,9 @@ from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.foreign_zarr import zarr_root
 from beamline.storage.hdf5 import UnreadableError
+from beamline.storage.packing import packing
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.images.image_names import NamedImages, in_order
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.side_files import offered
@@ -41,6 +43,7 @@ from beamline.storage.readers.tiff import (
     image_of,
     images_among,
     is_hidden,
+    is_untyped,
     no_image,
     opened,
     refuse_volume,
@@ -55,6 +58,7 @@ LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
+_SCALES = "scaleoffset.json"
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
@@ -84,12 +88,13 @@ class TiffSeriesSource(ScanSource):
             references, series = images.references, images.series
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
-                self.not_used = stated(path, tif)
+                self.not_used, self.untyped = stated(path, tif), is_untyped(tif)
             some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower()) and not name.endswith(".npy")]
+            self.packing = next((self._text(name) for name in names if name.rpartition("/")[2] == _SCALES), "")
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if images.beside:
@@ -291,7 +296,17 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
     scene = _scene_of(path)
-    return TiffSeriesSource(path, one_series=opening.one_series) if scene is None else _open_scene(scene)
+    return _unpacked(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
+
+
+def _unpacked(source: TiffSeriesSource) -> ScanSource:
+    """The values of a series that CIL packed, by the scale and the offset in the file that it writes beside images."""
+    said = json.loads(source.packing) if source.packing else {}
+    values = packing(said, source.dtype, f"{_SCALES} in {source.path}", by_cil=True) if isinstance(said, dict) else None
+    if values is None:
+        return source
+    real = np.result_type(source.dtype, np.float32)
+    return Frames(source, pixels=lambda read, frames, rows: values(read(frames, rows)), dtype=real)
 
 
 FORMAT = ScanFormat(

@@ -19,6 +19,7 @@ from beamline.storage.readers.tiff import (
     UNREADABLE,
     Complaints,
     images_of,
+    is_untyped,
     opened,
     orientation,
     refuse_packed,
@@ -69,7 +70,7 @@ class TiffStackSource(ScanSource):
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
             shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
-        self.not_used = stated(self.path, self._tif)
+        self.not_used, self.untyped = stated(self.path, self._tif), is_untyped(self._tif)
         self._stored, self.dtype, self._orientation = series.shape[-2:], np.dtype(series.dtype), orientation(self._tif)
         # Uncompressed stacks are one run of bytes: any frame, or some of its rows, is where arithmetic says.
         self._pages, self._offset = series.pages, series.dataoffset

@@ -13,7 +13,7 @@ import pytest
 from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.storage.readers.foreign_scans import (
     COLS,
     CONE,
@@ -28,8 +28,6 @@ from tests.beamline.storage.readers.foreign_scans import (
 )
 
 MATTERS: dict[str, tuple[Any, str | None]] = {  # values of a field that is not used, and that may change the volume
-    "detector/beam_center_x": (0.0, "pixel"),
-    "detector/beam_center_y": (9.0, None),
     "detector/magnification": (10.0, None),
     "detector/polar_angle": (3.0, "degree"),
     "detector/azimuthal_angle": (3.0, "degree"),
@@ -46,8 +44,6 @@ MATTERS: dict[str, tuple[Any, str | None]] = {  # values of a field that is not 
     "measurement/instrument/interferometer/number_of_grid_steps": (8, None),
 }
 HARMLESS: dict[str, Any] = {  # of those, values that change nothing
-    "detector/beam_center_x": 2.5,
-    "detector/beam_center_y": 1.5,
     "detector/magnification": 1.0,
     "sample/x_translation": np.r_[1, 2, [3.0] * VIEWS],  # the sample is moved out for flats
     "sample/y_translation": np.r_[1, 2, [3.0] * VIEWS],
@@ -93,6 +89,7 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
     "detector/distance": ([("detector/distance", 0.2, "m")], lambda s: s.attributes["distance_mm"], 200),
     "instrument/source/distance": (list(CONE), lambda s: s.cone, (10, 20)),
     "sample/rotation_angle": ([], lambda s: np.degrees(s.angles[-1]), 144),
+    "sample/depends_on": ([("sample/depends_on", "rotation_angle", None)], lambda s: np.degrees(s.angles[-1]), 144),
     **{
         where: ([(where, "said", None)], lambda s, name=name: s.attributes[name], "said")
         for where, name in (
@@ -261,3 +258,41 @@ def test_the_page_lists_every_field() -> None:
     for field in (*NXTOMO, *EXCHANGE):
         use = field.use if field.used else f"not used{', warned of' if field.matters else ''}: {field.use}"
         assert f"| `{field.where}` | {use} |\n" in page, field.where
+
+
+@pytest.mark.parametrize(
+    ("value", "units"), [(5.0, "pixels"), (5.0, None), (5e-6, "m"), (5e-3, "mm"), (5.0, "um"), (-2.0, "px")]
+)
+def test_a_central_ray_beside_the_middle_row_is_told_in_pixels(tmp_path: Path, value: float, units: str | None) -> None:
+    told = {
+        beam: validate(nxtomo(tmp_path / beam, *also, ("detector/beam_center_y", value, units)))
+        for beam, also in (("cone", CONE), ("parallel", ()))
+    }
+    (hit,) = [hit for hit in told["cone"] if hit.rule == "central-row"]
+    assert hit.severity == "warning" and f"--central-row {-2 if value < 0 else 5} " in hit.message
+    assert not [hit for hit in told["parallel"] if hit.rule == "central-row"]
+
+
+def test_a_central_ray_is_counted_as_frames_are_read(tmp_path: Path) -> None:
+    flipped = ("detector/y_flipped", True, None), ("detector/beam_center_y", 1.0, None)
+    path = nxtomo(tmp_path / "s.nx", *CONE, ("detector/beam_center_x", 4.0, "um"), *flipped)
+    assert opened(path).central == (ROWS - 2, pytest.approx(4))
+    with open_scan(SourceOptions(path, cols=(1, 6))) as source:
+        assert source.central == (ROWS - 2, pytest.approx(3))
+    with open_scan(SourceOptions(path, horizontal_axis=True)) as source:
+        assert source.central == (pytest.approx(COLS - 1 - 4), ROWS - 2)
+
+
+@pytest.mark.parametrize("side", "xy")
+@pytest.mark.parametrize("n", [VIEWS, VIEWS + 2])
+def test_pixel_sizes_that_differ_from_view_to_view(tmp_path: Path, side: str, n: int) -> None:
+    def said(spread: float) -> list[str]:
+        sizes = np.r_[[9.0] * (n - VIEWS), 6.5 * (1 + spread * np.linspace(-1, 1, VIEWS))]
+        path = nxtomo(tmp_path / "s.nx", (f"detector/{side}_pixel_size", sizes, "um"))
+        hits = [hit for hit in validate(path) if f"detector/{side}_pixel_size" in hit.message]
+        assert all(hit.severity == "warning" and "differs from view to view" in hit.message for hit in hits)
+        return [hit.message for hit in hits]
+
+    assert not said(0.1)  # 0.3 of a pixel at the edge of six columns
+    (message,) = said(0.2)
+    assert "by up to 0.6 px" in message

@@ -129,3 +129,67 @@ def test_another_scan_of_the_file_is_named(tmp_path: Path) -> None:
 def test_frames_in_another_order_of_axes_of_nxdata_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"rotation_angle"):
         open_scan(nxtomo(tmp_path / "s.nx", also=_axes))
+
+
+TURN = np.r_[0, 0, np.arange(5) * 36.0]
+
+
+def _chained(*steps: tuple[str, object, dict[str, Any]], first: str) -> Callable[[h5py.Group], None]:
+    """A sample without rotation_angle that depends on `first`; groups have a `value`."""
+
+    def add(entry: h5py.Group) -> None:
+        del entry["sample/rotation_angle"]
+        entry["sample/depends_on"] = first
+        for name, value, said in steps:
+            said = {"transformation_type": "rotation", "vector": (0.0, 1, 0), "units": "deg", "depends_on": "."} | said
+            entry[name] = value
+            (entry[name].parent if name.endswith("/value") else entry[name]).attrs.update(said)
+            entry[name].attrs["units"] = said["units"]
+
+    return add
+
+
+T = "sample/transformations"
+X: tuple[str, object, dict[str, Any]] = (f"{T}/x", TURN, {"transformation_type": "translation", "depends_on": "omega"})
+CHAINS: dict[str, tuple[Callable[[h5py.Group], None], int]] = {
+    "a path from the root": (_chained((f"{T}/omega", TURN, {}), first=f"/entry0000/{T}/omega"), 1),
+    "a path from the sample": (_chained((f"{T}/omega", TURN, {"vector": (0, 0, 1)}), first="transformations/omega"), 1),
+    "radians behind a move": (
+        _chained(X, (f"{T}/omega", np.radians(TURN), {"units": "rad"}), first=f"/entry0000/{T}/x"),
+        1,
+    ),
+    "the other sense": (_chained((f"{T}/omega", TURN, {"vector": (0, -1, 0)}), first=f"/entry0000/{T}/omega"), -1),
+    "a positioner": (_chained(("instrument/omega/value", TURN, {}), first="/entry0000/instrument/omega"), 1),
+    "a tilt that stands": (
+        _chained(
+            (f"{T}/omega", TURN, {"depends_on": "tilt"}), (f"{T}/tilt", np.ones(7), {}), first=f"/entry0000/{T}/omega"
+        ),
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+def test_the_rotation_that_a_sample_depends_on(tmp_path: Path, chain: str) -> None:
+    add, sense = CHAINS[chain]
+    path = nxtomo(tmp_path / "s.nx", also=add)
+    np.testing.assert_allclose(np.degrees(opened(path).angles), sense * TURN, atol=1e-12)
+    warned = [hit.message for hit in validate(path) if hit.rule == "angles"]
+    assert [f"--angles-path /entry0000/{T}/omega takes them" in message for message in warned] == [True] * (sense < 0)
+
+
+@pytest.mark.parametrize(
+    "add",
+    [
+        _chained((f"{T}/omega", TURN, {"depends_on": "phi"}), (f"{T}/phi", TURN, {}), first=f"/entry0000/{T}/omega"),
+        _chained((f"{T}/omega", TURN, {"depends_on": "omega"}), first=f"/entry0000/{T}/omega"),  # in a circle
+        _chained((f"{T}/omega", TURN, {}), first="."),
+        _chained((f"{T}/omega", TURN, {}), first="/nowhere"),
+    ],
+)
+def test_lists_that_may_be_angles_are_named(tmp_path: Path, add: Callable[[h5py.Group], None]) -> None:
+    path = nxtomo(tmp_path / "s.nx", also=add)
+    (error,) = [hit.message for hit in validate(path) if hit.severity == "error" and "no angle" in hit.message]
+    assert f"/entry0000/{T}/omega" in error and "may be the angles: --angles-path " in error
+    with open_scan(SourceOptions(path, angles_path=f"/entry0000/{T}/omega")) as source:
+        np.testing.assert_allclose(np.degrees(source.angles), TURN)
