@@ -202,7 +202,8 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
         names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
-        return StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
+        kind = "hdf5_stacks" if isinstance(file, h5py.File) else "arrays"
+        return StacksSource(path, file, stacks, format=kind, facts=facts)
 
 
 def open_arrays(path: Path) -> StacksSource:
