@@ -124,7 +124,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
 
     Raises:
-        ConfigError: a cone beam's pixel size is not known, or its distances cannot be; a central row of a parallel beam.
+        ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel beam.
     """
     rows = rows_of(source, selection)
     full = (rows.stop - rows.start, source.shape[1])

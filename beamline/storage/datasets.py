@@ -164,9 +164,9 @@ def piece_of(item: h5py.Dataset) -> int:
     return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
 
 
-def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
+def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
     """Bytes that HDF5 decompresses for one frame of a dataset of three dimensions; `frames` is the number of the frame
-    dimension (or of another one, of whose places one is read).
+    dimension (or of another one, of whose places one is read; None: of none).
     """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]

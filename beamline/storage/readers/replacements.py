@@ -19,7 +19,6 @@ from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
-from beamline.core.text import NUMBER
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
@@ -39,7 +38,7 @@ Angles = Path | str | ArrayLike
 """A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
 _ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # in the name of a column
 _UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # at its end
-_VALUE = re.compile(rf"[-+]?({NUMBER}|\d+,\d+|nan|inf)", re.IGNORECASE)
+_VALUE = re.compile(r"[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)  # what no name of a column begins with
 
 
 def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
@@ -94,7 +93,7 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
     bare = head.lstrip("# ")
     mark = next((mark for mark in (";", "\t", ",", None) if len(last.split(mark)) == len(bare.split(mark)) > 1), "\n")
     names = [cell.strip(' "') for cell in bare.split(mark)]
-    titled = not any(map(_VALUE.fullmatch, names)) and (len(names) > 1 or (head == bare and bool(_ANGLE.search(bare))))
+    titled = not any(map(_VALUE.match, names)) and (len(names) > 1 or (head == bare and bool(_ANGLE.search(bare))))
     if not (titled or wanted):
         return "\n".join(lines), "deg"
     chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]

@@ -220,10 +220,10 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
         names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
-        source = StacksSource(path, file, stacks, format="hdf5_stacks", facts=facts)
-        if "pixel_size_h" in views.attrs and isinstance(
-            config := datasets.resolve(views.parent.parent, "config"), h5py.Group
-        ):
+        stored = isinstance(file, h5py.File)
+        source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
+        config = datasets.resolve(views.parent.parent, "config") if stored and "pixel_size_h" in views.attrs else None
+        if isinstance(config, h5py.Group):
             _take_geometry(source, float(views.attrs["pixel_size_h"]), config)
         return source
 

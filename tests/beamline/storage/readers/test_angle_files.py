@@ -54,6 +54,7 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; say --angles-unit"),
         ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 holds '\(empty\)'"),
         ("0 deg\n2 deg", "", "line 1 holds '0 deg'"),
+        ("0.5°\n2.5°", "", "line 1 holds '0.5°'"),
     ],
 )
 def test_a_table_that_may_be_read_otherwise_is_refused(tmp_path: Path, text: str, column: str, message: str) -> None:
