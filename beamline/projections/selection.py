@@ -138,7 +138,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
         try:
             geometry = Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row)
         except ValueError as error:
-            raise ConfigError(f"{source.path}: {error}. Give the distances with --cone SOD:SDD.") from error
+            raise ConfigError(f"{source.path}: {error}. Give the right ones with --cone SOD:SDD.") from error
         return geometry.binned(selection.binning)
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
