@@ -141,7 +141,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
         try:
             geometry = Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row)
         except ValueError as error:
-            raise ConfigError(f"{source.path}: {error}. Give the distances with --cone SOD:SDD.") from error
+            raise ConfigError(f"{source.path}: {error}. Give the right ones with --cone SOD:SDD.") from error
         return geometry.binned(selection.binning)
     if selection.central_row is not None:
         raise ConfigError(

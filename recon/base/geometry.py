@@ -36,12 +36,12 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.arrays import F64, frozen
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.greys import fan, html
-from recon.base.placement import Where, checked_angles, placed_views
+from recon.base.placement import LONGEST, Where, checked_angles, placed_views
 from recon.base.ray_width import NO_WIDTH, RayWidth
 
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
-_LENGTHS = 1e-12, 1e9  # mm, from far below an atom to 1000 km: between them float32 holds what is computed
+_MAGNIFIED = 1e6  # far beyond any; a voxel stays in the range of float32
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 
 
@@ -82,13 +82,6 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        lengths = {"pixel_pitch": self.pixel_pitch, "a pixel at the axis": self.sample_pitch}
-        for name, length in {**lengths, **({"sod": self.sod, "sdd": self.sdd} if self.is_cone else {})}.items():
-            if not _LENGTHS[0] <= length <= _LENGTHS[1]:
-                raise ValueError(
-                    f"{name} is {length:.3g} mm; expected {_LENGTHS[0]:g} to {_LENGTHS[1]:g} mm"
-                    + (". A source farther away gives parallel rays: take a parallel beam" if name[:1] == "s" else "")
-                )
         if not self.centres.any():
             object.__setattr__(self, "centres", frozen(np.zeros((self.angles.size, 3))))
         elif not self.is_cone or self.width.arc:
@@ -142,8 +135,11 @@ class Geometry:
             ValueError: as `parallel`, and for distances that are not finite with 0 < sod <= sdd.
         """
         check_arguments(cls.cone, locals())
-        if not (math.isfinite(sod) and math.isfinite(sdd) and 0 < sod <= sdd):
-            raise ValueError(f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}")
+        if not 0 < sod <= sdd <= LONGEST or sdd > _MAGNIFIED * sod:
+            raise ValueError(
+                f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}; at most "
+                f"{LONGEST:g} mm, from where rays are parallel, and a magnification of {_MAGNIFIED:g}"
+            )
         return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=float(sod), sdd=float(sdd))
 
     @classmethod

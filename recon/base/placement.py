@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from recon.base.arrays import F64, frozen
 from recon.base.declared_types import check_arguments
 
+_SHORTEST, LONGEST = 1e-12, 1e9  # mm, from far below an atom to 1000 km: between them float32 holds what is computed
+
 
 class Where(TypedDict, total=False):
     """Position of the rotation axis on the detector, and pose of each view; as the attributes of a `Geometry`.
@@ -45,8 +47,8 @@ def placed_views(
     rows, cols = (operator.index(n) for n in detector_shape)
     if rows < 1 or cols < 1:
         raise ValueError(f"detector_shape must be (rows, cols) >= 1, got {(rows, cols)}")
-    if not (np.isfinite(pixel_pitch) and pixel_pitch > 0):
-        raise ValueError(f"pixel_pitch must be a positive length in mm, got {pixel_pitch}")
+    if not _SHORTEST <= pixel_pitch <= LONGEST:
+        raise ValueError(f"pixel_pitch must be a length of {_SHORTEST:g} to {LONGEST:g} mm, got {pixel_pitch}")
     col = (cols - 1) / 2 if axis_col is None else float(axis_col)
     row = (rows - 1) / 2 if axis_row is None else float(axis_row)
     for name, value in (("axis_col", col), ("axis_row", row)):

@@ -56,6 +56,7 @@ _PERCENT = click.FloatRange(min=0, max=100)
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
               help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "
               "always.")  # fmt: skip
+@click.option("--dark", is_flag=True, help="Particles are the darkest class, such as pores, not the densest.")
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Random seed of the clustering.")
 @click.option(
     "-o",
@@ -74,7 +75,8 @@ def segment(
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Segment the dense particles of VOLUME: a reconstruction, or any HDF5, TIFF, NumPy or NIfTI volume.
+    """Segment the dense particles of VOLUME, or its pores (--dark): a reconstruction, or any HDF5, TIFF, NumPy or
+    NIfTI volume.
 
     The grey values are rescaled between percentiles and smoothed, and parted by k-means. Particles are what is above
     half-way between the brightest cluster and the largest other one; opened, closed, filled, parted where they touch.
@@ -128,8 +130,8 @@ def summary(result: Segmented, options: SegmentOptions) -> str:
         "clusters": f"{result.clusters.centres.size}, threshold {result.clusters.threshold:.3f} of the range",
         "particles": f"{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
         "left out": result.outside
-        and f"{bodies} as bright outside the square {verb} no particle here; --crop none takes the whole volume, with "
-        "its wall",
+        and f"{bodies} as {'dark' if options.dark else 'bright'} outside the square {verb} no particle here; --crop "
+        "none takes the whole volume, with its wall",
         "diameter": sizes and f"{sizes} {unit} (equivalent, of whole particles)",
     }
     return "\n".join(f"{name:<12}{text}" for name, text in facts.items() if text)

@@ -60,6 +60,7 @@ class SegmentOptions:
         whole_if_cut: take the whole volume, too, where the square cuts half of the bodies or more.
         n_clusters: of grey values; None: by the elbow rule.
         neck: where touching particles are parted; 0: nowhere.
+        dark: particles are of the darkest class, such as pores.
     """
 
     volume: Path
@@ -75,6 +76,7 @@ class SegmentOptions:
     radius: int = 1
     smallest: int = 27
     neck: float = NECK
+    dark: bool = False
     seed: int = 0
     command: str = ""
 
@@ -101,6 +103,7 @@ class Segmented:
         volume_deviation: of each particle's volume; None where the file has no error bars.
         outside: bodies as bright as particles, and as large as the smallest, that lie outside the box; not the wall.
         margin: as of the options, None also where the whole volume was taken instead.
+        dark: as of the options.
     """
 
     box: Box
@@ -112,22 +115,20 @@ class Segmented:
     volume_deviation: NDArray[np.float64] | None = None
     outside: int = 0
     margin: float | None = None
+    dark: bool = False
 
     @property
     def verdict(self) -> str:
         """Whether the table is usable, and which option to give if it is not."""
         n, cut, k = self.particles.label.size, int(self.particles.cut.sum()), self.clusters.centres.size
-        other = "--clusters and --percentiles LOW HIGH take weaker matter"
+        other = "--clusters and --percentiles LOW HIGH take weaker matter" + ", --dark pores" * (not self.dark)
+        which = f"the {'darkest' if self.dark else 'densest'} of {k} classes"
         if n == 0:
-            return f"no, nothing of the densest of {k} classes is as large as --smallest: {other}"
+            return f"no, nothing of {which} is as large as --smallest: {other}"
         if 2 * cut > n:
             whole = "" if self.margin is None else "--crop none takes the whole volume, "
-            return (
-                f"no, {cut} of {count(n, 'particle')} of the densest of {k} classes are cut by a face: {whole}{other}"
-            )
-        return f"yes, {count(n - cut, 'whole particle')} of the densest of {k} classes" + (
-            f"; {other}" if n == 1 else ""
-        )
+            return f"no, {cut} of {count(n, 'particle')} of {which} are cut by a face: {whole}{other}"
+        return f"yes, {count(n - cut, 'whole particle')} of {which}" + (f"; {other}" if n == 1 else "")
 
 
 def segment(options: SegmentOptions) -> Segmented:
@@ -161,22 +162,23 @@ def segment(options: SegmentOptions) -> Segmented:
 def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     nz, ny, nx = volume.grid.shape
     box: Box = slice(0, nz), slice(0, ny), slice(0, nx)
-    whole, outside = volume.data, 0
+    whole, outside, sign = volume.data, 0, -1 if options.dark else 1
     if options.margin is not None:
         box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
         volume = Volume(np.ascontiguousarray(volume.data[box]), volume.grid.part(*box))
-    grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
+    data = sign * volume.data
+    grey = enhanced(data, options.percentiles, options.gamma, options.sigma)
     greys = clusters(grey, options.n_clusters, options.seed)
     labels = parted(cleaned(grey > greys.threshold, options.radius, options.smallest), options.neck)
     if options.margin is not None:
-        bright = whole > grey_at(volume.data, greys.threshold, options.percentiles, options.gamma)
+        bright = sign * whole > grey_at(data, greys.threshold, options.percentiles, options.gamma)
         outside = bodies_outside(cleaned(bright, options.radius, options.smallest), box)
     particles, bars = measured(labels, volume.grid.spacing, volume.grid.first), None
     deviation = _deviation(options, box)
     if deviation is not None and deviation.shape == volume.data.shape:
-        of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
+        of_grey = enhanced_deviation(data, deviation, options.percentiles, options.gamma)
         bars = volume_deviation(labels, grey, of_grey, greys.threshold) * np.prod(volume.grid.spacing)
-    return Segmented(box, volume, unit, labels, greys, particles, bars, outside, options.margin)
+    return Segmented(box, volume, unit, labels, greys, particles, bars, outside, options.margin, options.dark)
 
 
 def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
@@ -241,7 +243,8 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
         "percentile_low": low, "percentile_high": high, "gamma": options.gamma, "sigma": options.sigma,
         "clusters": found.clusters.centres.size, "threshold": found.clusters.threshold, "radius": options.radius,
         "smallest": options.smallest, "neck": options.neck, "seed": options.seed,
-        **found.particles.statistics(), "outside": found.outside, "unit": found.unit,
+        **({"dark": True} if found.dark else {}), **found.particles.statistics(),
+        "outside": found.outside, "unit": found.unit,
     }  # fmt: skip
 
 

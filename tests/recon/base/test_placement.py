@@ -34,8 +34,8 @@ def test_the_axis_is_in_the_middle_unless_told() -> None:
         ({"angles": [0.0, np.nan]}, "not finite"),
         ({"detector_shape": (0, 4)}, "detector_shape"),
         ({"pixel_pitch": -1.0}, "pixel_pitch"),
-        ({"pixel_pitch": 1e-300}, "pixel_pitch is 1e-300 mm; expected 1e-12 to"),
-        ({"pixel_pitch": 1e10}, "pixel_pitch is 1e\\+10 mm"),
+        ({"pixel_pitch": 1e-300}, "pixel_pitch must be a length of 1e-12 to"),
+        ({"pixel_pitch": 1e10}, "1e\\+09 mm, got 1"),
         ({"axis_col": np.inf}, "axis_col"),
     ],
 )
@@ -46,9 +46,9 @@ def test_impossible_geometries_are_refused(arguments: dict[str, object], message
 
 def test_distances_that_float32_does_not_hold_are_refused() -> None:
     """FDK from 1e20 mm gave zeros; the farthest that is taken gives what a parallel beam does."""
-    with pytest.raises(ValueError, match=r"sod is 1e\+20 mm; .* parallel beam"):
+    with pytest.raises(ValueError, match=r"got 1e\+20 and 1e\+20; at most 1e\+09 mm"):
         Geometry.cone([0.0], (4, 4), 1.0, 1e20, 1e20)
-    with pytest.raises(ValueError, match="a pixel at the axis is 1e-18 mm"):
+    with pytest.raises(ValueError, match="magnification of 1e"):
         Geometry.cone([0.0], (4, 4), 1.0, 1e-9, 1e9)
     angles, sinogram = np.linspace(0, 2 * np.pi, 40, endpoint=False), np.zeros((40, 4, 16), np.float32)
     sinogram[:, :, 5:11] = 1

@@ -115,6 +115,21 @@ def test_lengths_are_voxels_where_nobody_knows_them(here: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_pores_are_the_particles_of_the_negative(here: Path) -> None:
+    np.save(here / "can.npy", can())
+    np.save(here / "pores.npy", -can())
+    assert beamline("segment", "can.npy", "--crop", "none", "-o", "a.h5").exit_code == 0
+    assert "of the darkest of" in beamline("segment", "pores.npy", "--crop", "none", "-o", "b.h5", "--dark").stdout
+    assert _rows(here / "a.csv") == _rows(here / "b.csv")
+    with h5py.File(here / "b.h5") as file:
+        assert file["entry/process/dark"][()]
+    body = np.ones((24, 24, 24), np.float32)
+    body[8:16, 8:16, 8:16] = 0
+    np.save(here / "body.npy", body)
+    assert "--dark pores" in beamline("segment", "body.npy", "--crop", "none").stdout
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_touching_balls_are_one_without_a_neck(here: Path) -> None:
     np.save(here / "can.npy", can())
     result = beamline("segment", "can.npy", *MARGIN, "--neck", "0")
