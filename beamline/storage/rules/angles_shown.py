@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -18,8 +17,7 @@ from recon.prep.align import mirror_mismatch
 
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
-# Of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses; minutes; thousandths of rad.
-_FACTORS = 1 / 0.9, 2.0, 0.5, 60.0, 1000 * math.pi / 180
+_FACTORS = 2.0, 0.5  # of degrees in what is stated: twice or half the turn, by a gear or its pulses
 PAIRS = 6  # of views that are stated half a turn apart, which are compared
 UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
@@ -27,7 +25,6 @@ _AROUND = 9  # views about the best of some that are looked at
 _LEAST_LIGHT = 1e-3  # of the beam
 _FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
-_BESIDE, _RETRACED = 3, 1.5  # pairs about such frames; times a step: symmetric samples 0.1 to 1.2, two sides 1.75 to 3
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
 _MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
 _STANDS, _TURNED = 3, 2.0  # frames of one angle; times as different from the first: 1 at rest, 4 after two steps
@@ -243,8 +240,6 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
         unit = "they are 0, 1, 2 and so on, and count the views"
-    elif known == [_FACTORS[0]]:
-        unit = f"they look like gradians: {half} is {whole / 0.9:g}"
     else:
         unit = f"they look {whole / turn.degrees:.3g} times as large as stated"
     pairs = (
@@ -284,39 +279,6 @@ def angles_in_order(seen: CoarseViews) -> Iterator[Finding]:
         yield _in_another_order(seen, jumps, far[0], near[0])
     elif (elsewhere := _alike_elsewhere(seen, rows[order])) is not None:
         yield elsewhere
-    elif seen.source.cone is None and (pair := _mirrored_neighbours(seen, rows[order])) is not None:
-        yield Finding(
-            "warning",
-            ORDER,
-            f"{_stated(seen, pair)} are mirror images, as views half a turn apart are. Unless the sample moved, "
-            "the angles were taken modulo 180 degrees, or frames lie in another order than their angles. Give one for "
-            "each projection, in their order, with --angles FILE.",
-        )
-
-
-def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> Pair | None:
-    """Two frames that are stated side by side and look half a turn apart; None where none are. Rows by their angles.
-
-    A sample that is symmetric looks alike both ways, and one that moved looks unlike both ways. One with a plane of
-    symmetry retraces its views beyond it, mirrored, which frames of two sides do not.
-    """
-    some = _some_lit(seen, rows)
-    if some.size <= PAIRS:
-        return None
-    pairs = list(zip(some[:-1].tolist(), some[1:].tolist(), strict=True))
-    apart = np.diff(seen.degrees[some] % 360)
-    allowed = np.maximum(apart / np.median(apart[apart > 0]), 1) ** 2  # views differ by the square of a small turn
-    unlike = np.array([seen.unlike(pair) for pair in pairs])
-    rate = np.pad(unlike / allowed, 2, mode="edge")
-    near = np.median(np.lib.stride_tricks.sliding_window_view(rate, 5), axis=1)  # some directions change faster
-    usual = np.maximum(near, np.median(rate))
-    for at in np.flatnonzero(unlike > UNLIKE * usual * allowed)[:PAIRS].tolist():
-        around = list(zip(some[at::-1].tolist(), some[at + 1 :].tolist(), strict=False))[:_BESIDE]
-        mirrored = [seen.unlike(pair, mirrored=True) for pair in around]
-        retraced = len(around) == _BESIDE and np.mean(mirrored) < _RETRACED * usual[at]
-        if not retraced and mirrored[0] < min(2 * usual[at] * allowed[at], unlike[at] / UNLIKE):
-            return pairs[at]
-    return None
 
 
 def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | None:
