@@ -212,7 +212,7 @@ class PassLaws:
         if not rows.size or correction is None:
             self._no_law(ends.size, 0, "none of the views can be used")
             return
-        views_at_ends = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
+        views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
             open_beam = correction.open_beam(_NOISE_FLATS)

@@ -69,9 +69,11 @@ class Decider:
     def add_law(self, law: LawMeasured) -> None:
         """Take a law from the live reconstruction; any thread."""
         self._law = law
-        if law.gained is not None:
-            option = self._chosen.get(law.number - 1, {})
-            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, "judged": law.number - 1}
+        option = self._chosen.get(law.number - 1, {})
+        if law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
+            spread = law.gained * ErrorLaw(law.n_views, law.exponent, law.exponent_error, law.noise).half_range
+            ends = {"gained_low": law.gained - spread, "gained_high": law.gained + spread}
+            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, **ends, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not on offer becomes a warning."""
@@ -100,17 +102,18 @@ class Decider:
                 or f"no prediction within {self.wait:g} s"
             )
         asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
-        pass_ended = self.number, passes.n_frames // self.timeline.plan.frames_per_view
+        pass_ended, done = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
         rows = [  # an event has None for NaN
             {name: None if value != value else value for name, value in vars(option).items()} for option in offered
         ]
-        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark))
+        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark, done))
         if asks:
             by, choice, reason = self._ask(choice, offered)
             if self.stop.stopping:
                 return Choice.NEXT
         self._chosen[self.number] = {row["choice"]: row for row in rows}.get(choice, {})
-        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome)
+        dropped = passes.n_planned - passes.after(choice).n_planned
+        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome, passes=done, dropped=dropped)
         self._outcome = {}
         self.sink(event)
         self.record({"predicted": None, "gained": None} | event.data)

@@ -140,7 +140,12 @@ class Recorder:
 
     def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass: the values of its event, if the scan decides."""
-        self._enqueue(lambda: self._writer.add_decision(values))
+
+        def add() -> None:
+            self._writer.add_decision(values)
+            self._progress.expect_fewer(self.n_frames, int(str(values.get("dropped", 0))))
+
+        self._enqueue(add)
 
     def finish(self) -> None:
         """Wait until all queued frames are written; no frame may be put afterwards."""

@@ -39,6 +39,11 @@ class ErrorLaw:
     noise: float
     offset: float = 0.0
 
+    @property
+    def half_range(self) -> float:
+        """Half the range of a gain, as a part of it, at most 1."""
+        return min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
+
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
         """dB by so many views at new angles, at the same angles again, and by wide views."""
 
@@ -49,5 +54,4 @@ class ErrorLaw:
             error_ratio = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
             return -10 * math.log10(error_ratio) or 0.0  # never -0.0
 
-        half_range = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
-        return Gain(decibels(1.0), decibels(1 - half_range), decibels(1 + half_range))
+        return Gain(decibels(1.0), decibels(1 - self.half_range), decibels(1 + self.half_range))

@@ -56,7 +56,8 @@ def measured_law(
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
         geometry: of these views: parallel beam, straight.
-        views_at_ends: numbers of views at the ends of passes so far, the last of all.
+        views_at_ends: numbers of views at the ends of passes so far, the last of all. Where the last two are alike,
+            none came in between, and what came there was not measured.
         open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
             binned as the views.
 
@@ -93,7 +94,7 @@ def measured_law(
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0
     law = ErrorLaw(n, exponent, _EXPONENT_ERROR * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    if not fall_ratio or len(views_at_ends) < 2 or min(errors) <= 0:
+    if not fall_ratio or min(errors) <= 0 or (n, *views_at_ends)[-2] == n:
         return law, None
     fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])  # of the scan, from half to most views
     return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])
