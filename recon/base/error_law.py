@@ -20,6 +20,11 @@ class Gain:
     low: float
     high: float
 
+    @property
+    def at_most(self) -> float:
+        """What to count on before it is forgone: the mean, or the high end where no law is known to half of it."""
+        return self.mean if self.high <= 1.5 * self.mean * (1 + 1e-9) else self.high
+
 
 @dataclass(frozen=True)
 class ErrorLaw:
@@ -29,7 +34,7 @@ class ErrorLaw:
         n_views: of the volume.
         exponent: of the fall of the mean square error with the number of views.
         exponent_error: the exponent is taken to lie within twice this, and both shares within the same part of
-            themselves, which gives the range of a gain. A convention of `recon.voxels.measured_law`, not measured.
+            themselves, which gives the range of a gain. See `recon.voxels.measured_law`.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
