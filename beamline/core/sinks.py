@@ -258,6 +258,10 @@ class Warnings:
             self.messages.append(text)
             self._sink(event_of_sentence(text, self._clock.now()))
 
+    def withdraw(self, beginning: str) -> None:
+        """Take back, of the report, what begins so: it does not hold any more."""
+        self.messages = [text for text in self.messages if not text.startswith(beginning)]
+
 
 _PATIENCE = 10.0  # s
 

@@ -36,6 +36,7 @@ class Decider:
         began: time of the first frame; inf: none came yet, where a scan that goes on chooses first.
         added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of the references
             that follow the views.
+        retaken: views that earlier parts of the run took again.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
         why_no_law: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
@@ -54,6 +55,7 @@ class Decider:
     sink: Sink
     began: float = math.inf
     added_seconds: float = 0.0
+    retaken: int = 0
     number: int = 0
     why_no_law: Callable[[], str] = lambda: ""
     wait_a_moment: Callable[[], bool] = lambda: False
@@ -158,7 +160,7 @@ class Decider:
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
         seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.wide))
-        return seconds, (passes.n_frames + retaken + wide) * frame_dose(self.timeline)
+        return seconds, (passes.n_frames + self.retaken + retaken + wide) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait until this is so, but `wait` s at most, and not beyond a stop."""
