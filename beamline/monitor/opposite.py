@@ -149,12 +149,15 @@ class OppositeCheck(Logged):
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
-        is smoothed so is at most √1.5 / SMOOTH of the first one.
+        is smoothed so is at most √1.5 / SMOOTH of the first one. Where the sample moved between them, by more than the
+        rim turns, there is no velocity.
         """
         fit, smooth = lay_on(one, 0.0, after, grid, mirrored=False), SMOOTH * grid.cell
         errors = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth  # of the line, over the square of the step's
+        rim = 0.5 * grid.shape[1] * grid.cell * abs(_folded(after.angle - one.view.angle))
         return min(abs(steps), abs(steps - 1)) < BESIDE - 1 or (
             fit is not None
+            and max(abs(fit.down), abs(fit.across) - rim) <= max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
             and fit.remainder <= smooth
             and errors * fit.remainder**2 <= max(self.changed, CELLS[1] * grid.cell)
         )

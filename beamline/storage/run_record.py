@@ -35,8 +35,8 @@ class RunRecord:
         sample: its name.
         frames: in its file, or where `joined` in the file that joins the parts so far; None: not known.
         planned: frames that it is to have; None: not known.
-        ended: who ended it before its plan, and why; "" if nobody did.
         flags: frames that the monitor flagged: their number by check, then by level; empty before its file is closed.
+        ended: who ended it before its plan by a choice, and why; "" if nobody did.
         time: when this was written, s since the Unix epoch.
     """
 
@@ -46,8 +46,8 @@ class RunRecord:
     frames: int | None = 0
     joined: bool = False
     planned: int | None = None
-    ended: str = ""
     flags: FlagCounts = field(default_factory=dict)
+    ended: str = ""
     time: float = field(default=0.0, compare=False)
 
 

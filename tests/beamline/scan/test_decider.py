@@ -153,6 +153,21 @@ def test_wide_views_count_as_taken_as_they_come_in_any_case() -> None:
             assert Scan(tried, wide=5).after(1, law(12)) is choice
 
 
+def test_what_wide_views_or_retakes_brought_is_not_measured_and_a_pass_has_a_range() -> None:
+    scan = Scan(Wish(0.01), asks=True, wide=5)
+    for choice, measured in ((Choice.WIDE, False), (Choice.RETAKE, False), (Choice.NEXT, True)):
+        scan.moments = [partial(scan.decide.add_law, law(12)), lambda: None]
+        scan.moments += [partial(scan.decide.answer, choice)]
+        assert scan.after(1, retakes=2) is choice and scan.chosen["passes"] == 1
+        scan.decide.add_law(law(24, gained=0.5))
+        assert scan.decide._outcome.get("gained") == (0.5 if measured else None)
+    assert (scan.decide._outcome["gained_low"], scan.decide._outcome["gained_high"]) == pytest.approx((0.4, 0.6))
+
+
+def test_retakes_of_earlier_parts_count_in_the_dose() -> None:
+    assert Scan(Wish(dose=0.75), retaken=2).after(2, law(24)) is Choice.ENOUGH
+
+
 @pytest.mark.parametrize(("retaken", "choice"), [(0, Choice.NEXT), (2, Choice.ENOUGH)])
 def test_the_dose_of_a_wish_counts_retakes_that_were_chosen(retaken: int, choice: Choice) -> None:
     scan = Scan(Wish(dose=0.75), asks=bool(retaken))
