@@ -134,11 +134,11 @@ def _doubt_optics(config: Config) -> str:
             f"optics.pixel_size_um is {optics.pixel_size_um:g} um, the camera's pixels are {own:g} um: the field would "
             f"be {2 * half:.4g} mm wide. It is the size of an unbinned pixel at the sample; is it in nm?"
         )
-    if optics.distance_mm is None or not 0 < optics.distance_mm < half:
-        return ""
     return (
         f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of "
         f"{2 * half:.4g} mm: a sample that fills it could not turn there. Is it in m?"
+        if optics.distance_mm and optics.distance_mm < half
+        else ""
     )
 
 

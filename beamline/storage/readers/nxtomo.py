@@ -107,9 +107,8 @@ class OwnScan(NexusSource):
     @guarded
     def ending(self) -> ScanEnding:
         ending = ending_in(self._file)
-        if ending.status == RUNNING:
-            return replace(ending, missing=gaps_in(self.path, self._file))
-        return replace(ending, reason=ending.reason or ended_by(self.decisions))
+        own = {"reason": ending.reason or ended_by(self.decisions)}
+        return replace(ending, **({"missing": gaps_in(self.path, self._file)} if ending.status == RUNNING else own))
 
     @property
     @guarded
