@@ -19,7 +19,7 @@ from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL
 from drivers.base.frame import FrameKind
-from recon.base.error_law import ErrorLaw
+from recon.base.error_law import BELOW, ErrorLaw
 
 _NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="none came yet")
 
@@ -73,8 +73,7 @@ class Decider:
         self._law = law
         option = self._chosen.get(law.number - 1, {})
         if law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
-            spread = law.gained * ErrorLaw(law.n_views, law.exponent, law.exponent_error, law.noise).half_range
-            ends = {"gained_low": law.gained - spread, "gained_high": law.gained + spread}
+            ends = {"gained_low": (1 - BELOW) * law.gained, "gained_high": (1 + BELOW) * law.gained}
             self._outcome = {"predicted": option.get("gain"), "gained": law.gained, **ends, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:

@@ -126,7 +126,8 @@ def test_the_rest_is_all_that_the_plan_still_has() -> None:
     [
         (1, Wish(1.0), 0.1, True),  # after the next one the rest of 24 still adds 2.4 dB at least
         (1, Wish(2.5), 0.1, False),
-        (1, Wish(1.0), 0.4, False),
+        (1, Wish(1.0), 0.4, True),  # 1.5 dB at least: no law is taken to err by more below
+        (1, Wish(1.6), 0.4, False),
         (2, Wish(1.0), 0.1, False),
         (1, Wish(4.0), 0.0, False),  # it is chosen, but then met
         (1, Wish(7.0), 0.0, False),  # met already

@@ -97,7 +97,7 @@ def test_it_waits_for_the_law_of_these_views_and_says_what_it_chose() -> None:
 
 
 def test_what_came_of_a_prediction_stands_beside_it() -> None:
-    scan = Scan(Wish(0.01))
+    scan = Scan(Wish(1.6))  # which it waits for a law to tell
     scan.after(1, law(12, error=0.5))
     predicted = scan.chosen["options"][0]["gain"]
     scan.after(2, law(24, error=0.5, gained=2.5))
@@ -161,7 +161,7 @@ def test_what_wide_views_or_retakes_brought_is_not_measured_and_a_pass_has_a_ran
         assert scan.after(1, retakes=2) is choice and scan.chosen["passes"] == 1
         scan.decide.add_law(law(24, gained=0.5))
         assert scan.decide._outcome.get("gained") == (0.5 if measured else None)
-    assert (scan.decide._outcome["gained_low"], scan.decide._outcome["gained_high"]) == pytest.approx((0.4, 0.6))
+    assert (scan.decide._outcome["gained_low"], scan.decide._outcome["gained_high"]) == pytest.approx((0.25, 0.75))
 
 
 def test_retakes_of_earlier_parts_count_in_the_dose() -> None:
