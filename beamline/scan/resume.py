@@ -199,9 +199,8 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
-                kinds, replaces = file[layout.KIND][()], file[layout.REPLACES][()]
-                again = kinds[replaces[(replaces >= 0) & (kinds == FrameKind.PROJECTION)]]
-                retaken += int((again != FrameKind.INVALID).sum())
+                views = file[layout.TRIGGER][()][file[layout.KIND][()] == FrameKind.PROJECTION]
+                retaken += int((views >= planned).sum())  # their triggers count on from those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
