@@ -74,13 +74,10 @@ def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
     """
     last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
     after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
-    reason = "" if by == "operator" else f": {why}".rstrip(".")  # the operator's is that they chose it
+    chosen = f" of the {by}" if by else ""
+    chosen += f": {why}".rstrip(".") if why and by != "operator" else ""  # whose reason is that they chose it
     rest = f" {left} planned frames were not taken." if left else ""
-    return (
-        f"Ended after pass {after or last.get('number')} by the choice `enough` of the {by}{reason}.{rest}"
-        if last
-        else ""
-    )
+    return f"Ended after pass {after or last.get('number')} by the choice `enough`{chosen}.{rest}" if last else ""
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:

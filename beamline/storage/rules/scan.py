@@ -32,8 +32,8 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
     elif ending.status in ("stopped", "failed"):
         planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
-        before = ended_by(source.decisions)
-        sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason} {before}".strip()
+        of_plan += "; it had decided against the others" if ended_by(source.decisions) else ""
+        sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         if ending.reason:
             yield Finding("info", "ended", ending.reason)
