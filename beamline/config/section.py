@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, fields
 from enum import StrEnum
@@ -23,6 +24,15 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
         return text
 
     return AfterValidator(checked)
+
+
+def port_problem(port: str) -> str:
+    """What is wrong with a port; "" if it may be one. Names of ports, not URLs, have a colon only within a path."""
+    wrong = re.match(r"[a-z]\w*:(?!//)|socket://(?!.+:\d+)", port, re.IGNORECASE)
+    return f"{port} is no port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
+
+
+Port = Annotated[str, Field(min_length=1), without(port_problem)]
 
 
 class Section(BaseModel):

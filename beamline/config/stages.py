@@ -11,12 +11,12 @@ import re
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
+from typing import TYPE_CHECKING, Literal, Self, Union
 from zlib import crc32
 
 from pydantic import Field, model_validator
 
-from beamline.config.section import Section, declared, read_from, section_of
+from beamline.config.section import Port, Section, declared, read_from, section_of
 from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
@@ -50,7 +50,7 @@ class StageSection(Section):
     """Keys that all stages share. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
 
     kind: str
-    port: Annotated[str, Field(min_length=1)] = Field(
+    port: Port = Field(
         description="Where its controller is; sim:// and the kind is its simulated counterpart, which takes all "
         "else from here."
     )

@@ -186,12 +186,13 @@ class PassEnded(Event, event="pass_ended"):
     """A pass of views is over. What is next is being chosen, or the operator is asked.
 
     Attributes:
-        number: of the pass, from 1; n_views: so far.
+        number: of this event, from 1: after a pass, wide views or retakes; n_views: so far.
         options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
             dose (share of the plan's), bytes, and gain, low, high in dB (None: not known).
         recommended: the choice that the program takes or would take.
         wait: real s for which the operator is asked; 0: nobody is.
         remark: a sentence on why no gain is known; "" where they are.
+        passes: that are over; wide views and retakes are none.
     """
 
     number: int
@@ -200,19 +201,21 @@ class PassEnded(Event, event="pass_ended"):
     recommended: str
     wait: float = 0.0
     remark: str = ""
+    passes: int = 0
 
 
 class NextChosen(Event, event="next_chosen"):
     """What is measured after a pass.
 
     Attributes:
-        number: of the pass that ended, from 1; n_views: so far.
+        number: of the decision, from 1; n_views: so far; passes: as of `PassEnded`.
         choice: a `beamline.plan.passes.Choice`; by: program, operator, or plan (nobody chose: the plan goes on).
         reason: a sentence.
         options: as of `PassEnded`.
-        predicted, gained: dB by an earlier choice, as predicted then and as measured now: the newest choice that a law
-            has judged since the event before; None: not known.
-        judged: number of the pass after which that earlier choice was made.
+        predicted, gained: dB by an earlier choice, as predicted then and as measured now, with the ends of its range:
+            the newest choice that a law has judged since the event before; None: not known.
+        judged: number of the decision for that earlier choice.
+        dropped: frames of views by which the scan is shorter after this choice.
     """
 
     number: int
@@ -223,7 +226,11 @@ class NextChosen(Event, event="next_chosen"):
     options: Sequence[Mapping[str, Any]]
     predicted: float | None = None
     gained: float | None = None
+    gained_low: float | None = None
+    gained_high: float | None = None
     judged: int | None = None
+    passes: int = 0
+    dropped: int = 0
 
 
 class Counted(Event, event="progress"):

@@ -152,7 +152,8 @@ def _trial(trial: TrialDone) -> str:
 
 def _table_of_options(ended: PassEnded) -> Iterator[str]:
     """Lines of at most 80 characters: what can be measured next, side by side, and how the operator answers."""
-    yield f"Pass {ended.number} is over, {count(ended.n_views, 'view')} so far. What can be measured next:"
+    number = ended.passes or ended.number  # of earlier versions
+    yield f"Pass {number} is over, {count(ended.n_views, 'view')} so far. What can be measured next:"
     yield f"  {'choice':<7}{'gain, dB':<22}{'dB/min':>8}{'s':>9}{'dose':>9}{'data':>10}"
     for option in ended.options:
         mark, choice = "> " if option["choice"] == ended.recommended else "  ", one_line(str(option["choice"]))
@@ -178,11 +179,12 @@ _BY = {"program": "chosen by the program: ", "plan": "as planned: "}  # the oper
 
 
 def _decision(chosen: NextChosen) -> str:
-    decision = f"After pass {chosen.number}: {chosen.choice}, {_BY.get(chosen.by, '')}{chosen.reason}"
+    decision = f"After pass {chosen.passes or chosen.number}: {chosen.choice}, {_BY.get(chosen.by, '')}{chosen.reason}"
     if chosen.gained is None:
         return decision
     predicted = "" if chosen.predicted is None else f"predicted {chosen.predicted:+.2f} dB, "
-    return f"{decision.rstrip('.')}. The choice after pass {chosen.judged}: {predicted}measured {chosen.gained:+.2f} dB"
+    ends = "" if None in (low := chosen.gained_low, high := chosen.gained_high) else f" ({low:.2f} to {high:.2f})"
+    return f"{decision.rstrip('.')}. An earlier choice: {predicted}measured {chosen.gained:+.2f} dB{ends}"
 
 
 def _missing(block: BlockDone) -> str | None:
@@ -255,6 +257,10 @@ class Warnings:
         if text not in self.messages:
             self.messages.append(text)
             self._sink(event_of_sentence(text, self._clock.now()))
+
+    def withdraw(self, beginning: str) -> None:
+        """Take back, of the report, what begins so: it does not hold any more."""
+        self.messages = [text for text in self.messages if not text.startswith(beginning)]
 
 
 _PATIENCE = 10.0  # s

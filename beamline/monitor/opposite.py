@@ -45,7 +45,7 @@ class Kept:
     """A view that is kept until the one half a turn later arrives."""
 
     view: CellView
-    after: CellView | None = None  # the next one, which gives the velocity
+    after: CellView | None = None  # the next one, later the nearest in angle so far, which gives the velocity
     # turned, again: it was compared with the view from the other side, and with a repetition
     turned: bool = False
     again: bool = False
@@ -117,20 +117,25 @@ class OppositeCheck(Logged):
             late = one.after is not None and view.index - one.view.index >= LATER
             if late and (looked := self._compared(state, at, view, context)) is not None:
                 return looked
-        return Look(state)
+        return Look(replace(state, kept=tuple(_with_nearer(one, view) for one in kept)))
 
     def _compared(
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
     ) -> Look[OppositeState] | None:
-        """The view against one that was kept; None where they are neither opposite nor at one angle."""
+        """The view against one that was kept; None where they are neither opposite nor at one angle, or where the step
+        that gives its velocity is too far: then the pair waits for views that are nearer."""
         one, grid = state.kept[at], context.grid
         assert one.after is not None and grid is not None
         turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
         beside, other = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1])), math.copysign(math.pi, turn)
-        if not one.turned and abs(turn - other) <= beside:
+        if (
+            not one.turned
+            and abs(turn - other) <= beside
+            and self._goes_on(one, one.after, (turn - other) / step, grid)
+        ):
             kept = (*state.kept[:at], replace(one, turned=True), *state.kept[at + 1 :])
             return self._mirrored(replace(state, kept=kept), one, (turn - other) / step, view, context)
-        if not one.again and abs(turn) <= beside:
+        if not one.again and abs(turn) <= beside and self._goes_on(one, one.after, turn / step, grid):
             kept = (*state.kept[:at], replace(one, again=True), *state.kept[at + 1 :])
             fit = lay_on(one, turn / step, view, grid, mirrored=False)
             again = f"frame {one.view.index}, taken again"
@@ -138,6 +143,24 @@ class OppositeCheck(Logged):
                 replace(state, kept=kept), None if fit is None else self._moved(fit, view.index, again, context)
             )
         return None
+
+    def _goes_on(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> bool:
+        """Whether a kept view with its velocity predicts one some steps later, to within the limit of a change.
+
+        A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
+        differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
+        is smoothed so is at most √1.5 / SMOOTH of the first one. Where the sample moved between them, by more than the
+        rim turns, there is no velocity.
+        """
+        fit, smooth = lay_on(one, 0.0, after, grid, mirrored=False), SMOOTH * grid.cell
+        errors = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth  # of the line, over the square of the step's
+        rim = 0.5 * grid.shape[1] * grid.cell * abs(_folded(after.angle - one.view.angle))
+        return min(abs(steps), abs(steps - 1)) < BESIDE - 1 or (
+            fit is not None
+            and max(abs(fit.down), abs(fit.across) - rim) <= max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
+            and fit.remainder <= smooth
+            and errors * fit.remainder**2 <= max(self.changed, CELLS[1] * grid.cell)
+        )
 
     def _mirrored(
         self, state: OppositeState, one: Kept, steps: float, view: CellView, context: ScanContext
@@ -193,6 +216,12 @@ def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows
         return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]
     apart = all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept)
     return (*kept, Kept(view)) if len(kept) < MOST and apart else kept
+
+
+def _with_nearer(one: Kept, view: CellView) -> Kept:
+    """The kept view with this one in place of the view after it, if there is one and this is nearer in angle."""
+    before, away = (0.0 if each is None else abs(_folded(each.angle - one.view.angle)) for each in (one.after, view))
+    return replace(one, after=view) if (BESIDE - 1) * before < away < before else one
 
 
 def _folded(angle: float) -> float:

@@ -154,6 +154,7 @@ class StampedValues:
         before, stored, status = self.values, int(seen["frames"]), str(seen["status"])
         frame = Stamp(now if seen["newest"] is None else float(seen["newest"]))
         taken: dict[str, Any] = {"stored": stored, "angle": angle, "free": seen["free"] / 1e9, "age": seen["age_s"]}
+        taken["exposed"] = max(before.exposed, stored)  # not every frame has an event
         taken["percent"] = 100.0 * stored / before.planned if before.planned > 0 else before.percent
         taken["skipped"] = seen.get("skipped_lines", 0)
         stamps = {**self.stamps, **dict.fromkeys(_OF_FILE, frame), "free": Stamp(now), "age": Stamp(now)}
@@ -297,7 +298,7 @@ def _pass(before: RunValues, event: Event) -> dict[str, Any]:
         return tuple(factor * _number(option[name]) for option in event["options"])
 
     return {
-        "pass_number": int(event["number"]), "wait": _number(event.get("wait", 0.0)),
+        "pass_number": int(event.get("passes", event["number"])), "wait": _number(event.get("wait", 0.0)),
         "options": tuple(one_line(str(option["choice"])) for option in event["options"]),
         "option_gains": of_options("gain"), "option_lows": of_options("low"), "option_highs": of_options("high"),
         "option_times": of_options("seconds"), "option_doses": of_options("dose", 100.0),

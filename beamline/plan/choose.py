@@ -94,7 +94,7 @@ def choose(
         remaining: by all that the plan still has, as of `remaining_gain`.
         seconds, dose: that the scan has taken, with what follows the passes in any case: wide views, references.
     """
-    if wish.quality_db is not None and remaining.mean <= wish.quality_db:
+    if wish.quality_db is not None and remaining.at_most <= wish.quality_db:
         return Choice.ENOUGH, (
             f"all that the plan still has would add {remaining.mean:.2f} dB ({remaining.low:.2f} to "
             f"{remaining.high:.2f}); {wish.quality_db:g} dB less is accepted"

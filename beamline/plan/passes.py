@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import accumulate, pairwise
+from typing import Any
 
 from beamline.plan.plan import Block
 
@@ -42,6 +43,11 @@ class Passes:
         return sum(block.n_to_take for block in self.done)
 
     @property
+    def n_planned(self) -> int:
+        """Frames of views so far and to come, without retakes."""
+        return self.n_frames + sum(block.n_to_take for block in self.to_come)
+
+    @property
     def may_repeat(self) -> bool:
         """Whether the last pass can be taken again: a pass is still to come, with at least as many views."""
         return bool(self.to_come) and self.done[-1].n_to_take <= self.to_come[-1].n_to_take
@@ -58,6 +64,20 @@ class Passes:
             case Choice.ENOUGH:
                 return replace(self, to_come=())
         return self  # retakes are of no pass
+
+
+def ended_by(decisions: Iterable[Mapping[str, Any]]) -> str:
+    """A sentence on who ended a scan before its plan, and why; "" if nobody did.
+
+    Args:
+        decisions: values of the events `next_chosen`, oldest first.
+    """
+    last = next((each for each in decisions if each.get("choice") == Choice.ENOUGH), {})
+    after, by, why, left = (last.get(name) for name in ("passes", "by", "reason", "dropped"))
+    chosen = f" of the {by}" if by else ""
+    chosen += f": {why}".rstrip(".") if why and by != "operator" else ""  # whose reason is that they chose it
+    rest = f" {left} planned frames were not taken." if left else ""
+    return f"Ended after pass {after or last.get('number')} by the choice `enough`{chosen}.{rest}" if last else ""
 
 
 def triggers_to_take(*blocks: Block) -> frozenset[int]:

@@ -319,7 +319,6 @@ def describe(
     ]
     lines += ["", *(f"{name:<10}{text}" for name, text in facts)]
     lines += [f"{'remark':<10}{text}" for text in timeline.remarks]
-    lines += [f"{'VIOLATION':<10}{text}" for text in timeline.violations]
     return lines
 
 

@@ -18,6 +18,7 @@ from beamline.projections.selection import Selection, pixel_size
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.light import without_air
+from drivers.base.frame import FrameKind
 from recon.base.masks import areas
 from recon.prep.correct import Projections
 from recon.voxels.direct import has_direct_method
@@ -69,7 +70,8 @@ def warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepar
         if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
             light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        warn(f"{cut_sentence(sides, continued, not geometry.ordinary.all())} {light}".rstrip())
+        wide = not geometry.ordinary.all() or bool((source.image_key == FrameKind.WIDE_VIEW).any())
+        warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(source, selection)):
             warn(change)
     elif ranges := edges.passing():
@@ -78,7 +80,7 @@ def warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepar
 
 def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
     """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP,
-    `wide`: there are wide views."""
+    `wide`: the scan has wide views."""
     fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
     advice = (
         "Wide views (scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice "

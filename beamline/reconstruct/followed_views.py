@@ -167,9 +167,11 @@ class AxisSearch:
             return
         if estimate.confident or last_chance:
             self.col, self.estimate = axis_col, estimate
+            self._warn.withdraw(_UNKNOWN)
 
 
 _NOISE_FLATS = 8  # at most, which show the noise of a frame
+_NO_GAIN = "No gain by further views is predicted"
 
 
 class PassLaws:
@@ -212,7 +214,7 @@ class PassLaws:
         if not rows.size or correction is None:
             self._no_law(ends.size, 0, "none of the views can be used")
             return
-        views_at_ends = [n for n in np.unique(np.searchsorted(rows, ends)).tolist() if n]
+        views_at_ends = [n for n in np.searchsorted(rows, ends).tolist() if n]
         try:
             geometry, _ = self._views.geometry(axis_col, rows)
             open_beam = correction.open_beam(_NOISE_FLATS)
@@ -222,10 +224,11 @@ class PassLaws:
             return
         if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
+        self._warn.withdraw(_NO_GAIN)
         self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))
 
     def _no_law(self, number: int, n_views: int, why: str) -> None:
-        self._warn(f"No gain by further views is predicted: {why}.")
+        self._warn(f"{_NO_GAIN}: {why}.")
         self._sink(
             LawMeasured(number, n_views, math.nan, math.nan, math.nan, math.nan, reason=why, time=self._clock.now())
         )

@@ -38,6 +38,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
+from drivers.base.frame import FrameKind
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.in_time import LastRound
@@ -313,6 +314,11 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
+        if wide := int((self.source.image_key == FrameKind.WIDE_VIEW).sum()):
+            self._warn(
+                f"{count(wide, 'wide view')} of this scan are not used: this volume grew with the scan, of ordinary "
+                f"views. `beamline recon {self.source.path}` uses them, which gives densities near the axis."
+            )
         steps = in_order(self._options.selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
 from beamline.core.text import spans
+from beamline.plan.passes import ended_by
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
@@ -136,7 +137,7 @@ class ScanFacts:
 
     Attributes:
         table: facts for people, by name.
-        frames: frames in the file of those triggered, e.g. "110/110".
+        frames: frames in the file of those planned, e.g. "110/110".
         remarks: faults during the scan, by the file.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
@@ -203,9 +204,10 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     n, again = int(source.image_key.size), rows_replaced(source)
     if again.size:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
-    remarks = [] if flags is None else reasons(flags)
+    dropped = sum(int(decision.get("dropped") or 0) for decision in source.decisions)
+    remarks = [*filter(None, [ended_by(source.decisions)]), *([] if flags is None else reasons(flags))]
     return ScanFacts(
-        source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks,
+        source.path, source.path.name, sample, table, f"{n}/{n + missing + dropped}", remarks,
         flagged=[] if flags is None else worst_frames(source, flags),
         references=reference_images(source),
         shape=source.shape,

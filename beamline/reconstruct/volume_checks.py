@@ -163,7 +163,8 @@ def _sample_radius(volume: CheckedVolume) -> str:
         known = "assumed: there are too few views to measure it"
     elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
-        sure = f" Densities near the axis are uncertain by {density:.1%} or more; scan.wide_views reduce that."
+        advice = "; wide views (scan.wide_views) reduce that" if prepared.geometry.ordinary.all() else ""
+        sure = f" Densities near the axis are uncertain by {density:.1%} or more{advice}."
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / reach:.2f} times as far as the "
         f"field ({known}). The whole sample was reconstructed; only the part within the field is written.{sure}"

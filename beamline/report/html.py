@@ -36,7 +36,7 @@ class Report:
     Attributes:
         summary: one or two sentences, the result first.
         metrics: by method, then by name of the metric (see METRICS); a method may lack some.
-        frames: frames in the file of those triggered, e.g. "90/90".
+        frames: frames in the file of those planned, e.g. "90/90".
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
         recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.

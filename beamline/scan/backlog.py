@@ -109,6 +109,12 @@ class FrameProgress:
         self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
         self.total += n
 
+    def expect_fewer(self, done: int, n: int) -> None:
+        """The next `n` of the frames planned after `done` do not come."""
+        left = min(done + n, self.total)
+        self._ahead = np.append(self._ahead[:done] - self._ahead[done] + self._ahead[left], self._ahead[left:])
+        self.total -= left - done
+
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
         """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)

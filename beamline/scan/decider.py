@@ -19,7 +19,7 @@ from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL
 from drivers.base.frame import FrameKind
-from recon.base.error_law import ErrorLaw
+from recon.base.error_law import BELOW, ErrorLaw
 
 _NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="none came yet")
 
@@ -36,6 +36,7 @@ class Decider:
         began: time of the first frame; inf: none came yet, where a scan that goes on chooses first.
         added_seconds: count as taken beside those since `began`: of earlier parts of the run, and of the references
             that follow the views.
+        retaken: views that earlier parts of the run took again.
         number: of the pass that ended last, from 1; at first the last one of earlier parts of the run.
         why_no_law: says why no law can come any more; "" while one may. Then the plan goes on without a wait.
         wait_a_moment: waits `PAUSE_POLL` real s, or as long as the scan is paused; whether Enter was pressed.
@@ -54,6 +55,7 @@ class Decider:
     sink: Sink
     began: float = math.inf
     added_seconds: float = 0.0
+    retaken: int = 0
     number: int = 0
     why_no_law: Callable[[], str] = lambda: ""
     wait_a_moment: Callable[[], bool] = lambda: False
@@ -69,9 +71,10 @@ class Decider:
     def add_law(self, law: LawMeasured) -> None:
         """Take a law from the live reconstruction; any thread."""
         self._law = law
-        if law.gained is not None:
-            option = self._chosen.get(law.number - 1, {})
-            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, "judged": law.number - 1}
+        option = self._chosen.get(law.number - 1, {})
+        if law.gained is not None and option.get("choice", Choice.NEXT) in (Choice.NEXT, Choice.AGAIN):
+            ends = {"gained_low": (1 - BELOW) * law.gained, "gained_high": (1 + BELOW) * law.gained}
+            self._outcome = {"predicted": option.get("gain"), "gained": law.gained, **ends, "judged": law.number - 1}
 
     def answer(self, choice: Choice) -> None:
         """Take the operator's choice; any thread. One that is not on offer becomes a warning."""
@@ -100,17 +103,18 @@ class Decider:
                 or f"no prediction within {self.wait:g} s"
             )
         asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
-        pass_ended = self.number, passes.n_frames // self.timeline.plan.frames_per_view
+        pass_ended, done = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
         rows = [  # an event has None for NaN
             {name: None if value != value else value for name, value in vars(option).items()} for option in offered
         ]
-        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark))
+        self.sink(PassEnded(*pass_ended, rows, choice, self.wait if asks else 0.0, remark, done))
         if asks:
             by, choice, reason = self._ask(choice, offered)
             if self.stop.stopping:
                 return Choice.NEXT
         self._chosen[self.number] = {row["choice"]: row for row in rows}.get(choice, {})
-        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome)
+        dropped = passes.n_planned - passes.after(choice).n_planned
+        event = NextChosen(*pass_ended, choice, by, reason, rows, **self._outcome, passes=done, dropped=dropped)
         self._outcome = {}
         self.sink(event)
         self.record({"predicted": None, "gained": None} | event.data)
@@ -155,7 +159,7 @@ class Decider:
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
         wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
         seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.wide))
-        return seconds, (passes.n_frames + retaken + wide) * frame_dose(self.timeline)
+        return seconds, (passes.n_frames + self.retaken + retaken + wide) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait until this is so, but `wait` s at most, and not beyond a stop."""

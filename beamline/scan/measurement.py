@@ -91,6 +91,7 @@ class Measurement:
             sink=self.sink,
             added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
             + (self.series.seconds if self.series else 0.0),
+            retaken=self.series.retaken if self.series else 0,
             number=len(timeline.plan.choices),
             close_shutter=lambda: None if devices.shutter.by_hand else devices.shutter.close(),
         )
@@ -269,8 +270,8 @@ class Measurement:
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
         """Views that may be taken again now, and how many were flagged or gave no frame: of more than the plan still
         allows, an even spread."""
-        allowed = self.ready.plan.retakes - recorder.announced
-        if not allowed:
+        allowed = self.ready.plan.retakes - recorder.announced - self.decider.retaken
+        if allowed <= 0:
             return (), 0
         recorder.wait()
         flagged = recorder.flagged.views_to_retake

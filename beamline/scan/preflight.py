@@ -34,6 +34,7 @@ from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
+from drivers.orca_quest import PITCH_MM
 from recon.methods import streams
 
 Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earlier files of the same scan
@@ -72,7 +73,7 @@ class DryRun:
         return sum(need.total_bytes for need in self.energies) if self.energies else self.timeline.total_bytes
 
     def lines(self) -> list[str]:
-        """Lines of text; the violations come last."""
+        """Lines of text, without violations: `refuse_violations` states them."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
         if each := self.energies:
             seconds = sum(need.duration for need in each)
@@ -80,7 +81,7 @@ class DryRun:
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
                 f"{duration_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
             )
-            lines.insert(len(lines) - len(self.timeline.violations), f"{'energies':<10}{sentence}")
+            lines.append(f"{'energies':<10}{sentence}")
         return lines
 
     def data(self) -> Mapping[str, Any]:
@@ -115,8 +116,30 @@ def doubts(config: Config) -> list[str]:
     sentences = [
         *(doubt(".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"}))),
         next(filter(None, map(doubt_span, spans)), ""),
+        _doubt_optics(config),
     ]
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
+
+
+_DEMAGNIFIED = 100  # pixels at the sample over those of the camera: no optics images a field so much larger
+
+
+def _doubt_optics(config: Config) -> str:
+    """A sentence where pixel size and distance cannot go with the camera, as by another unit; "" where they can."""
+    optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
+    half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
+    if optics.pixel_size_um > _DEMAGNIFIED * own:
+        return (
+            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, the camera's pixels are {own:g} um: the field would "
+            f"be {2 * half:.4g} mm wide. It is the size of an unbinned pixel at the sample; is it in nm?"
+        )
+    return (
+        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of "
+        f"{2 * half:.4g} mm: a sample that fills it could not turn there. Is it in m?"
+        if optics.distance_mm and optics.distance_mm < half
+        else ""
+    )
 
 
 def dry_run(

@@ -141,6 +141,7 @@ class Recorder:
     def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass: the values of its event, if the scan decides."""
         self._enqueue(lambda: self._writer.add_decision(values))
+        self._enqueue(lambda: self._progress.expect_fewer(self.n_frames, int(str(values.get("dropped", 0)))))
 
     def finish(self) -> None:
         """Wait until all queued frames are written; no frame may be put afterwards."""

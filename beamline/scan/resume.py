@@ -61,6 +61,7 @@ class ResumableRun:
         choices: after each pass that ended in them, oldest first.
         choice_due: the last one ended, and nothing was chosen yet.
         seconds: that they took, from the first frame of each to its last one.
+        retaken: views that they took again, in place of others.
         end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
@@ -80,6 +81,7 @@ class ResumableRun:
     choices: tuple[str, ...] = ()
     choice_due: bool = False
     seconds: float = 0.0
+    retaken: int = 0
 
     @property
     def in_words(self) -> str:
@@ -182,7 +184,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     config = load(run / CONFIG, environment={})
     if given is not None and not config.recon.live:
         given = changed(given, NO_LIVE)
-    planned, times, parts, closed = 0, list[NDArray[np.float64]](), list[Path](), True
+    planned, retaken, times, parts, closed = 0, 0, list[NDArray[np.float64]](), list[Path](), True
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             require_ours(part, file)
@@ -197,6 +199,8 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
+                views = file[layout.TRIGGER][()][file[layout.KIND][()] == FrameKind.PROJECTION]
+                retaken += int((views >= planned).sum())  # their triggers count on from those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
@@ -210,7 +214,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
-        end_references, wide, wide_missing, choices, due, seconds,
+        end_references, wide, wide_missing, choices, due, seconds, retaken,
     )  # fmt: skip
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, FrameStored, ScanDone, Sink, StateEntered
+from beamline.core.events import Event, FrameStored, NextChosen, ScanDone, Sink, StateEntered
 from beamline.core.files import CONFIG, EVENTS, SCAN, STAMP, is_below, parts_of
 from beamline.core.text import one_line, size
+from beamline.plan.passes import ended_by
 from beamline.scan.control import State, running
 from beamline.storage.interrupted import next_step
 from beamline.storage.run_record import DIED, FlagCounts, RecordFile, RunRecord, alive, read_record, write_record
@@ -35,6 +36,7 @@ class Run:
         time: s since the Unix epoch, when it began.
         frames: in its files; None: not known.
         planned: frames that the first part was to have; None: not known.
+        ended: who ended it before its plan by a choice, and why; "" if nobody did.
         flags: frames that the monitor flagged: their number by check, then by level.
         state: of its newest part, see docs/states.md; `died` if its process ended without writing its last one.
         bytes: of all files in the folder.
@@ -52,6 +54,7 @@ class Run:
     bytes: int
     parts: int
     next_step: str = ""
+    ended: str = ""
 
     @property
     def over(self) -> bool:
@@ -98,6 +101,7 @@ def describe(run: Path) -> Run:
         bytes=sum(_size(Path(at, name)) for at, _, names in os.walk(run) for name in names),
         parts=len(parts),
         next_step=next_step(run / SCAN) if state in (DIED, NOT_KNOWN) else "",
+        ended=next((record.ended for record in records if record.ended), ""),
     )
 
 
@@ -109,7 +113,7 @@ def cells(run: Run) -> tuple[str, ...]:
     from beamline.storage.flag_legend import counted
 
     frames = "not known" if run.frames is None else str(run.frames)
-    if run.planned is not None and run.state != State.DONE:
+    if run.planned is not None and (run.ended or run.state != State.DONE):
         frames += f" of {run.planned}"
     parts = f" in {run.parts} parts" if run.parts > 1 else ""
     of_series = f"{run.folder.parent.name}/" if (run.folder.parent / CONFIG).is_file() else ""
@@ -128,6 +132,8 @@ def record_sink(file: RecordFile) -> Sink:
         match event:
             case StateEntered(state=state, source=None) if state in [*State]:
                 record = replace(record, state=state, over=State(state).ended)
+            case NextChosen():
+                record = replace(record, ended=ended_by([event.data]))
             case FrameStored(n=n):
                 record = replace(record, frames=n)
             case ScanDone(result=scan):

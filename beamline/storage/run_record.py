@@ -36,6 +36,7 @@ class RunRecord:
         frames: in its file, or where `joined` in the file that joins the parts so far; None: not known.
         planned: frames that it is to have; None: not known.
         flags: frames that the monitor flagged: their number by check, then by level; empty before its file is closed.
+        ended: who ended it before its plan by a choice, and why; "" if nobody did.
         time: when this was written, s since the Unix epoch.
     """
 
@@ -46,6 +47,7 @@ class RunRecord:
     joined: bool = False
     planned: int | None = None
     flags: FlagCounts = field(default_factory=dict)
+    ended: str = ""
     time: float = field(default=0.0, compare=False)
 
 

@@ -11,6 +11,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+BELOW = 0.5
+"""Over the mean: a gain is taken to lie so far below it, at most, and beyond it where a law is known. A convention."""
+
 
 @dataclass(frozen=True)
 class Gain:
@@ -20,6 +23,11 @@ class Gain:
     low: float
     high: float
 
+    @property
+    def at_most(self) -> float:
+        """What to count on before it is forgone: the mean, or the high end where no law is known to half of it."""
+        return self.mean if self.high <= (1 + BELOW) * self.mean * (1 + 1e-9) else self.high
+
 
 @dataclass(frozen=True)
 class ErrorLaw:
@@ -28,8 +36,8 @@ class ErrorLaw:
     Attributes:
         n_views: of the volume.
         exponent: of the fall of the mean square error with the number of views.
-        exponent_error: the exponent is taken to lie within twice this, and both shares within the same part of
-            themselves, which gives the range of a gain. A convention of `recon.voxels.measured_law`, not measured.
+        exponent_error: the exponent is taken to lie within twice this, though not below half of itself, and both shares
+            within the same part of themselves, which gives the range of a gain. See `recon.voxels.measured_law`.
         noise, offset: shares of the mean square error, each 0 to 1.
     """
 
@@ -49,5 +57,5 @@ class ErrorLaw:
             error_ratio = gaps_and_noise * (1 + views / self.n_views) ** (-factor * self.exponent) + offset
             return -10 * math.log10(error_ratio) or 0.0  # never -0.0
 
-        half_range = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
-        return Gain(decibels(1.0), decibels(1 - half_range), decibels(1 + half_range))
+        above = min(2 * self.exponent_error / self.exponent, 1.0) if self.exponent else 1.0
+        return Gain(decibels(1.0), decibels(1 - min(above, BELOW)), decibels(1 + above))

@@ -39,6 +39,7 @@ LEAST_VIEWS = 40
 _NOISE_EXPONENT, _OTHER_EXPONENT = 0.6, 0.3  # on ten scans 0.5 to 0.7, and 0.1 to 0.4 (tests/bench/next_pass.py)
 _NOISE_PRODUCT = 0.08, 0.16  # noise x ratio of falls: below the first other errors rule, above the second noise does
 _EXPONENT_ERROR = 0.25  # over the exponent: a convention, by which a gain's range is half to one and a half times it
+_GAPS_ERROR = 0.46  # likewise with gaps between views, where exponents from 0.41 to 1.15 were found on ten scans
 _SAME_ANGLES = 0.8  # share of the error that falls with light at the same angles, over the exponent: median of 14 pairs
 _VOLUME_OVER_VIEWS = 1.4  # times the fall that is measured: views show errors between voxels, too, which stay
 _ROWS, _WORK = 8, 60 * 512**2  # rows of the slab; views times square of the columns: more are binned
@@ -56,7 +57,8 @@ def measured_law(
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
         geometry: of these views: parallel beam, straight.
-        views_at_ends: numbers of views at the ends of passes so far, the last of all.
+        views_at_ends: numbers of views at the ends of passes so far, the last of all. Where the last two are alike,
+            none came in between, and what came there was not measured.
         open_beam: line integrals [frame, row, col] of frames of the open beam that follow each other, noise alone,
             binned as the views.
 
@@ -72,7 +74,8 @@ def measured_law(
             f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed to measure the law of the error"
         )
     sample = sample_radius(data, geometry)
-    slab = _Slab.of(data, geometry, 1.0 if sample is None else sample.radius / geometry.reach, open_beam)
+    width = 1.0 if sample is None else sample.radius / geometry.reach  # of the sample, over the field's
+    slab = _Slab.of(data, geometry, width, open_beam)
     most, held_out = split_views(slab.geometry)
     half = split_views(slab.geometry, 2)[1]  # every second one by angle, none of those held out
     method = _TotalVariation(slab.chosen_weight())
@@ -87,13 +90,15 @@ def measured_law(
         [slab.unseen_power(volume, slab.views, held_out) for volume in volumes],
         [slab.unseen_power(volume, copy, held_out) for volume in copied],
     )
-    # Fewer views than columns leave gaps between them, whose error falls as that by noise does.
-    product = 1.0 if n < geometry.detector_shape[1] else noise * (1.0 if fall_ratio is None else fall_ratio)
+    # Fewer views than the sample is columns wide leave gaps between them, whose error falls as that by noise does.
+    gaps = n < width * geometry.detector_shape[1]
+    product = 1.0 if gaps else noise * (1.0 if fall_ratio is None else fall_ratio)
     exponent = float(np.interp(product, _NOISE_PRODUCT, (_OTHER_EXPONENT, _NOISE_EXPONENT)))
     constant = offset_error(Volume(volumes[1], slab.box), slab.geometry, sample)
     offset = constant / (errors[1] + constant) if constant else 0.0
-    law = ErrorLaw(n, exponent, _EXPONENT_ERROR * exponent, _SAME_ANGLES * exponent * (1 - offset), offset)
-    if not fall_ratio or len(views_at_ends) < 2 or min(errors) <= 0:
+    error = (_GAPS_ERROR if gaps else _EXPONENT_ERROR) * exponent
+    law = ErrorLaw(n, exponent, error, _SAME_ANGLES * exponent * (1 - offset), offset)
+    if not fall_ratio or min(errors) <= 0 or (n, *views_at_ends)[-2] == n:
         return law, None
     fall = _VOLUME_OVER_VIEWS * fall_ratio * math.log(errors[0] / errors[1])  # of the scan, from half to most views
     return law, fall / math.log(len(most) / len(half)) * 10 * math.log10(n / views_at_ends[-2])

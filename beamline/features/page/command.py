@@ -132,8 +132,8 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     if not runs:
         click.echo(f"There is no run in {folder}.", err=True)
     for run in runs:
-        if run.next_step:
-            click.echo(f"{run.folder.name}: {run.next_step}", err=True)
+        if sentence := run.next_step or run.ended:
+            click.echo(f"{run.folder.name}: {sentence}", err=True)
 
 
 def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:

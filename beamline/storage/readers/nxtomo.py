@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
+from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.parts import decisions_in, gaps_in, pass_ends_in, require_joined
@@ -98,15 +99,16 @@ class OwnScan(NexusSource):
     @guarded
     def attributes(self) -> dict[str, str | float | int]:
         """Further metadata: sample, title, times, status, missing triggers, why the scan ended early."""
-        ending = ending_in(self._file)
+        ending, reason = ending_in(self._file), self.ending.reason
         facts = super().attributes | {"status": ending.status, "missing_triggers": len(ending.missing)}
-        return facts | ({"ended": ending.reason} if ending.reason else {})
+        return facts | ({"ended": reason} if reason else {})
 
     @property
     @guarded
     def ending(self) -> ScanEnding:
         ending = ending_in(self._file)
-        return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
+        own = {"reason": ending.reason or ended_by(self.decisions)}
+        return replace(ending, **({"missing": gaps_in(self.path, self._file)} if ending.status == RUNNING else own))
 
     @property
     @guarded

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
-from beamline.plan.passes import Choice
+from beamline.plan.passes import ended_by
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource
@@ -29,17 +29,18 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 
 
 def scan_ended(source: ScanSource) -> Iterator[Finding]:
-    """The writer closed the file, and the scan ended as planned; else a remedy."""
+    """The writer closed the file, and the scan ended as planned; else a remedy, or who ended it."""
     ending, n = source.ending, count(source.image_key.size, "frame")
     if not source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
         planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
-        if any(each.get("choice") == Choice.ENOUGH for each in source.decisions):
-            of_plan += "; it had decided against the others"
+        of_plan += "; it had decided against the others" if ended_by(source.decisions) else ""
         sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
+        if ending.reason:
+            yield Finding("info", "ended", ending.reason)
         return
     yield Finding("warning", "unfinished", f"{sentence} {next_step(source.path)}".strip())
 

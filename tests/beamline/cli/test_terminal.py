@@ -150,14 +150,21 @@ EVENTS = [
     ),
     (
         "next_chosen",
-        {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71, "judged": 2},
-        "After pass 3: again, chosen by the program: it brings most a second. The choice after pass 2: predicted "
-        "+0.80 dB, measured +0.71 dB",
+        {**CHOSEN, "by": "program", "predicted": 0.8, "gained": 0.71, "judged": 2, "passes": 2},
+        "After pass 2: again, chosen by the program: it brings most a second. An earlier choice: predicted +0.80 dB, "
+        "measured +0.71 dB",
     ),
     (
         "next_chosen",
-        {**CHOSEN, "by": "operator", "reason": "the operator chose it", "gained": -0.1, "judged": 2},
-        "again, the operator chose it. The c",
+        {
+            **CHOSEN,
+            "by": "operator",
+            "reason": "the operator chose it",
+            "gained": 0.4,
+            "gained_low": 0.2,
+            "gained_high": 0.6,
+        },
+        "again, the operator chose it. An earlier choice: measured +0.40 dB (0.20 to 0.60)",
     ),
     ("next_chosen", {**CHOSEN, "by": "plan", "predicted": 0.8}, "again, as planned: it brings most a second."),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),

@@ -7,7 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.opposite import OppositeCheck
+from beamline.plan.plan import interlaced
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs
 
 STEP = np.radians(2)
@@ -80,3 +83,32 @@ def test_a_steady_scan_of_a_turn_and_more_raises_no_flag() -> None:
 def test_in_a_cone_it_stands_aside_and_says_so_once() -> None:
     (flag,) = only(Moved(100), cone=True)
     assert (flag.level, flag.frame) == (Level.INFO, 10) and "cone" in flag.advice
+
+
+class Interlaced(Moved):
+    """A sample twice as wide as the field, in eight passes over half a turn."""
+
+    def __init__(self, place: Place) -> None:
+        super().__init__(200, place)
+        self.step, self.turns = 1.0, interlaced(320, 8)
+        radius, phase = self.at
+        self.at = 2 * radius, phase
+
+    def line_integrals(self, view: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+        radius, phase = self.at
+        self.at = radius, phase + self.turns[view] - view
+        found = super().line_integrals(view, shift)
+        self.at = radius, phase
+        return found
+
+    def _frame(
+        self, kind: FrameKind, row: int, light: NDArray[np.float64], angle: float = np.nan
+    ) -> tuple[Frame, FrameDigest]:
+        return super()._frame(kind, row, light, angle if np.isnan(angle) else float(self.turns[int(angle)]))
+
+
+def test_a_wide_sample_in_passes_raises_no_flag_while_its_neighbours_are_far_and_shows_a_shift_later() -> None:
+    """From one view of the first pass to the next, 4.5 degrees on, the field shows other matter."""
+    flags = only(Interlaced(lambda view: (6.0 * (view >= 170), 0)))
+    assert flags and min(flag.frame for flag in flags) >= 10 + 170
+    assert [flag.score for flag in flags] == pytest.approx([6] * len(flags), abs=0.5)

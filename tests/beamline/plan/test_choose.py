@@ -101,8 +101,16 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
 def test_the_choice_and_its_reason(
     offered: list[PassOption], wish: Wish, spent: tuple[float, float], rest: float, chosen: Choice, why: str
 ) -> None:
-    choice, reason = choose([*offered, ENOUGH], wish, Gain(rest, 0.0, 9.0), *spent)
+    choice, reason = choose([*offered, ENOUGH], wish, Gain(rest, rest / 2, 1.5 * rest), *spent)
     assert choice is chosen and why in reason
+
+
+@pytest.mark.parametrize(("high", "chosen"), [(1.35, Choice.ENOUGH), (1.4, Choice.NEXT), (0.95, Choice.ENOUGH)])
+def test_where_no_law_is_known_to_half_of_it_the_scan_ends_only_if_even_its_high_end_is_accepted(
+    high: float, chosen: Choice
+) -> None:
+    assert choose([NEXT, ENOUGH], Wish(1.0), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is chosen
+    assert choose([NEXT, ENOUGH], Wish(1.4), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is Choice.ENOUGH
 
 
 def test_the_rest_is_all_that_the_plan_still_has() -> None:
@@ -118,7 +126,8 @@ def test_the_rest_is_all_that_the_plan_still_has() -> None:
     [
         (1, Wish(1.0), 0.1, True),  # after the next one the rest of 24 still adds 2.4 dB at least
         (1, Wish(2.5), 0.1, False),
-        (1, Wish(1.0), 0.4, False),
+        (1, Wish(1.0), 0.4, True),  # 1.5 dB at least: no law is taken to err by more below
+        (1, Wish(1.6), 0.4, False),
         (2, Wish(1.0), 0.1, False),
         (1, Wish(4.0), 0.0, False),  # it is chosen, but then met
         (1, Wish(7.0), 0.0, False),  # met already

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
+from beamline.core.sinks import Warnings
 from beamline.projections.selection import Selection
 from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.base.clock import SystemClock
 from recon.prep.align import AxisEstimate
 from tests.beamline.reconstruct.growing_scan import BRIEF, FIT, INTERLACED, SCAN, ScanClock, options, schedule
 from tests.beamline.scans import frames_of
@@ -64,7 +66,7 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
 ) -> None:
     """A full turn, that other looks would reach at 90 and 135 views; a quarter is there at 50, the half turn at 100."""
     looks, told = list[int](), list[str]()
-    warn: Any = told.append
+    warn = Warnings(lambda event: told.append(event.data["message"]), SystemClock())
     correction: Any = None
     source: Any = SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8)), axis_col=None, cone=None)
 
@@ -81,3 +83,4 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)
     assert 50 in looks and looks[-1] == 100 and search.col == 20.7
     assert len(set(told)) == 1 and "--axis COLUMN" in told[0] and "optics.axis_col" in told[0]
+    assert warn.messages == []  # the report does not say that the axis is unknown, which was found

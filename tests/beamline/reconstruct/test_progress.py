@@ -10,7 +10,7 @@ import pytest
 from beamline.core.events import Event
 from beamline.reconstruct.job import progress_events
 from drivers.base.clock import SystemClock
-from recon.base.method import Progress
+from recon.base.method import SWEEPS_OF_TRIALS, Progress
 
 
 def _told(points: Sequence[tuple[int, float]], steps: int, seconds: float | None = None) -> list[dict[str, Any]]:
@@ -29,6 +29,14 @@ def test_a_fit_taken_up_again_is_as_fast_as_it_is_now(first: int) -> None:
     assert later["per_s"] == pytest.approx(20)
     assert later["eta_s"] == pytest.approx(10)
     assert later["step"] == first + 100 and later["stage"] == "recon"
+
+
+def test_a_trial_that_may_end_early_has_no_time_left() -> None:
+    events: list[Event] = []
+    listen = progress_events(events.append, SystemClock())
+    for step, unit in ((1, ""), (50, "steps of the trial of r2"), (60, f"{SWEEPS_OF_TRIALS} at most"), (90, "")):
+        listen(Progress(step, 100, float(step), 0.1, 0.1, 50, 12, unit=unit))
+    assert [event.data["eta_s"] is None for event in events] == [True, True, True, False]
 
 
 def test_a_time_tells_the_end_where_no_steps_are_planned() -> None:

@@ -18,12 +18,16 @@ from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.passes import Choice
+from beamline.reconstruct.scan_facts import facts_of
 from beamline.scan import preflight
 from beamline.scan.control import State, Verb, ask, state_of
 from beamline.scan.live_process import LiveCommand
 from beamline.scan.preflight import scan_info
 from beamline.scan.resume import NothingMissing, open_for_resume
 from beamline.scan.run import run_scan
+from beamline.scan.runs import cells, describe
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.scan import scan_ended
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import ScanInfo
 from tests.beamline.fakes import FakeInstrument
@@ -79,6 +83,16 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     ]
     assert [event.data["number"] for event in ran.of("pass_ended")] == [1, 2, 3]
     ran.assert_good_file(16, "complete")  # with the flats of the end
+    assert [(each["passes"], each.get("dropped", 0)) for each in decisions] == [(1, 0), (2, 0), (3, 3)]
+    assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 16
+    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: all that the plan "
+    assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
+    assert "16 of 19" in cells(run)
+    with open_scan(ran.folder / "scan.h5") as source:
+        assert [(found.severity, found.message) for found in scan_ended(source)] == [("info", run.ended)]
+        facts = facts_of(source)
+        assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
+    assert run.ended.endswith("1 dB less is accepted. 3 planned frames were not taken.")
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 

@@ -97,7 +97,7 @@ def test_it_waits_for_the_law_of_these_views_and_says_what_it_chose() -> None:
 
 
 def test_what_came_of_a_prediction_stands_beside_it() -> None:
-    scan = Scan(Wish(0.01))
+    scan = Scan(Wish(1.6))  # which it waits for a law to tell
     scan.after(1, law(12, error=0.5))
     predicted = scan.chosen["options"][0]["gain"]
     scan.after(2, law(24, error=0.5, gained=2.5))
@@ -151,6 +151,21 @@ def test_wide_views_count_as_taken_as_they_come_in_any_case() -> None:
         for less, choice in ((0.999, Choice.ENOUGH), (1.001, Choice.NEXT)):
             tried = Wish(seconds=wish.seconds and less * wish.seconds, dose=wish.dose and less * wish.dose)
             assert Scan(tried, wide=5).after(1, law(12)) is choice
+
+
+def test_what_wide_views_or_retakes_brought_is_not_measured_and_a_pass_has_a_range() -> None:
+    scan = Scan(Wish(0.01), asks=True, wide=5)
+    for choice, measured in ((Choice.WIDE, False), (Choice.RETAKE, False), (Choice.NEXT, True)):
+        scan.moments = [partial(scan.decide.add_law, law(12)), lambda: None]
+        scan.moments += [partial(scan.decide.answer, choice)]
+        assert scan.after(1, retakes=2) is choice and scan.chosen["passes"] == 1
+        scan.decide.add_law(law(24, gained=0.5))
+        assert scan.decide._outcome.get("gained") == (0.5 if measured else None)
+    assert (scan.decide._outcome["gained_low"], scan.decide._outcome["gained_high"]) == pytest.approx((0.25, 0.75))
+
+
+def test_retakes_of_earlier_parts_count_in_the_dose() -> None:
+    assert Scan(Wish(dose=0.75), retaken=2).after(2, law(24)) is Choice.ENOUGH
 
 
 @pytest.mark.parametrize(("retaken", "choice"), [(0, Choice.NEXT), (2, Choice.ENOUGH)])

@@ -13,6 +13,7 @@ from beamline.core.stop import ScanStopped, StopRequest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
+from beamline.scan.resume import open_for_resume
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
@@ -116,6 +117,8 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
         flags = source.flags
         assert flags is not None and (source.image_key[left] == FrameKind.PROJECTION).all()
         assert flags.alarmed[left].all()
+    with open_for_resume(ran.folder) as series:
+        assert series.retaken == len(again)  # which count in the dose and the share of the run
 
 
 def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:

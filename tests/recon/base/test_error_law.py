@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.base.error_law import ErrorLaw
+from recon.base.error_law import ErrorLaw, Gain
 
 SHARE = st.floats(0, 0.5)
 LAWS = st.builds(ErrorLaw, st.integers(1, 2000), st.floats(0, 2), st.floats(0, 0.2), SHARE, SHARE)
@@ -46,3 +47,12 @@ def test_steps_add_up_where_views_take_all_of_the_error(law: ErrorLaw, first: in
 
 def test_nothing_brings_nothing() -> None:
     assert repr(ErrorLaw(10, 0.5, 0.1, 0.4).gain().mean) == "0.0"
+
+
+@given(LAWS, st.integers(1, 500))
+def test_a_gain_that_is_known_to_half_of_it_counts_as_its_mean_and_another_one_as_its_high_end(
+    law: ErrorLaw, views: int
+) -> None:
+    gain = replace(law, exponent_error=law.exponent / 4).gain(views=views, wide=True)
+    assert gain.at_most == gain.mean
+    assert Gain(1.0, 0.1, 1.9).at_most == 1.9

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 import recon
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
+from recon.base.method import SampleRadius
 from recon.base.volume import Grid
 from recon.voxels.measured_law import measured_law
 from recon.voxels.priors import NoiseBalance
@@ -105,6 +106,22 @@ def test_wide_views_help_where_the_sample_is_wider_than_the_field() -> None:
 def test_fewer_views_than_columns_leave_gaps_that_others_fill() -> None:
     views, geometry, open_beam, _ = scan(56, 1e6, cols=64)
     assert measured_law(views, geometry, [56], np.random.default_rng(1), open_beam)[0].exponent == 0.6
+
+
+@pytest.mark.parametrize(("n", "gaps"), [(48, True), (96, False)])
+def test_gaps_last_until_the_views_are_as_many_as_the_sample_is_columns_wide(
+    monkeypatch: pytest.MonkeyPatch, n: int, gaps: bool
+) -> None:
+    """A sample of 56 columns on a field of 28. With gaps the law is known less well."""
+    monkeypatch.setattr(
+        "recon.voxels.measured_law.sample_radius",
+        lambda data, geometry: SampleRadius(2 * geometry.reach, geometry.reach, 2 * geometry.reach, 0.02),
+    )
+    views, geometry, open_beam, _ = scan(n, 1e6, cols=28)
+    law, gained = measured_law(views, geometry, [n, n], np.random.default_rng(1), open_beam)
+    more = law.gain(views=40)
+    assert (law.exponent == 0.6, more.at_most == more.high) == (gaps, gaps)
+    assert gained is None  # no view came between the last two ends
 
 
 def test_views_of_many_columns_are_binned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, PositiveInt
 
 from beamline.config.beam import BeamMonitorSection
-from beamline.config.section import without
+from beamline.config.section import Port, without
 from drivers.base.clock import Clock
 from drivers.beam_monitors import (
     PATTERN,
@@ -33,9 +33,7 @@ class ElectrometerConfig(BeamMonitorSection):
     counterpart: ClassVar[str | None] = "electrometer"
 
     kind: Literal["electrometer"]
-    port: Annotated[str, Field(min_length=1)] = Field(
-        description="A serial port, socket://host:port, or sim://electrometer."
-    )
+    port: Port = Field(description="A serial port, socket://host:port, or sim://electrometer.")
     query: Annotated[str, Field(min_length=1)] = QUERY
     pattern: Pattern = Field(default=PATTERN, description="Regular expression whose first group is the number.")
     unit: str = "A"

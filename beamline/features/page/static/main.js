@@ -8,7 +8,7 @@ const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "in
 const COLOURS = { done: "good", complete: "good", paused: "warn", asking: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
 const columns = { kind: [], angle: [], time: [], mean: [] };
 const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] }, error: { x: [], y: [] } };
-let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
+let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, ended = "", rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
 
 // --- frame -------------------------------------------------------------------------------------------------------
 const frameWindows = {};  // of a kind of frame, so that flats and views each keep theirs
@@ -234,8 +234,8 @@ function onRun(event) {
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
     case "progress": if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
-    case "pass_ended": passes.end(data); log(data, `Pass ${data.number} is over, ${data.n_views} views so far`); break;
-    case "next_chosen": passes.choose(data); log(data, `After pass ${data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
+    case "pass_ended": passes.end(data); log(data, `Pass ${data.passes ?? data.number} is over, ${data.n_views} views so far`); break;
+    case "next_chosen": if (data.choice === "enough") ended = `Ended after pass ${data.passes ?? data.number} by the choice enough of the ${data.by}: ${data.reason}. ${data.dropped ?? 0} planned frames were not taken.`; passes.choose(data); log(data, `After pass ${data.passes ?? data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
     case "warning": log(data, data.message, "warning"); break;
     case "failed": log(data, data.message, "failed"); break;
@@ -300,10 +300,10 @@ async function onState(event) {
 
 function header(now) {
   const word = now.next ? now.status : state || now.status, chip = $("state");
-  if (now.next) $("said").textContent = now.next;
+  if (now.next || ended) $("said").textContent = now.next || ended;
   chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
   $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
-  const shown = { frames: planned ? `${now.frames} stored, ${ledger.exposed || now.frames} exposed, ${planned} planned` : `${now.frames}` };
+  const shown = { frames: planned ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${planned} planned` : `${now.frames}` };
   if (rate && now.status === "running") {
     shown.rate = `${rate.frames_per_s.toFixed(1)} frames/s, ${rate.mb_per_s.toFixed(1)} MB/s`;
     if (rate.eta_s !== null) shown.left = duration(rate.eta_s);

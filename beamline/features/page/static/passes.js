@@ -18,9 +18,9 @@ export class Passes {
   /** What was chosen. The event also says what an earlier decision has brought, by the number of its pass. */
   choose(data) {
     const judged = this.decisions.find((decision) => decision.number === data.judged) ?? this.decisions[this.decisions.length - 1];
-    if (judged) { judged.predicted = data.predicted ?? judged.predicted; judged.gained = data.gained ?? judged.gained; }
+    if (judged) for (const name of ["predicted", "gained", "gained_low", "gained_high"]) judged[name] = data[name] ?? judged[name];
     const chosen = data.options.find((option) => option.choice === data.choice);
-    this.decisions.push({ ...data, predicted: chosen?.gain ?? null, gained: null });
+    this.decisions.push({ ...data, predicted: chosen?.gain ?? null, gained: null, gained_low: null, gained_high: null });
     this.asks = false;
     this.draw();
   }
@@ -36,20 +36,19 @@ export class Passes {
     const find = (name) => this.box.querySelector(name), asks = this.asks && this.runs, { ended } = this;
     this.box.hidden = !ended && !this.decisions.length;
     find("thead + tbody").replaceChildren(...(ended ? ended.options : []).map((option) => this.rowOf(option, asks && this.mayAct)));
-    find("small").textContent = ended ? `pass ${ended.number} is over, ${ended.n_views} views so far` : "";
+    find("small").textContent = ended ? `pass ${ended.passes ?? ended.number} is over, ${ended.n_views} views so far` : "";
     const how = this.mayAct ? "Choose above" : "beamline decide CHOICE";
     const question = asks ? `The scan asks what is next. ${how}; after ${ended.wait.toFixed(0)} s without an answer the plan goes on.` : "";
     find(".asks").textContent = [ended?.remark, question].filter(Boolean).join(" ");
     find(".decisions").hidden = !this.decisions.length;
-    find(".decisions tbody").replaceChildren(...this.decisions.map((decision) => row([decision.number, decision.choice, CHOSEN_BY[decision.by] ?? decision.by, db(decision.predicted), db(decision.gained), decision.reason])).reverse());
+    find(".decisions tbody").replaceChildren(...this.decisions.map((decision) => row([decision.passes ?? decision.number, decision.choice, CHOSEN_BY[decision.by] ?? decision.by, db(decision.predicted), db(decision.gained) + rangeOf(decision.gained_low, decision.gained_high), decision.reason])).reverse());
   }
 
   /** A row of the table, with a button where this person may answer. */
   rowOf(option, mayAnswer) {
     const { choice, gain, low, high, seconds } = option, recommended = choice === this.ended.recommended;
-    const range = low === null || high === null || low === high ? "" : ` (${low.toFixed(2)} to ${high.toFixed(2)})`;
     const rate = gain === null || !seconds ? "-" : db(60 * gain / seconds);
-    const line = row([MEANINGS[choice] ? `${choice}: ${MEANINGS[choice]}` : choice, gain === null ? "not known" : db(gain) + range, rate, `${seconds.toFixed(0)} s`, `${(100 * option.dose).toFixed(1)} %`, size(option.bytes), recommended ? "recommended" : ""]);
+    const line = row([MEANINGS[choice] ? `${choice}: ${MEANINGS[choice]}` : choice, gain === null ? "not known" : db(gain) + rangeOf(low, high), rate, `${seconds.toFixed(0)} s`, `${(100 * option.dose).toFixed(1)} %`, size(option.bytes), recommended ? "recommended" : ""]);
     if (recommended) line.className = "recommended";
     if (mayAnswer) {
       const button = document.createElement("button");
@@ -66,5 +65,6 @@ function row(texts) {
   for (const text of texts) line.insertCell().textContent = text;
   return line;
 }
-function db(value) { return value === null || value === undefined ? "-" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`; }
+function db(value) { return value === null || value === undefined ? "–" : `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(2)}`; }
+function rangeOf(low, high) { return (low ?? null) === null || (high ?? null) === null || low === high ? "" : ` (${low.toFixed(2)} to ${high.toFixed(2)})`; }
 function size(bytes) { return bytes < 1e9 ? `${(bytes / 1e6).toFixed(0)} MB` : `${(bytes / 1e9).toFixed(2)} GB`; }
