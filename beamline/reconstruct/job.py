@@ -186,6 +186,14 @@ def runner_of(
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     """Reconstruct within a time budget, in slabs, or at once; returns the volume, and the views as used."""
+    made, used = _volume_of(job, decided)
+    lost = [row for row in used.unmeasured_rows[0] if row not in used.unmeasured_rows[1]]
+    if lost and used.geometry.rows_show_slices and len(made.volume.data) == used.geometry.detector_shape[0]:
+        made.volume.data[lost] = 0
+    return made, used
+
+
+def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     prepared = job.prepared
     if job.options.budget is not None or not job.slabs:
         budget = job.options.budget

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import Mask, without_mask
+from recon.base.arrays import F64, I64, Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
-from recon.base.masks import Image, fill, plan_fill
+from recon.base.masks import Image, areas, fill, plan_fill
 from recon.prep.counts import Photons, of_view
 from recon.prep.references import References as References
 from recon.prep.references import (
@@ -24,6 +24,9 @@ from recon.prep.references import (
     flat_at,
     zingers,
 )
+from recon.prep.unmeasured import border_of, boxes_of, foreign_rows, of_light
+
+_NONE = np.zeros((0, 5), np.int64)
 
 
 class UnlitViewsError(ValueError):
@@ -76,6 +79,8 @@ class Projections:
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
             pixels; None: photons were not counted.
+        unmeasured: int64 [box, 5], pixels that measured nothing in one view, filled from their neighbours: its number
+            in `view_ids`, first row, row after the last, first column, column after the last.
     """
 
     data: NDArray[np.float32]
@@ -86,6 +91,7 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
+    unmeasured: I64 = field(default_factory=lambda: np.zeros((0, 5), np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +103,14 @@ class Transmission:
         view_ids: int64 [view].
         repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
         beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
+        unmeasured: as of `Projections`.
     """
 
     data: NDArray[np.float32]
     view_ids: NDArray[np.int64]
     repaired: NDArray[np.int64]
     beam: NDArray[np.float32] | None = None
+    unmeasured: I64 = field(default_factory=lambda: np.zeros((0, 5), np.int64))
 
 
 class Correction:
@@ -111,7 +119,14 @@ class Correction:
     For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
     columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
     With the same references and air columns the line integrals are the same to the bit for any split into batches.
+
+    Attributes:
+        masked: bool [row, col], dead and hot pixels, filled in every view.
+        hidden: bool [row, col], areas of them.
+        foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured.foreign_rows`; None: none.
     """
+
+    foreign: Mask | None = None
 
     def __init__(
         self,
@@ -141,7 +156,7 @@ class Correction:
             raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
         if masked is None:
             masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
-        self.masked = masked
+        self.masked, self.hidden = masked, areas(masked)
         self._fill, self._photons, self._dynamic = plan_fill(masked), photons, references.dynamic
         with np.errstate(invalid="ignore", over="ignore"):
             self._flats = [
@@ -208,7 +223,7 @@ class Correction:
         if ids.shape != counts.shape[:1]:
             raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
-        beam = None if self._photons is None else np.empty(counts.shape, np.float32)
+        beam, unmeasured = None if self._photons is None else np.empty(counts.shape, np.float32), [_NONE]
         for v, view in enumerate(data):
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 np.subtract(counts[v], self._dark, out=view, casting="unsafe")
@@ -223,9 +238,23 @@ class Correction:
                 raise ValueError(
                     f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
-            fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
+            unseen = of_light(counts[v], view, self.hidden, self.foreign)
+            if unseen is not None:
+                boxes = boxes_of(unseen)
+                unmeasured.append(np.insert(boxes, 0, ids[v], axis=1))
+                repaired[v] -= np.count_nonzero(bad & unseen)
+                bad |= unseen
+            fill(view, plan_fill(bad | self.masked) if bad.any() else self._fill)
             progress(v + 1)
-        return Transmission(data, ids, repaired, beam)
+        return Transmission(data, ids, repaired, beam, np.concatenate(unmeasured))
+
+    def find_foreign(self, counts: NDArray[np.generic], positions: NDArray[np.float64], angles: F64) -> Mask:
+        """Find `foreign` by views all around, as of `transmission`; angles in radians."""
+        net = border_of(counts) - border_of(self._dark)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            border = net / border_of(self._flats[0][1])
+        self.foreign = foreign_rows(lambda: self.transmission(counts, positions).data, border, angles, self.hidden)
+        return self.foreign
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
@@ -268,7 +297,7 @@ class Correction:
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
-        data, ids, repaired = views.data, views.view_ids, views.repaired
+        data, ids, repaired, unmeasured = views.data, views.view_ids, views.repaired, views.unmeasured
         data /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
         if self._waiting is not None:
@@ -276,14 +305,15 @@ class Correction:
             data = np.concatenate((first.data, data))
             ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
             repaired = np.concatenate((first.repaired, repaired))
+            unmeasured = np.concatenate((first.unmeasured, unmeasured))
             if beam is not None and first.beam is not None:
                 beam = np.concatenate((first.beam, beam))
         n = len(data) if last else max(len(data) - 1, 0)
         replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
-        self._waiting = None
+        self._waiting, done = None, np.isin(unmeasured[:, 0], ids[:n])
         if n < len(data):
             waits = None if beam is None else beam[n:].copy()
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits), air[n:]
+            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits, unmeasured[~done]), air[n:]
         if n:
             self._before = data[n - 1].copy()
         data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
@@ -296,7 +326,9 @@ class Correction:
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * n, 1)
-        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam)
+        return Projections(
+            data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam, unmeasured[done]
+        )
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -369,7 +401,9 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]
-    ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
+    ids, air, unmeasured = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air", "unmeasured")
+    )
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
@@ -379,4 +413,4 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             part = parts.pop(0).data
             data[at : at + len(part)] = part
             at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, unmeasured)
