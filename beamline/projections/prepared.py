@@ -157,10 +157,9 @@ class PreparedProjections:
     def unmeasured_rows(self) -> tuple[I64, I64]:
         """Rows of the detector, binned, that no ray measured; and those of them that lie between others that were, as
         a line that is not read, and are interpolated."""
-        views = np.zeros(self.geometry.detector_shape[0], np.int64)
-        for _, top, bottom, left, right in self.projections.unmeasured.tolist():
-            views[top:bottom] += (left, right) == (0, self.geometry.detector_shape[1])
-        unseen = views >= self.geometry.n_views
+        runs, (height, width) = self.projections.unmeasured, self.geometry.detector_shape
+        whole = runs[(runs[:, 2] == 0) & (runs[:, 3] == width), 1]
+        unseen = np.bincount(whole, minlength=height)[:height] >= self.geometry.n_views
         unseen |= False if self.measured is None else ~self.measured.any(axis=1)
         lost = unseen | self.projections.masked.all(axis=1)
         return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)

@@ -121,14 +121,12 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
     Args:
         first_row: of the detector, at which the (binned) rows begin.
     """
-    unseen, boxes = areas(projections.masked), projections.unmeasured
-    boxes = boxes[~projections.masked.all(axis=1)[boxes[:, 1]]]
-    if boxes.size:
-        frames = np.unique(boxes[:, 0])
-        rows, cols = (
-            spans(np.unique(np.concatenate([np.arange(*box) for box in part])).tolist(), 4)
-            for part in (first_row + binning * boxes[:, 1:3], binning * boxes[:, 3:])
-        )
+    unseen, runs = areas(projections.masked), projections.unmeasured
+    runs = runs[~projections.masked.all(axis=1)[runs[:, 1]]]
+    if runs.size:
+        frames, rows = np.unique(runs[:, 0]), spans(np.unique(first_row + binning * runs[:, 1]).tolist(), 4)
+        ends = np.unique(runs[:, 2:], axis=0) * binning
+        cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
             f"In {count(frames.size, 'view')} of {projections.view_ids.size} (frames {spans(frames.tolist())}) pixels "
             f"of columns {cols} and rows {rows} measured nothing: zeros or no numbers at a border, as where views were "

@@ -38,19 +38,16 @@ class Regions:
         """Mark which rays of these views have reduced weight."""
         return bool(np.isin(self.frames, view_ids).any())
 
-    def and_unmeasured(self, boxes: I64, first_row: int, binning: int) -> Regions:
-        """These, and the boxes of `Projections.unmeasured`, of rays that weigh nothing.
+    def and_unmeasured(self, runs: I64, first_row: int, binning: int) -> Regions:
+        """These, and the runs of `Projections.unmeasured`, of rays that weigh nothing.
 
         Args:
-            first_row: of the detector, at which the binned rows of the boxes begin.
+            first_row: of the detector, at which the binned rows of the runs begin.
         """
-        rows, cols = first_row + binning * boxes[:, 1:3], binning * boxes[:, 3:]
-        return replace(
-            self,
-            frames=np.concatenate((self.frames, boxes[:, 0])),
-            boxes=np.concatenate((self.boxes, np.concatenate((rows, cols), axis=1))),
-            shares=np.concatenate((self.shares, np.zeros(len(boxes), np.float32))),
-        )
+        boxes = runs[:, [1, 1, 2, 3]] * binning + [first_row, first_row + binning, 0, 0]
+        shares = np.concatenate((self.shares, np.zeros(len(runs), np.float32)))
+        frames = np.concatenate((self.frames, runs[:, 0]))
+        return replace(self, frames=frames, boxes=np.concatenate((self.boxes, boxes)), shares=shares)
 
     def weights(self, view_ids: I64, rows: slice, binning: int, shape: tuple[int, int]) -> NDArray[np.float32] | None:
         """[view, row, col] weights of the rays of some views, in binned pixels `shape` of these detector rows.

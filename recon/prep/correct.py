@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import F64, I64, Mask, without_mask
+from recon.base.arrays import I64, Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.masks import Image, areas, fill, plan_fill
 from recon.prep.counts import Photons, of_view
@@ -24,9 +24,10 @@ from recon.prep.references import (
     flat_at,
     zingers,
 )
-from recon.prep.unmeasured import border_of, boxes_of, foreign_rows, of_light
+from recon.prep.unmeasured import runs_of, unmeasured
 
-_NONE = np.zeros((0, 5), np.int64)
+NO_RUNS = np.zeros((0, 4), np.int64)
+NO_RUNS.flags.writeable = False
 
 
 class UnlitViewsError(ValueError):
@@ -79,8 +80,8 @@ class Projections:
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
             pixels; None: photons were not counted.
-        unmeasured: int64 [box, 5], pixels that measured nothing in one view, filled from their neighbours: its number
-            in `view_ids`, first row, row after the last, first column, column after the last.
+        unmeasured: int64 [run, 4], pixels that measured nothing in one view, filled from their neighbours: its number
+            in `view_ids`, row, first column, column after the last.
     """
 
     data: NDArray[np.float32]
@@ -91,7 +92,7 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
-    unmeasured: I64 = field(default_factory=lambda: np.zeros((0, 5), np.int64))
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,7 @@ class Transmission:
     view_ids: NDArray[np.int64]
     repaired: NDArray[np.int64]
     beam: NDArray[np.float32] | None = None
-    unmeasured: I64 = field(default_factory=lambda: np.zeros((0, 5), np.int64))
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
 
 class Correction:
@@ -119,14 +120,7 @@ class Correction:
     For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
     columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
     With the same references and air columns the line integrals are the same to the bit for any split into batches.
-
-    Attributes:
-        masked: bool [row, col], dead and hot pixels, filled in every view.
-        hidden: bool [row, col], areas of them.
-        foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured.foreign_rows`; None: none.
     """
-
-    foreign: Mask | None = None
 
     def __init__(
         self,
@@ -134,6 +128,7 @@ class Correction:
         settings: CorrectionSettings | None = None,
         masked: Mask | None = None,
         photons: Photons | None = None,
+        foreign: Mask | None = None,
     ) -> None:
         """Take the references.
 
@@ -142,6 +137,7 @@ class Correction:
             masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
             photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
                 None: the line integrals are logarithms.
+            foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
 
         Raises:
             ValueError: for shapes that do not fit, no flats, or no beam in the flats.
@@ -156,7 +152,7 @@ class Correction:
             raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
         if masked is None:
             masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
-        self.masked, self.hidden = masked, areas(masked)
+        self.masked, self._hidden, self._foreign = masked, areas(masked), foreign
         self._fill, self._photons, self._dynamic = plan_fill(masked), photons, references.dynamic
         with np.errstate(invalid="ignore", over="ignore"):
             self._flats = [
@@ -223,7 +219,7 @@ class Correction:
         if ids.shape != counts.shape[:1]:
             raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
-        beam, unmeasured = None if self._photons is None else np.empty(counts.shape, np.float32), [_NONE]
+        beam, runs = None if self._photons is None else np.empty(counts.shape, np.float32), [NO_RUNS]
         for v, view in enumerate(data):
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 np.subtract(counts[v], self._dark, out=view, casting="unsafe")
@@ -238,23 +234,13 @@ class Correction:
                 raise ValueError(
                     f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
-            unseen = of_light(counts[v], view, self.hidden, self.foreign)
-            if unseen is not None:
-                boxes = boxes_of(unseen)
-                unmeasured.append(np.insert(boxes, 0, ids[v], axis=1))
+            if (unseen := unmeasured(counts[v], view, self._hidden, self._foreign)) is not None:
+                runs.append(runs_of(unseen, int(ids[v])))
                 repaired[v] -= np.count_nonzero(bad & unseen)
                 bad |= unseen
             fill(view, plan_fill(bad | self.masked) if bad.any() else self._fill)
             progress(v + 1)
-        return Transmission(data, ids, repaired, beam, np.concatenate(unmeasured))
-
-    def find_foreign(self, counts: NDArray[np.generic], positions: NDArray[np.float64], angles: F64) -> Mask:
-        """Find `foreign` by views all around, as of `transmission`; angles in radians."""
-        net = border_of(counts) - border_of(self._dark)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            border = net / border_of(self._flats[0][1])
-        self.foreign = foreign_rows(lambda: self.transmission(counts, positions).data, border, angles, self.hidden)
-        return self.foreign
+        return Transmission(data, ids, repaired, beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
@@ -297,7 +283,7 @@ class Correction:
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
-        data, ids, repaired, unmeasured = views.data, views.view_ids, views.repaired, views.unmeasured
+        data, ids, repaired, runs = views.data, views.view_ids, views.repaired, views.unmeasured
         data /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
         if self._waiting is not None:
@@ -305,15 +291,15 @@ class Correction:
             data = np.concatenate((first.data, data))
             ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
             repaired = np.concatenate((first.repaired, repaired))
-            unmeasured = np.concatenate((first.unmeasured, unmeasured))
+            runs = np.concatenate((first.unmeasured, runs))
             if beam is not None and first.beam is not None:
                 beam = np.concatenate((first.beam, beam))
         n = len(data) if last else max(len(data) - 1, 0)
         replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
-        self._waiting, done = None, np.isin(unmeasured[:, 0], ids[:n])
+        self._waiting, done = None, np.isin(runs[:, 0], ids[:n])
         if n < len(data):
             waits = None if beam is None else beam[n:].copy()
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits, unmeasured[~done]), air[n:]
+            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits, runs[~done]), air[n:]
         if n:
             self._before = data[n - 1].copy()
         data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
@@ -327,7 +313,7 @@ class Correction:
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * n, 1)
         return Projections(
-            data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam, unmeasured[done]
+            data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam, runs[done]
         )
 
     def _likelihood(self, view: Image, beam: Image) -> None:
@@ -401,7 +387,7 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]
-    ids, air, unmeasured = (
+    ids, air, runs = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air", "unmeasured")
     )
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
@@ -413,4 +399,4 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             part = parts.pop(0).data
             data[at : at + len(part)] = part
             at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, unmeasured)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs)
