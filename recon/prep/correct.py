@@ -238,7 +238,7 @@ class Correction:
                 runs.append(runs_of(unseen, int(ids[v])))
                 repaired[v] -= np.count_nonzero(bad & unseen)
                 bad |= unseen
-            fill(view, plan_fill(bad | self.masked) if bad.any() else self._fill)
+            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._fill)
             progress(v + 1)
         return Transmission(data, ids, repaired, beam, np.concatenate(runs))
 

@@ -20,7 +20,7 @@ from recon.base.masks import areas, fill, plan_fill
 DARK = 0.01  # transmission, below which a pixel has no light that counts
 _BLOCK, _RIM = np.ones((3, 3), np.bool_), np.ones((5, 5), np.bool_)  # two pixels: interpolation, blur of an edge
 _FEWEST = 3  # dark pixels, at a border and in an area
-_ONE_VALUE = 0.9  # of the pixels of an area, where it is not noise
+_ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
 _BELOW = 3.0  # standard deviations below the dark, as no camera reads
 _CLEARLY = 0.5  # of the mass that comes and goes, so much may be left without the post
 
@@ -34,16 +34,22 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
         hidden: areas that are masked in all views.
         foreign: bool [row], rows in which what is dark is not the sample, see `foreign_rows`; None: none.
     """
+    if light.min() > DARK:  # never of NaN
+        return None
     low = ~(light > DARK)
     unknown = low & ~np.isfinite(light) & ~hidden
-    some = _corners(low).any() or (foreign is not None and foreign.any())
-    if not low.any() or not (some or unknown.any()):
+    if not (_corners(low).any() or (foreign is not None and foreign.any()) or unknown.any()):
         return None
     labels, found = _at_borders(low, hidden), np.zeros_like(low)
     for label in {*_corners(labels).flat} - {0}:
         part = (labels == label) & low & ~hidden & ~unknown
+        solid = np.mean((low | hidden)[labels == label]) > _ONE_VALUE
         given, seen = values[part], light[part].astype(np.float64)
-        if part.any() and (np.mean(given == np.median(given)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std()):
+        if (
+            part.any()
+            and solid
+            and (np.mean(given == np.median(given)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std())
+        ):
             found |= labels == label
     if foreign is not None:
         found |= (labels > 0) & foreign[:, None]

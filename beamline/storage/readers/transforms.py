@@ -248,6 +248,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
+_ALIKE = 0.2  # of the noise above an edge is below it, where both are light; behind a slit there is readout alone
 
 
 def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
@@ -263,9 +264,13 @@ def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
     top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
     steps = (ends[..., 1:-2] * ends[..., 2:-1] < 0) & (upper[..., :-3] == upper[..., 1:-2])
-    edges = int((steps & (upper[..., 2:-1] == upper[..., 3:])).sum())
+    steps &= upper[..., 2:-1] == upper[..., 3:]
+    edges, change, above = int(steps.sum()), np.abs(np.diff(counts)), upper[..., 1:-2]
+    of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
     most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
     if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
+        return 0, False
+    if np.median(of_low) < _ALIKE * np.median(of_high):
         return 0, False
     left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
     return edges, bool(left.sum() < _A_ROW * edges)
