@@ -199,7 +199,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = selected(base, views)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
         base = as_unsigned(base, dtype)
-    found = [wrapped(images, images.dtype) for images in _some_of_each_kind(base)] if base.finished else []
+    counted = base.finished and not base.plan and base.dtype == np.uint16
+    found = [wrapped(images, images.dtype) for images in _some_of_each_kind(base)] if counted else []
     if any(below for _, below in found) and all(below for edges, below in found if edges):
         base = without_wraps(base, sum(edges for edges, _ in found))
     base = _with_references(base, options, side, replaced=angles is not None)

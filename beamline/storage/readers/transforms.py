@@ -248,7 +248,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
-_ALIKE = 0.2  # of the noise above an edge is below it, where both are light; behind a slit there is readout alone
+_ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 
 
 def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
@@ -258,9 +258,9 @@ def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
     at the top have one value, light was cut off there. 0 for fewer than one in ten rows has.
     """
-    if dtype.kind != "u" or dtype.itemsize != 2 or images.shape[-1] < 4:
+    if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0, False
-    counts, whole = images.astype(np.int64), 2**16
+    counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
     top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
     steps = (ends[..., 1:-2] * ends[..., 2:-1] < 0) & (upper[..., :-3] == upper[..., 1:-2])

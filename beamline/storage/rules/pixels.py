@@ -44,16 +44,17 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     if WRAPPED in source.attributes:
         yield Finding("warning", WRAPPED, str(source.attributes[WRAPPED]))
         return
-    kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype == np.uint16 else ()
+    kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
     frames = [images for kind in kinds if (images := sample(source, kind)) is not None]
     if edges := sum(wrapped(images, source.dtype)[0] for images in frames):
+        least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
         yield Finding(
             "error",
             WRAPPED,
-            f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {edges} pixels near 65535 lie beside ones "
-            "near 0, as whole numbers of 16 bits do that were brighter than 65535 and began again at 0, such as sums "
-            "of pixels or frames. How bright these pixels were is lost, and other references do not help. Make the "
-            "frames again from those of the camera, in 32 bits or as reals.",
+            f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {edges} pixels near {most} lie beside ones "
+            f"near {least}, as whole numbers of 16 bits do that were brighter than {most} and began again at {least}, "
+            "such as sums of pixels or frames. How bright these pixels were is lost, and other references do not help. "
+            "Make the frames again from those of the camera, in 32 bits or as reals.",
         )
 
 
