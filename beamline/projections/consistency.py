@@ -89,11 +89,14 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     Angles, heights, turned frames, masses and an axis that moments of the views disagree with, which hold for a
     parallel beam and a sample within the field; and for others, whether views of the same rays agree. Moments of a part
     of the rows are passed over: those of Diamond
-    24737 above its metal seem to turn by 14 % more, for a reason that is not known.
+    24737 above its metal seem to turn by 14 % more, for a reason that is not known. Views that measured a part of their
+    pixels are left out.
     """
-    geometry, data = prepared.geometry, prepared.projections.data
+    if 0 < (whole := prepared.whole_views).size < prepared.geometry.n_views:
+        prepared = prepared.of_views(whole)
+    geometry = prepared.geometry
     known = prepared.measured is None and prepared.projections.floored <= _FLOORED
-    if geometry.shifts.any() or not geometry.is_straight or len(data) < _LEAST_VIEWS or not known:
+    if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
     laws = _laws_of(prepared, whole=selection.rows is None)
     for law in laws:

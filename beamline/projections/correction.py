@@ -17,7 +17,7 @@ from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
-from beamline.projections.open_beam import OpenBeam, count_references
+from beamline.projections.open_beam import SHADOW_VIEWS, OpenBeam, count_references
 from beamline.projections.read import ViewFilters, read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
@@ -26,10 +26,13 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import Mask
-from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
+from recon.base.views import spread
+from recon.prep.correct import NO_RUNS, Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons
+from recon.prep.unmeasured import DARK, foreign_rows, runs_of, unmeasured
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
+_NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
 
@@ -61,7 +64,7 @@ class ScanCorrection:
         if source.altered:
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
-        self._shadow: Mask | None = None  # [row, col] of the rows read, binned; None: not looked for
+        self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
@@ -133,7 +136,9 @@ class ScanCorrection:
                 progress(min((done + 1) * batch, frames.size), passes * frames.size)
             columns = survey.air_columns
             settings = replace(self._beam.settings, air=columns if any(columns) else "none")
-            stream = Correction(self._beam.references, settings, masked=survey.masked)
+            stream = Correction(
+                self._beam.references, settings, survey.masked, foreign=self._shadow and self._shadow[1]
+            )
             parts = [usable for usable in alive if usable.size]
         at, kept, begun = 0, [], (passes - 1) * frames.size
         for done, part in enumerate(parts):
@@ -213,10 +218,10 @@ class ScanCorrection:
         return more or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
-        """Whether an object stands in the beam of all these views of a finished scan that `feed` took for sample."""
+        """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
         unknown = self._shadow is None
         self._look_for_shadow(views)
-        return unknown and self._shadow is not None and bool(self._shadow.any())
+        return unknown and self._shadow is not None and any(part.any() for part in self._shadow)
 
     def quiet(self) -> ScanCorrection:
         """A correction with the same references for a few views, without warnings."""
@@ -295,9 +300,15 @@ class ScanCorrection:
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:
         """Find what stands in the beam of all views of a finished scan, by some of these; once."""
-        if self._beam is not None and self._shadow is None and self._source.finished:
-            first = self._filters.read(None).start
-            self._shadow = self._beam.shadow(self._source, views, first, self.binning)
+        if self._shadow is not None or not self._source.finished:
+            return
+        read, some = self._filters.read(None), spread(views, SHADOW_VIEWS)
+        if self._beam is not None:
+            self._shadow = self._beam.shadow(self._source, views, read.start, self.binning)
+        elif views.size >= SHADOW_VIEWS:
+            lines = _as_given(read_binned(self._source, some, read, self.binning), some, None).data
+            foreign = foreign_rows(np.exp(-lines), self._source.angles[some])
+            self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
     def _correction(self, rows: slice | None) -> Correction | None:
         """None: the scan holds line integrals already."""
@@ -318,7 +329,8 @@ class ScanCorrection:
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
         if correction is None:
-            return self._filters.apply(_as_given(data, frames), rows)
+            foreign = None if self._shadow is None else self._shadow[1][self._filters.within(rows)]
+            return self._filters.apply(_as_given(data, frames, foreign), rows)
         n = frames.size
         try:
             views = None
@@ -369,14 +381,21 @@ def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: 
     return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
 
 
-def _as_given(data: NDArray[Any], frames: NDArray[np.int64]) -> Projections:
-    """Line integrals that need no correction; a pixel that is not finite takes the value of the nearest that is."""
+def _as_given(data: NDArray[Any], frames: NDArray[np.int64], foreign: Mask | None) -> Projections:
+    """Line integrals that need no correction; a pixel that measured nothing, or is not finite, takes the value of the
+    nearest one. Exact zeros at the corners are measured where air is 0 without noise; `foreign` as of `Correction`."""
     data = data.astype(np.float32, copy=False)
-    bad = ~np.isfinite(data)
-    for view in np.flatnonzero(bad.any(axis=(1, 2))):
-        nearest = ndimage.distance_transform_edt(bad[view], return_distances=False, return_indices=True)
+    bad, unseen, runs = ~np.isfinite(data), np.zeros(data.shape, np.bool_), [NO_RUNS]
+    for view in range(len(data)):
+        light = DARK * (2 + data[view] / np.float32(np.log(DARK)))  # above DARK where transmission is
+        light[(data[view] == 0) & (np.mean(data[view] < 0) > _NOISY)] = 0
+        if (found := unmeasured(data[view], light, unseen[view], foreign)) is not None:
+            runs.append(runs_of(found, int(frames[view])))
+            unseen[view] = found
+    masked, replaced = np.asarray(bad.all(axis=0)), float((bad & ~unseen).mean())
+    for view in np.flatnonzero((bad | unseen).any(axis=(1, 2))):
+        lost = bad[view] | unseen[view]
+        nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
         data[view] = data[view][tuple(nearest)]
     ones = np.ones(len(frames), np.float32)
-    return Projections(
-        data, frames, floored=0.0, air=ones, masked=np.asarray(bad.all(axis=0)), replaced=float(bad.mean())
-    )
+    return Projections(data, frames, 0.0, ones, masked, replaced=replaced, unmeasured=np.concatenate(runs))

@@ -30,8 +30,9 @@ from recon.base.views import spread
 from recon.prep.correct import Correction, CorrectionSettings, References
 from recon.prep.counts import Photons, photon_transfer
 from recon.prep.references import SHADOW_REACH, shadowed
+from recon.prep.unmeasured import foreign_rows
 
-_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
+_LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,24 +98,27 @@ class OpenBeam:
         }
         return cls(references, settings, photons, light, n, used, done)
 
-    def correction(self, rows: slice, shadow: Mask | None) -> Correction:
+    def correction(self, rows: slice, shadow: tuple[Mask, Mask] | None) -> Correction:
         """The correction for some of the rows read, binned.
 
         Args:
-            shadow: bool [row, col] of all rows read, what stands in the beam of all views; None: nothing.
+            shadow: of all rows read, see `shadow`; None: nothing.
 
         Raises:
             ValueError: references that cannot be used.
         """
         references, settings = self.references.rows(rows), self.settings
-        plain = Correction(references, settings, photons=self.photons)
-        if shadow is None or not shadow[rows].any():
+        standing, foreign = (None, None) if shadow is None else (part[rows] for part in shadow)
+        plain = Correction(references, settings, None, self.photons, foreign)
+        if standing is None or not standing.any():
             return plain
-        return Correction(references, settings, plain.masked | shadow[rows], self.photons)
+        return Correction(references, settings, plain.masked | standing, self.photons, foreign)
 
-    def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Mask | None:
-        """bool [row, col], objects in the beam of all views, judged from some of these; None if they are too few to
-        tell.
+    def shadow(
+        self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int
+    ) -> tuple[Mask, Mask] | None:
+        """bool [row, col], objects in the beam of all views, and bool [row], rows in which objects come and go that are
+        not of the sample (`foreign_rows`), judged from some of these; None if they are too few to tell.
 
         Args:
             first: the detector row at which the rows read begin.
@@ -123,14 +127,16 @@ class OpenBeam:
             return None
         references, settings = replace(self.references, dynamic=None), replace(self.settings, air="none")
         in_shadow = np.zeros(references.dark.shape, np.bool_)
-        views = spread(views, _SHADOW_VIEWS)
+        foreign = in_shadow[:, 0].copy()
+        views = spread(views, SHADOW_VIEWS)
         for start in range(0, len(in_shadow), _BAND):
             rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * binning, first + rows.stop * binning)
             data = np.nan_to_num(read_binned(source, views, read, binning))
             light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
             in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-        return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow
+            foreign[rows] |= foreign_rows(light, source.angles[views])
+        return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
 def count_references(source: ScanSource) -> int:

@@ -19,6 +19,7 @@ from beamline.projections.corrections.poses import ScanPoses, poses_of, require_
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import EstimatedStep, ScanStep
+from beamline.projections.read import ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
     report_defects,
@@ -26,6 +27,7 @@ from beamline.projections.scan_warnings import (
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
+    warn_of_unmeasured_rows,
 )
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
@@ -249,19 +251,20 @@ def assemble(
     Raises:
         DataError: fewer than two views, or nothing in the beam.
     """
-    report_defects(projections, warn)
+    rows, (height, width) = rows_of(source, selection), geometry.detector_shape
+    binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
+    report_defects(projections, first, binning, warn)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
     if not projections.data.any():
         raise DataError(f"{source.path}: the chosen views are zero everywhere: there is no sample in the beam.")
     axis_col, estimate = axis
-    rows, (height, width) = rows_of(source, selection), geometry.detector_shape
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
     unknown = areas(unknown)
-    regions, binning = replace(usable.regions, resampling=resampling), selection.binning
+    regions = replace(usable.regions, resampling=resampling).and_unmeasured(projections.unmeasured, first, binning)
 
     def shares_of(views: slice, part: slice) -> NDArray[np.float32] | None:
         within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
@@ -285,6 +288,7 @@ def assemble(
         stretch=_stretch(source, geometry, resampled=resampling is not None),
         sample_radius=_stated_radius(source, selection),
     )
+    warn_of_unmeasured_rows(prepared, warn)
     warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
 

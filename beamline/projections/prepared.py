@@ -149,6 +149,22 @@ class PreparedProjections:
         )
 
     @property
+    def whole_views(self) -> I64:
+        """Numbers of the views of which every pixel measured something, but for pixels that are masked in all."""
+        return np.flatnonzero(~np.isin(self.projections.view_ids, self.projections.unmeasured[:, 0]))
+
+    @property
+    def unmeasured_rows(self) -> tuple[I64, I64]:
+        """Rows of the detector, binned, that no ray measured; and those of them that lie between others that were, as
+        a line that is not read, and are interpolated."""
+        runs, (height, width) = self.projections.unmeasured, self.geometry.detector_shape
+        whole = runs[(runs[:, 2] == 0) & (runs[:, 3] == width), 1]
+        unseen = np.bincount(whole, minlength=height)[:height] >= self.geometry.n_views
+        unseen |= False if self.measured is None else ~self.measured.any(axis=1)
+        lost = unseen | self.projections.masked.all(axis=1)
+        return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)
+
+    @property
     def leaves_slices(self) -> bool:
         """Whether views of a parallel beam see beyond the slices of the volume, because they are shifted along it or
         tilted.
@@ -164,7 +180,8 @@ class PreparedProjections:
     @property
     def without_warnings(self) -> PreparedProjections:
         """The same views without the warnings of the monitor: unmeasured rays have weight 0, all others weight 1."""
-        return replace(self, view_weights=None, shares=None, shares_of=None)
+        shares = None if self.shares is None else (self.shares > 0).astype(np.float32)
+        return replace(self, view_weights=None, shares=shares, shares_of=None)
 
     def ray_factors(self, others: int = 0) -> RayWeights | None:
         """Weights [view, row, col], computed only on request; None if all rays have weight 1.

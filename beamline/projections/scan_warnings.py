@@ -8,6 +8,7 @@ import numpy as np
 
 from beamline.core.quantities import doubt
 from beamline.core.sinks import Note, Warn
+from beamline.core.text import count, spans
 from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.poses import stated_poses
@@ -92,6 +93,19 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
     )
 
 
+def warn_of_unmeasured_rows(prepared: PreparedProjections, warn: Warn) -> None:
+    """Name the slices (of a cone, rows) that no ray measured."""
+    what = "slice" if prepared.geometry.rows_show_slices else "row"
+    lost, between = prepared.unmeasured_rows
+    for rows, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
+        if rows.size:
+            warn(
+                f"No ray measured {count(rows.size, what)} of {len(prepared.projections.masked)} (from 0: "
+                f"{spans(rows.tolist())}): in all views these rows have no beam, no numbers, or dead pixels. They are "
+                f"{so if what == 'slice' else 'not used'}."
+            )
+
+
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
     """A warning for `FieldEdges.passing`."""
     words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
@@ -103,9 +117,24 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
     )
 
 
-def report_defects(projections: Projections, warn: Warn) -> None:
-    """Report repaired pixels if there are more than one in a thousand."""
-    unseen = areas(projections.masked)
+def report_defects(projections: Projections, first_row: int, binning: int, warn: Warn) -> None:
+    """Report what measured nothing, by frames, rows and columns, and repaired pixels if more than one in a thousand.
+
+    Args:
+        first_row: of the detector, at which the (binned) rows begin.
+    """
+    unseen, runs = areas(projections.masked), projections.unmeasured
+    runs = runs[~projections.masked.all(axis=1)[runs[:, 1]]]
+    if runs.size:
+        frames, rows = np.unique(runs[:, 0]), spans(np.unique(first_row + binning * runs[:, 1]).tolist(), 4)
+        ends = np.unique(runs[:, 2:], axis=0) * binning
+        cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
+        warn(
+            f"In {count(frames.size, 'view')} of {projections.view_ids.size} (frames {spans(frames.tolist())}) pixels "
+            f"of columns {cols} and rows {rows} measured nothing: zeros or no numbers at a border, as where views were "
+            "shifted or turned before, or something opaque in the beam that is not the sample, as a post or a clamp. "
+            "These rays weigh nothing."
+        )
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
         (

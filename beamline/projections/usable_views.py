@@ -20,35 +20,41 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Regions of flagged frames in which rays have reduced weight.
+    """Regions of frames in which rays have reduced weight.
 
     Attributes:
         frames: int64 [region], rows of the file.
         boxes: int64 [region, 4], first row, row after the last, first column, column after the last.
         shares: float32 [region], what the rays in it weigh.
-        local: bool [frame of the file], every flag of the frame is of a part of it.
         resampling: of the views, whose pixels were seen elsewhere; None: of none.
     """
 
     frames: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     boxes: I64 = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     shares: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    local: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
         """Mark which rays of these views have reduced weight."""
-        return bool(self._of(view_ids).any())
+        return bool(np.isin(self.frames, view_ids).any())
 
-    def _of(self, view_ids: I64) -> NDArray[np.bool_]:
-        return np.isin(self.frames, view_ids[self.local[view_ids]]) if self.local.size else np.zeros(0, np.bool_)
+    def and_unmeasured(self, runs: I64, first_row: int, binning: int) -> Regions:
+        """These, and the runs of `Projections.unmeasured`, of rays that weigh nothing.
+
+        Args:
+            first_row: of the detector, at which the binned rows of the runs begin.
+        """
+        boxes = runs[:, [1, 1, 2, 3]] * binning + [first_row, first_row + binning, 0, 0]
+        shares = np.concatenate((self.shares, np.zeros(len(runs), np.float32)))
+        frames = np.concatenate((self.frames, runs[:, 0]))
+        return replace(self, frames=frames, boxes=np.concatenate((self.boxes, boxes)), shares=shares)
 
     def weights(self, view_ids: I64, rows: slice, binning: int, shape: tuple[int, int]) -> NDArray[np.float32] | None:
         """[view, row, col] weights of the rays of some views, in binned pixels `shape` of these detector rows.
 
         None where all are 1.
         """
-        chosen = self._of(view_ids)
+        chosen = np.isin(self.frames, view_ids)
         if not chosen.any():
             return None
         height, width = shape
@@ -63,8 +69,12 @@ class Regions:
                 inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
                 weights[at[frame]][inside] *= share
                 continue
+            first, end = max(top - rows.start, 0), max(bottom - rows.start, 0)
+            if not any(edge % binning for edge in (first, end, left, right)):
+                weights[at[frame], first // binning : end // binning, left // binning : right // binning] *= share
+                continue
             fine = np.ones((1, height * binning, width * binning), np.float32)
-            fine[0, max(top - rows.start, 0) : max(bottom - rows.start, 0), left:right] = share
+            fine[0, first:end, left:right] = share
             weights[at[frame]] *= bin_views(fine, binning)[0]
         return weights
 
@@ -173,7 +183,6 @@ def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
         np.array([frame for frame, _, _ in kept], np.int64),
         np.array([box for _, box, _ in kept], np.int64).reshape(-1, 4),
         np.array([share for _, _, share in kept], np.float32),
-        local,
     )
 
 

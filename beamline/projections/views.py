@@ -21,9 +21,10 @@ from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
-from beamline.storage.rules.pixels import quantity_stated
+from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import central_ray_taken, references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
@@ -150,8 +151,10 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
 
 
 def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raise DataError for the errors among the findings, with a remedy for each."""
-    reasons = [finding.message for finding in findings if finding.severity == "error"]
+    """Raise DataError for the errors among the findings, with a remedy for each; numbers that wrapped explain all."""
+    errors = [finding for finding in findings if finding.severity == "error"]
+    wrapped = [finding for finding in errors if finding.rule == WRAPPED]
+    reasons = [finding.message for finding in wrapped or errors]
     if reasons:
         raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
 
@@ -159,5 +162,5 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
     """Reasons why the frames of a running scan cannot be corrected yet."""
     checked = () if selection.step(Preparation).accepted else (references_usable,)
-    rules = (quantity_stated, references_present, *checked)
+    rules = (quantity_stated, references_present, numbers_wrapped, *checked)
     return [finding for rule in rules for finding in rule(source)]

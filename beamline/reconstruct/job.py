@@ -185,7 +185,15 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs, or at once; returns the volume, and the views as used."""
+    """Reconstruct in slabs, or at once; returns the volume, and the views as used. Slices that no ray measured are 0."""
+    made, used = _volume_of(job, decided)
+    lost = [row for row in used.unmeasured_rows[0] if row not in used.unmeasured_rows[1]]
+    if lost and used.geometry.rows_show_slices and len(made.volume.data) == used.geometry.detector_shape[0]:
+        made.volume.data[lost] = 0
+    return made, used
+
+
+def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     prepared, budget = job.prepared, job.options.budget
     if budget is not None:
         with refused(job.options):
@@ -193,7 +201,7 @@ def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPro
                 job.method, budget, prepared.geometry, prepared.box, job.channels.clock.now, job.channels.warn
             )
         job.say(words, "budget")
-        made, used = volume_of(replace(job, options=replace(job.options, method=method, budget=None)), decided)
+        made, used = _volume_of(replace(job, options=replace(job.options, method=method, budget=None)), decided)
         chosen = f"{made.chosen or made.method}; {words}"
         return replace(made, chosen=chosen, settings={**made.settings, "budget": budget}), used
     if not job.slabs:

@@ -39,10 +39,10 @@ def plan_fill(mask: Mask) -> Fill:
         ValueError: all pixels [row, col] are masked.
     """
     rows, cols = mask.shape
-    known = ~mask
+    known, left = ~mask, int(np.count_nonzero(mask))
     r, c = np.nonzero(mask)
     plan: Fill = []
-    while r.size:
+    while left:
         nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
         inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
         nr, nc = np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)
@@ -51,8 +51,9 @@ def plan_fill(mask: Mask) -> Fill:
         if not ready.any():
             raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
         plan.append((r[ready], c[ready], nr[ready], nc[ready], valid[ready]))
-        known[r[ready], c[ready]] = True
-        r, c = r[~ready], c[~ready]
+        known[r[ready], c[ready]], left = True, left - int(ready.sum())
+        beside = inside[ready] & ~known[nr[ready], nc[ready]]  # the next ring
+        r, c = np.divmod(np.unique((nr[ready] * cols + nc[ready])[beside]), cols)
     return plan
 
 

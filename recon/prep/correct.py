@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.arrays import Mask, without_mask
+from recon.base.arrays import I64, Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
-from recon.base.masks import Image, fill, plan_fill
+from recon.base.masks import Image, areas, fill, plan_fill
 from recon.prep.counts import Photons, of_view
 from recon.prep.references import References as References
 from recon.prep.references import (
@@ -24,6 +24,10 @@ from recon.prep.references import (
     flat_at,
     zingers,
 )
+from recon.prep.unmeasured import runs_of, unmeasured
+
+NO_RUNS = np.zeros((0, 4), np.int64)
+NO_RUNS.flags.writeable = False
 
 
 class UnlitViewsError(ValueError):
@@ -76,6 +80,8 @@ class Projections:
         replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
             pixels; None: photons were not counted.
+        unmeasured: int64 [run, 4], pixels that measured nothing in one view, filled from their neighbours: its number
+            in `view_ids`, row, first column, column after the last.
     """
 
     data: NDArray[np.float32]
@@ -86,6 +92,7 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +104,14 @@ class Transmission:
         view_ids: int64 [view].
         repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
         beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
+        unmeasured: as of `Projections`.
     """
 
     data: NDArray[np.float32]
     view_ids: NDArray[np.int64]
     repaired: NDArray[np.int64]
     beam: NDArray[np.float32] | None = None
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
 
 class Correction:
@@ -119,6 +128,7 @@ class Correction:
         settings: CorrectionSettings | None = None,
         masked: Mask | None = None,
         photons: Photons | None = None,
+        foreign: Mask | None = None,
     ) -> None:
         """Take the references.
 
@@ -127,6 +137,7 @@ class Correction:
             masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
             photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
                 None: the line integrals are logarithms.
+            foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
 
         Raises:
             ValueError: for shapes that do not fit, no flats, or no beam in the flats.
@@ -141,7 +152,7 @@ class Correction:
             raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
         if masked is None:
             masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
-        self.masked = masked
+        self.masked, self._hidden, self._foreign = masked, areas(masked), foreign
         self._fill, self._photons, self._dynamic = plan_fill(masked), photons, references.dynamic
         with np.errstate(invalid="ignore", over="ignore"):
             self._flats = [
@@ -208,7 +219,7 @@ class Correction:
         if ids.shape != counts.shape[:1]:
             raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
-        beam = None if self._photons is None else np.empty(counts.shape, np.float32)
+        beam, runs = None if self._photons is None else np.empty(counts.shape, np.float32), [NO_RUNS]
         for v, view in enumerate(data):
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 np.subtract(counts[v], self._dark, out=view, casting="unsafe")
@@ -223,9 +234,13 @@ class Correction:
                 raise ValueError(
                     f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
-            fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
+            if (unseen := unmeasured(counts[v], view, self._hidden, self._foreign)) is not None:
+                runs.append(runs_of(unseen, int(ids[v])))
+                repaired[v] -= np.count_nonzero(bad & unseen)
+                bad |= unseen
+            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._fill)
             progress(v + 1)
-        return Transmission(data, ids, repaired, beam)
+        return Transmission(data, ids, repaired, beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
@@ -268,7 +283,7 @@ class Correction:
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
-        data, ids, repaired = views.data, views.view_ids, views.repaired
+        data, ids, repaired, runs = views.data, views.view_ids, views.repaired, views.unmeasured
         data /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
         if self._waiting is not None:
@@ -276,14 +291,15 @@ class Correction:
             data = np.concatenate((first.data, data))
             ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
             repaired = np.concatenate((first.repaired, repaired))
+            runs = np.concatenate((first.unmeasured, runs))
             if beam is not None and first.beam is not None:
                 beam = np.concatenate((first.beam, beam))
         n = len(data) if last else max(len(data) - 1, 0)
         replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
-        self._waiting = None
+        self._waiting, done = None, np.isin(runs[:, 0], ids[:n])
         if n < len(data):
             waits = None if beam is None else beam[n:].copy()
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits), air[n:]
+            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits, runs[~done]), air[n:]
         if n:
             self._before = data[n - 1].copy()
         data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
@@ -296,7 +312,9 @@ class Correction:
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * n, 1)
-        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam)
+        return Projections(
+            data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam, runs[done]
+        )
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -369,7 +387,9 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     """
     n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]
-    ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
+    ids, air, runs = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air", "unmeasured")
+    )
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
@@ -379,4 +399,4 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             part = parts.pop(0).data
             data[at : at + len(part)] = part
             at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs)

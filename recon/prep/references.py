@@ -105,6 +105,7 @@ def flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tup
 
 _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
 SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
+_WHOLE = 0.9  # of the pixels of a row: noise lights some
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
 
 
@@ -156,11 +157,12 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
     dark &= np.partition(light, n - 2, axis=0)[n - 2] < _DIM  # one view may have a zinger
+    whole = dark.mean(axis=1) > _WHOLE  # a row that is not read has no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     found = left | right[:, ::-1]
-    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))))
+    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))) | whole[:, None])
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:

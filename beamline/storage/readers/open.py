@@ -46,6 +46,8 @@ from beamline.storage.readers.transforms import (
     turned,
     type_wrapped,
     with_kinds,
+    without_wraps,
+    wrapped,
 )
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
@@ -213,6 +215,10 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = selected(base, views)
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
         base = as_unsigned(base, dtype)
+    counted = base.finished and not base.plan and base.dtype == np.uint16
+    found = [wrapped(images, images.dtype) for images in _some_of_each_kind(base)] if counted else []
+    if any(below for _, below in found) and all(below for edges, below in found if edges):
+        base = without_wraps(base, sum(edges for edges, _ in found))
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)

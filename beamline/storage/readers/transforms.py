@@ -282,6 +282,51 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     return dtype if plain < signed or (plain == signed and np.median(images) < 0) else None
 
 
+WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
+_NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
+_ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
+
+
+def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
+    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
+    all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
+
+    Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
+    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has.
+    """
+    if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
+        return 0, False
+    counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
+    top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
+    ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
+    steps = (ends[..., 1:-2] * ends[..., 2:-1] < 0) & (upper[..., :-3] == upper[..., 1:-2])
+    steps &= upper[..., 2:-1] == upper[..., 3:]
+    edges, change, above = int(steps.sum()), np.abs(np.diff(counts)), upper[..., 1:-2]
+    of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
+    most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
+    if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
+        return 0, False
+    if np.median(of_low) < _ALIKE * np.median(of_high):
+        return 0, False
+    left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
+    return edges, bool(left.sum() < _A_ROW * edges)
+
+
+def without_wraps(base: ScanSource, edges: int) -> ScanSource:
+    """A scan whose counts near the end of their range, which lay below a dark taken off them, are 0."""
+    least = 2**16 - 2**16 // _NEAR
+    fact = (
+        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as whole numbers "
+        f"of 16 bits do where the dark taken off them is above them. Those from {least} on are taken as 0. Take darks "
+        "off in reals or signed numbers, so that the noise about 0 is kept."
+    )
+    return Frames(
+        base,
+        pixels=lambda read, frames, rows: (images := read(frames, rows)) * (images < least).astype(images.dtype),
+        attributes=lambda known: {**known, WRAPPED: fact},
+    )
+
+
 def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> ScanSource:
     """The frames of `earlier`, which are complete, and then of `last`, whose path and metadata the scan has.
 

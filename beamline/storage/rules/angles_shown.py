@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.monitor.evidence import lit_places
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
 from beamline.storage.rules.references import LEAST, VIEWS, ViewLight, brightness, reference_groups, seen_frame
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.align import mirror_mismatch
+from recon.prep.unmeasured import DARK
 
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
@@ -71,6 +73,10 @@ class CoarseViews:
         cells, dark, flat = seen_frame(self.source, row).cells, self.light.dark, self.light.flat
         if cells is None or dark is None or flat is None:
             return bool(np.ptp(self._lines(row)))
+        if (lit := lit_places(flat - dark)).any():  # opaque from top to bottom, as what is not of the sample
+            posts = ((cells - dark < DARK * (flat - dark)) | ~lit).all(axis=0) & lit.any(axis=0)
+            if posts.any():
+                return False
         return brightness(cells, dark, flat) > LEAST * self.light.usual
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
-from beamline.storage.rules.pixels import darks_measured, pixels_measured, quantity_stated
+from beamline.storage.rules.pixels import darks_measured, numbers_wrapped, pixels_measured, quantity_stated
 from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, views_first
 from drivers.base.frame import FrameKind
 
@@ -165,6 +165,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_shown,
     quantity_stated,
     references_present,
+    numbers_wrapped,
     darks_measured,
     exposures_agree,
     one_energy,

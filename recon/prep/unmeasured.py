@@ -1,0 +1,112 @@
+"""Unmeasured pixels: which pixels of a view measured nothing, by its values; and whether the sample took their light.
+
+Three kinds: what is not finite; what a shift or a turn of the image moved in, which has one value and holds a corner of
+the frame; and something opaque that is not the sample, such as the post of a load frame, and reaches a border. Metal in
+the sample is as dark. But it stays within the field, so that each row shows it in all views, or holds the same mass
+where a view looks along it: a post comes and goes, and brings mass.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.base.arrays import F32, F64, I64, Mask
+from recon.base.masks import areas, fill, plan_fill
+
+DARK = 0.01  # transmission, below which a pixel has no light that counts
+_BLOCK, _RIM = np.ones((3, 3), np.bool_), np.ones((5, 5), np.bool_)  # two pixels: interpolation, blur of an edge
+_FEWEST = 3  # dark pixels, at a border and in an area
+_ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
+_BELOW = 3.0  # standard deviations below the dark, as no camera reads
+_CLEARLY = 0.5  # of the mass that comes and goes, so much may be left without the post
+
+
+def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: Mask | None) -> Mask | None:
+    """Which pixels [row, col] of a view measured nothing; None: all did, or none.
+
+    Args:
+        values: as stored.
+        light: transmission; NaN: not finite.
+        hidden: areas that are masked in all views.
+        foreign: bool [row], rows in which what is dark is not the sample, see `foreign_rows`; None: none.
+    """
+    if light.min() > DARK:  # never of NaN
+        return None
+    low = ~(light > DARK)
+    unknown = low & ~np.isfinite(light) & ~hidden
+    if not (_corners(low).any() or (foreign is not None and foreign.any()) or unknown.any()):
+        return None
+    labels, found = _at_borders(low, hidden), np.zeros_like(low)
+    for label in {*_corners(labels).flat} - {0}:
+        part = (labels == label) & low & ~hidden & ~unknown
+        solid = np.mean((low | hidden)[labels == label]) > _ONE_VALUE
+        given, seen = values[part], light[part].astype(np.float64)
+        if (
+            part.any()
+            and solid
+            and (np.mean(given == np.median(given)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std())
+        ):
+            found |= labels == label
+    if foreign is not None:
+        found |= (labels > 0) & foreign[:, None]
+    found = (ndimage.binary_dilation(found, _RIM) | areas(unknown)) & ~hidden
+    return found if found.any() and not (found | hidden).all() else None
+
+
+def foreign_rows(light: F32, angles: F64) -> Mask:
+    """Rows [row] whose dark areas at borders come and go, and bring more matter than the other views show there.
+
+    Args:
+        light: transmission [view, row, col], finite, of views all around.
+        angles: of these, radians.
+    """
+    dark = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
+    there = dark.any(axis=2)
+    rows = there.any(axis=0) & ~there.all(axis=0)
+    some = there[:, rows].any(axis=1)
+    if some.all() or not some.any():
+        return np.zeros_like(rows)
+    lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
+    mass = lines.sum(axis=(1, 2), dtype=np.float64)
+    for view in np.flatnonzero(some):
+        fill(lines[view], plan_fill(ndimage.binary_dilation(dark[view], _RIM)[rows]))
+    free = np.flatnonzero(~some)[np.argsort(angles[~some])]
+    usual = np.interp(angles[some], angles[free], mass[free])
+    more, less = mass[some] - usual, lines[some].sum(axis=(1, 2), dtype=np.float64) - usual
+    return rows & (more.sum() > 0 and np.abs(less).sum() < _CLEARLY * np.abs(more).sum())
+
+
+def without_borders(image: NDArray[Any]) -> NDArray[Any]:
+    """An image of counts whose areas of exact zeros at its corners have the value of the nearest pixel beside them."""
+    if (_corners(image) != 0).all():
+        return image
+    labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
+    found = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _RIM)
+    nearest = ndimage.distance_transform_edt(found, return_distances=False, return_indices=True)
+    return image if found.all() else image[tuple(nearest)]
+
+
+def runs_of(mask: Mask, view: int) -> I64:
+    """Runs [run, 4] of the pixels [row, col] of a view: its number, row, first column, column after the last."""
+    edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, left), right = np.nonzero(edges > 0), np.nonzero(edges < 0)[1]
+    return np.stack([np.full(row.size, view), row, left, right], axis=1).astype(np.int64)
+
+
+def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
+    """Areas [row, col] of dark pixels that reach a border of the frame, or what is hidden there, by number; 0: none."""
+    if sum(np.count_nonzero(side) for side in (low[0], low[-1], low[:, 0], low[:, -1])) < _FEWEST:
+        return np.zeros(low.shape, np.int32)
+    dark = np.pad(low | hidden, 3, mode="edge")  # the outer layer goes in closing
+    labels, n = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3], _BLOCK)
+    at_border = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
+    large = np.bincount(labels[low & ~hidden], minlength=n + 1) >= _FEWEST
+    return np.where(np.isin(labels, at_border[at_border > 0]) & large[labels], labels, 0)
+
+
+def _corners(image: NDArray[Any]) -> NDArray[Any]:
+    return image[:: max(len(image) - 1, 1), :: max(image.shape[1] - 1, 1)]

@@ -1,0 +1,42 @@
+"""Counts of 16 bits that wrapped: beyond the largest number, and below the dark that was taken off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.storage.readers.transforms import wrapped
+
+COLS = np.arange(256) - 127.5
+SAMPLE = 1.3 * np.cos(np.pi / 2 * np.minimum(np.abs(COLS) / 80, 1)) ** 2
+
+
+def counts(light: float, profile: float = 0.0) -> np.ndarray:
+    beam = light * (1 - profile * (COLS / 128) ** 2)
+    return np.random.default_rng(0).poisson(np.broadcast_to(beam * np.exp(-SAMPLE), (2, 32, 256))) + 400
+
+
+@pytest.mark.parametrize(("light", "profile"), [(66_000, 0), (80_000, 0), (150_000, 0), (72_000, 0.25)])
+def test_what_is_brighter_than_the_type_begins_again(light: float, profile: float) -> None:
+    edges, below = wrapped((counts(light, profile) % 2**16).astype(np.uint16), np.dtype(np.uint16))
+    assert edges > 0 and not below
+
+
+def test_what_is_below_the_dark_goes_on_at_the_end_and_is_told_from_it() -> None:
+    images = counts(3e4).astype(np.int64) - 400
+    images[:, :, 120:140] = np.random.default_rng(1).normal(0, 8, (2, 32, 20)).round()  # behind metal
+    edges, below = wrapped((images % 2**16).astype(np.uint16), np.dtype(np.uint16))
+    assert edges > 0 and below
+
+
+def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None:
+    images = counts(5e4)
+    cut = images.copy()
+    cut[:, :, :30], cut[:, :, 30:40] = 65_535, 50  # saturated beside a slit
+    slit = counts(6.2e4)
+    slit[:, :, :20] = np.random.default_rng(2).normal(100, 4, (2, 32, 20))
+    images[:, ::7, ::11] = 65_000
+    dim = counts(500)
+    dim[:, ::5, ::13] = 65_000
+    for some in (cut, slit, images, dim):
+        assert wrapped(some.astype(np.uint16), np.dtype(np.uint16)) == (0, False)
