@@ -185,7 +185,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs, or at once; returns the volume, and the views as used. Slices that no ray measured are 0."""
+    """Reconstruct in slabs, or at once; returns the volume, 0 in slices that no ray measured, and the views as used."""
     made, used = _volume_of(job, decided)
     lost = [row for row in used.unmeasured_rows[0] if row not in used.unmeasured_rows[1]]
     if lost and used.geometry.rows_show_slices and len(made.volume.data) == used.geometry.detector_shape[0]:
