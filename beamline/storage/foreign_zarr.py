@@ -21,7 +21,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
-from beamline.storage.packing import packing, values_type
+from beamline.storage.packing import packing
 from beamline.storage.structure import numbers_of, shape_of
 
 METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
@@ -167,7 +167,7 @@ class NamedArray:
         packed = None
         if array.dtype.kind in "uif":
             packed = packing(self.attrs, array.dtype, f"{name} in {file.filename}", by_cil=False)
-        self._values, self.dtype = packed or np.asarray, values_type(array.dtype) if packed else array.dtype
+        self._values, self.dtype = packed or np.asarray, np.result_type(array.dtype, np.float32) if packed else array.dtype
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.array, name)
