@@ -393,7 +393,7 @@ def _as_given(data: NDArray[Any], frames: NDArray[np.int64], foreign: Mask | Non
             runs.append(runs_of(found, int(frames[view])))
             unseen[view] = found
     masked, replaced = np.asarray(bad.all(axis=0)), float((bad & ~unseen).mean())
-    for view in np.flatnonzero((bad | unseen).any(axis=(1, 2))):
+    for view in np.flatnonzero((bad | unseen).any(axis=(1, 2))).tolist():
         lost = bad[view] | unseen[view]
         nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
         data[view] = data[view][tuple(nearest)]

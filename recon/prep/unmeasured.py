@@ -64,8 +64,8 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
         light: transmission [view, row, col], finite, of views all around.
         angles: of these, radians.
     """
-    dark = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
-    there = dark.any(axis=2)
+    dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
+    there: Mask = np.any(dark, axis=2)
     rows = there.any(axis=0) & ~there.all(axis=0)
     some = there[:, rows].any(axis=1)
     if some.all() or not some.any():
