@@ -114,7 +114,7 @@ def report_defects(projections: Projections, warn: Warn) -> None:
         (
             projections.replaced,
             Note,
-            "of the pixels were zingers or not finite: filled from their neighbours.",
+            "of the pixels were bright spots of single views (zingers), or not finite: filled from their neighbours.",
         ),
         (
             projections.floored,

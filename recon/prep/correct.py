@@ -1,13 +1,15 @@
-"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and zingers; then -log, or likelihood."""
+"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and spots; then -log, or likelihood."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from recon.base.arrays import Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
@@ -22,8 +24,12 @@ from recon.prep.references import (
     edge_depth,
     edge_profiles,
     flat_at,
-    zingers,
 )
+from recon.prep.spots import SpotFilter
+from recon.prep.spots import Transmission as Transmission
+
+
+_DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
 
 
 class UnlitViewsError(ValueError):
@@ -38,8 +44,8 @@ class CorrectionSettings:
         floor: lowest transmission; below it, also for zero and negative values, the line integral is -log(floor).
         hot_threshold: robust standard deviations by which a pixel's dark, or its response to the beam, must differ from
             its neighbours to be masked; inf masks none.
-        zinger_threshold: robust standard deviations by which a pixel must be brighter than its neighbours, and than
-            itself in the neighbouring views, to be replaced; inf replaces none.
+        zinger_threshold: standard deviations by which a spot is brighter than what is around it, and than the
+            neighbouring views, see `recon.prep.spots.spots`; inf fills none.
         air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
         divided by their level, or by the line through the levels of both sides.
         sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
@@ -73,7 +79,7 @@ class Projections:
         air: float32 [view], transmission of the air, by which each view was divided, on average; 1 without air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
-        replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
+        replaced: fraction of the live pixels that were spots or not finite in one view; filled from their neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
             pixels; None: photons were not counted.
     """
@@ -86,23 +92,6 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Transmission:
-    """Views divided by the flat, before the correction of air and zingers.
-
-    Attributes:
-        data: float32 [view, row, col], finite; `Correction.line_integrals` takes it over.
-        view_ids: int64 [view].
-        repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
-        beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
-    """
-
-    data: NDArray[np.float32]
-    view_ids: NDArray[np.int64]
-    repaired: NDArray[np.int64]
-    beam: NDArray[np.float32] | None = None
 
 
 class Correction:
@@ -151,23 +140,21 @@ class Correction:
         self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
         self._surveyed: list[NDArray[np.int64]] = []
-        self._before: Image | None = None  # the last returned view, before the logarithm
-        self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
+        self._spots = SpotFilter(self._settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
 
     @property
     def waiting(self) -> bool:
         """Whether the newest view waits for the one after it."""
-        return self._waiting is not None
+        return self._spots.waiting
 
     def provisional(self) -> Projections | None:
         """Line integrals of the waiting view, as if no view followed; None if no view waits.
 
-        It keeps waiting, because all its zingers show only beside both neighbours."""
-        if self._waiting is None:
+        It keeps waiting, because all its spots show only beside both neighbours."""
+        if not self.waiting:
             return None
-        waiting, before = self._waiting, self._before
-        lines = self.line_integrals(None)
-        self._waiting, self._before = waiting, before
+        spots, lines = copy(self._spots), self.line_integrals(None)
+        self._spots = spots
         return lines
 
     @property
@@ -243,22 +230,26 @@ class Correction:
             self._surveyed.append(views.view_ids)
 
     def line_integrals(
-        self, views: Transmission | None, last: bool = True, progress: Callable[[int], None] = lambda done: None
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
     ) -> Projections:
         """Line integrals of these views and of the waiting one; without `last` the newest view then waits.
 
         Args:
             views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
             last: no view comes after these.
-            progress: how many views are free of zingers, after each; the logarithm that follows takes little time.
+            progress: how many views are free of spots, after each; the logarithm that follows takes little time.
+            order: of their neighbours, see `SpotFilter.feed`.
 
         Raises:
             UnlitViewsError: the air columns of some views are dark; it has their numbers.
         """
         settings, columns = self._settings, self.air_columns
         if views is None:
-            rows, cols = self._dark.shape
-            none, empty = np.empty((0, rows, cols), np.float32), np.empty(0, np.int64)
+            none, empty = np.empty((0, *self._dark.shape), np.float32), np.empty(0, np.int64)
             views = Transmission(none, empty, empty, None if self._photons is None else none)
         light = air_light(views.data, *columns)
         air = light.mean(axis=1)
@@ -268,35 +259,21 @@ class Correction:
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
-        data, ids, repaired = views.data, views.view_ids, views.repaired
-        data /= light[:, None]
+        views.data[...] /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
-        if self._waiting is not None:
-            first, first_air = self._waiting
-            data = np.concatenate((first.data, data))
-            ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
-            repaired = np.concatenate((first.repaired, repaired))
-            if beam is not None and first.beam is not None:
-                beam = np.concatenate((first.beam, beam))
-        n = len(data) if last else max(len(data) - 1, 0)
-        replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
-        self._waiting = None
-        if n < len(data):
-            waits = None if beam is None else beam[n:].copy()
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits), air[n:]
-        if n:
-            self._before = data[n - 1].copy()
-        data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
-        for v, view in enumerate(data):
-            if beam is not None:
-                self._likelihood(view, beam[v])
+        views = self._spots.feed(replace(views, air=air, beam=beam), last, progress, order)
+        floored = 0
+        for v, view in enumerate(views.data):
+            if views.beam is not None:
+                self._likelihood(view, views.beam[v])
                 continue
             low = view < settings.floor
             floored += int((low & ~self.masked).sum())
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
-        live = max(int((~self.masked).sum()) * n, 1)
-        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam)
+        live = max(int((~self.masked).sum()) * len(views.data), 1)
+        lines, replaced = (views.data, views.view_ids, floored / live), int(views.repaired.sum()) / live
+        return Projections(*lines, views.air, self.masked, columns, replaced, views.beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -306,21 +283,6 @@ class Correction:
         p, w = of_view(np.maximum(view * light, -extra), light, extra)
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
-
-    def _remove_zingers(self, data: NDArray[np.float32], n: int, progress: Callable[[int], None]) -> int:
-        """Take zingers out of the first `n` views; how many pixels they hit."""
-        if not np.isfinite(self._settings.zinger_threshold):
-            return 0
-        replaced = 0
-        for v in range(n):
-            before = data[v - 1] if v else self._before
-            after = data[v + 1] if v + 1 < len(data) else None
-            others = [image for image in (before, after) if image is not None]
-            r, c, value = zingers(data[v], others, self._settings.zinger_threshold)
-            data[v, r, c] = value
-            replaced += r.size
-            progress(v + 1)
-        return replaced
 
     def _check_views(self, counts: NDArray[np.generic], positions: NDArray[np.float64]) -> None:
         if counts.ndim != 3 or counts.size == 0:
@@ -335,6 +297,64 @@ class Correction:
             raise ValueError(
                 f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
             )
+
+
+class GivenLines:
+    """Line integrals as they are given, as a `Correction` for its caller: pixels that are not finite, and spots, are
+    filled. There is no air, and nothing is masked but pixels [row, col] that no view has."""
+
+    air_columns = (0, 0)
+
+    def __init__(self, zinger_threshold: float) -> None:
+        self.masked: Mask = np.ones((1, 1), np.bool_)
+        self._spots = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
+
+    @property
+    def waiting(self) -> bool:
+        """As of a `Correction`."""
+        return self._spots.waiting
+
+    def provisional(self) -> Projections | None:
+        """As of a `Correction`."""
+        if not self.waiting:
+            return None
+        spots, lines = copy(self._spots), self.line_integrals(None)
+        self._spots = spots
+        return lines
+
+    def transmission(
+        self,
+        lines: NDArray[np.generic],
+        positions: NDArray[np.float64],
+        view_ids: NDArray[np.int64],
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Transmission:
+        """The line integrals; a pixel that is not finite takes the value of the nearest that is."""
+        data = lines.astype(np.float32, copy=False)
+        bad = ~np.isfinite(data)
+        for view in np.flatnonzero(bad.any(axis=(1, 2))):
+            nearest = ndimage.distance_transform_edt(bad[view], return_distances=False, return_indices=True)
+            data[view] = data[view][tuple(nearest)]
+        self.masked = self.masked & bad.all(axis=0)
+        return Transmission(data, view_ids, bad.sum(axis=(1, 2)), None, np.ones(len(data), np.float32))
+
+    def survey(self, views: Transmission) -> None:
+        """There is no air to be found."""
+
+    def line_integrals(
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
+    ) -> Projections:
+        """As of a `Correction`."""
+        if views is None:
+            none, empty = np.empty((0, *self.masked.shape), np.float32), np.empty(0, np.int64)
+            views = Transmission(none, empty, empty, None, np.empty(0, np.float32))
+        views = self._spots.feed(views, last, progress, order)
+        replaced = float(views.repaired.sum()) / max(views.data.size, 1)
+        return Projections(views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced)
 
 
 def correct(
