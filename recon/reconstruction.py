@@ -114,8 +114,8 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
             f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0, -log of the transmission: change the sign. Of differences of views, methods that keep no "
-            "voxel below 0 need allow_negative",
+            "matter are above 0, -log of the transmission: change the sign. Of differences of views, methods that keep "
+            "no voxel below 0 need allow_negative",
             stacklevel=3,
         )
 

@@ -101,7 +101,9 @@ class ScanCorrection:
             self._tell_unlit(asked, frames)
         if not frames.size:
             raise self._no_view()
-        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress, whole=True)
+        return self._corrected(
+            self._correction(rows), data, frames, last=True, rows=rows, progress=progress, whole=True
+        )
 
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
@@ -375,4 +377,3 @@ def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: 
     read = ViewFilters.of(source, selection).read(rows)
     pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
     return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
-

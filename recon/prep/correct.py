@@ -28,7 +28,6 @@ from recon.prep.references import (
 from recon.prep.spots import SpotFilter
 from recon.prep.spots import Transmission as Transmission
 
-
 _DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
 
 
@@ -212,7 +211,7 @@ class Correction:
                 )
             fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
             progress(v + 1)
-        return Transmission(data, ids, repaired, beam)
+        return Transmission(data, ids, repaired, np.ones(len(data), np.float32), beam)
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
@@ -250,7 +249,8 @@ class Correction:
         settings, columns = self._settings, self.air_columns
         if views is None:
             none, empty = np.empty((0, *self._dark.shape), np.float32), np.empty(0, np.int64)
-            views = Transmission(none, empty, empty, None if self._photons is None else none)
+            air = np.empty(0, np.float32)
+            views = Transmission(none, empty, empty, air, None if self._photons is None else none)
         light = air_light(views.data, *columns)
         air = light.mean(axis=1)
         unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
@@ -336,7 +336,7 @@ class GivenLines:
             nearest = ndimage.distance_transform_edt(bad[view], return_distances=False, return_indices=True)
             data[view] = data[view][tuple(nearest)]
         self.masked = self.masked & bad.all(axis=0)
-        return Transmission(data, view_ids, bad.sum(axis=(1, 2)), None, np.ones(len(data), np.float32))
+        return Transmission(data, view_ids, bad.sum(axis=(1, 2)), np.ones(len(data), np.float32))
 
     def survey(self, views: Transmission) -> None:
         """There is no air to be found."""
@@ -351,7 +351,7 @@ class GivenLines:
         """As of a `Correction`."""
         if views is None:
             none, empty = np.empty((0, *self.masked.shape), np.float32), np.empty(0, np.int64)
-            views = Transmission(none, empty, empty, None, np.empty(0, np.float32))
+            views = Transmission(none, empty, empty, np.empty(0, np.float32))
         views = self._spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced)

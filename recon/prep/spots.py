@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,24 +29,26 @@ class Transmission:
         data: float32 [view, row, col], finite; `line_integrals` takes it over.
         view_ids: int64 [view].
         repaired: int64 [view], pixels that were not finite, or a spot; filled from their neighbours.
+        air: float32 [view], transmission of the air by which each view was divided; 1 before.
         beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
-        air: float32 [view], transmission of the air by which each view was divided; None: not yet known.
     """
 
     data: F32
     view_ids: NDArray[np.int64]
     repaired: NDArray[np.int64]
+    air: F32
     beam: F32 | None = None
-    air: F32 | None = None
 
     def __getitem__(self, part: slice | NDArray[np.intp]) -> Transmission:
         """Some of the views."""
-        return Transmission(*(None if each is None else each[part] for each in vars(self).values()))
+        parts: list[Any] = [None if each is None else each[part] for each in vars(self).values()]
+        return Transmission(*parts)
 
     def and_then(self, later: Transmission) -> Transmission:
         """These views and later ones."""
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
-        return Transmission(*(None if first is None else np.concatenate((first, then)) for first, then in pairs))
+        joined: list[Any] = [None if first is None else np.concatenate((first, then)) for first, then in pairs]
+        return Transmission(*joined)
 
 
 class SpotFilter:
@@ -125,7 +128,9 @@ def spots(view: Image, before: Image | None, after: Image | None, threshold: flo
 
 
 @njit(nogil=True, cache=True)
-def _mark(view, before, after, against, limit, brightest, errors, found):
+def _mark(  # type: ignore[no-untyped-def]
+    view, before, after, against, limit, brightest, errors, found
+):
     """Mark the spots of `spots`: `against` is compared with the view before around them; `brightest`: from there on
     light is of no sample; `errors`: the threshold over the median difference of two normal variables."""
     rows, cols = view.shape
@@ -138,9 +143,9 @@ def _mark(view, before, after, against, limit, brightest, errors, found):
                 continue
             along, down = -np.inf, -np.inf  # the least light of the brightest piece of its line that is no spot
             for first in range(-_WIDEST, 1):
-                if 0 <= c + first and c + first + _WIDEST < cols:
+                if c + first >= 0 and c + first + _WIDEST < cols:
                     along = max(along, view[r, c + first : c + first + _WIDEST + 1].min())
-                if 0 <= r + first and r + first + _WIDEST < rows:
+                if r + first >= 0 and r + first + _WIDEST < rows:
                     down = max(down, view[r + first : r + first + _WIDEST + 1, c].min())
             around = min(along, down) if stray and down > -np.inf else max(along, down)
             height = light - max(around, before[r, c] if stray else max(before[r, c], after[r, c]))

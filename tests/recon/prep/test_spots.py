@@ -30,7 +30,12 @@ def filtered(views: F32, ends: tuple[int, ...] = (), threshold: float = 8.0) -> 
     spots, parts = SpotFilter(threshold, lambda image: np.sqrt(np.maximum(image, 0))), []
     for first, end in zip((0, *ends), (*ends, len(views)), strict=True):
         ids = np.arange(first, end)
-        parts.append(spots.feed(Transmission(views[first:end].copy(), ids, np.zeros(ids.size, int)), end == len(views)))
+        parts.append(
+            spots.feed(
+                Transmission(views[first:end].copy(), ids, np.zeros(ids.size, int), np.ones(ids.size, np.float32)),
+                end == len(views),
+            )
+        )
     whole = parts[0]
     for part in parts[1:]:
         whole = whole.and_then(part)
@@ -38,9 +43,11 @@ def filtered(views: F32, ends: tuple[int, ...] = (), threshold: float = 8.0) -> 
 
 
 @pytest.mark.parametrize("rows", [ROWS, 1])
-@pytest.mark.parametrize(("down", "across", "amount"), [(1, 1, 0.4), (2, 2, 0.4), (3, 3, 1.5), (1, 9, 1.5), (12, 2, 1.5)])
+@pytest.mark.parametrize(
+    ("down", "across", "amount"), [(1, 1, 0.4), (2, 2, 0.4), (3, 3, 1.5), (1, 9, 1.5), (12, 2, 1.5)]
+)
 def test_a_spot_goes_and_nothing_else(down: int, across: int, amount: float, rows: int) -> None:
-    """Also as a line, where it is brighter than all light of the view before; not of one row, where it may be an edge."""
+    """Also as a line, where it is brighter than all light of the view before; but not of one row."""
     clean = light(rows=rows)
     views, hit = clean.copy(), np.zeros(clean.shape, bool)
     for view, row, col in ((3, 6, 4), (7, 10, 50), (8, 0, 30)):
@@ -77,6 +84,6 @@ def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
     views[np.random.default_rng(4).random(views.shape) < 0.01] += 0.5
     passes = np.concatenate([np.arange(first, 90, 9) for first in range(9)])
     root: Callable[[F32], F32] = lambda image: np.sqrt(np.maximum(image, 0))  # noqa: E731
-    taken = Transmission(views[passes], passes, np.zeros(90, int))
+    taken = Transmission(views[passes], passes, np.zeros(90, int), np.ones(90, np.float32))
     found = SpotFilter(8.0, root).feed(taken, order=np.argsort(passes))
     np.testing.assert_array_equal(found.data[np.argsort(passes)], filtered(views).data)

@@ -92,4 +92,4 @@ def test_the_mean_of_a_turn_tells_a_lean(roll: float, off: float) -> None:
     )
     found, sigma = roll_of_turn(mean + np.random.default_rng(2).normal(0, 1e-3, mean.shape), 31.5 + off)
     assert np.degrees(found) == pytest.approx(roll, abs=0.1 + 0.15 * abs(roll))
-    assert 0 < sigma and (abs(found) > 4 * sigma) == (roll != 0)
+    assert sigma > 0 and (abs(found) > 4 * sigma) == (roll != 0)
