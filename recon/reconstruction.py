@@ -62,7 +62,7 @@ def reconstruct(
 
     Warns:
         UserWarning: projections are not finite where weights do not leave them out, angles look like degrees,
-            projections like counts or transmission, or, where no voxel may be below 0, like -1 times line integrals.
+            projections like counts or transmission, or like -1 times line integrals.
     """
     projections = without_mask(projections)
     check_arguments(reconstruct, locals())
@@ -77,7 +77,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if not setting(chosen, "allow_negative", True):
+    if not setting(chosen, "allow_negative", False):  # a method with that setting may be asked for such voxels
         _warn_of_negative(data)
     if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
         raise ValueError(sentence)
@@ -113,8 +113,8 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
             f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0: -log of the transmission. This method keeps no voxel below 0: change the sign, or set "
-            "allow_negative",
+            "matter are above 0, -log of the transmission: change the sign. Of differences of views, methods that keep "
+            "no voxel below 0 need allow_negative",
             stacklevel=3,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
@@ -28,8 +30,9 @@ from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.prep.repeats import changes_seen
+from recon.prep.tilt import roll_of_turn
 from recon.voxels.field_edges import FieldEdges
-from recon.voxels.view_weights import covers_the_circle
+from recon.voxels.view_weights import circle_weights, covers_the_circle
 
 _VIEWS = 180  # more do not sharpen the moments, they only cost reading
 _COLUMN_VIEWS = 32  # whose columns are looked at
@@ -45,6 +48,7 @@ _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in stand
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
+_OF_A_STEP = 1 / 3  # by which the turn that views show may differ from the one with both ends, or without
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
@@ -117,6 +121,8 @@ def _laws_of(prepared: PreparedProjections, *, whole: bool) -> list[Law]:
             laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames[some])]
         elif data.shape[1] >= _LEAST_ROWS and whole:
             laws = _laws_within_the_field(prepared, some)
+    if geometry.is_cone and not wide and covers_the_circle(geometry.angles):
+        laws.append(_upright(data, some, geometry))
     if (wide or not air_is_off) and not any(law.broken for law in laws):
         laws.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
     return laws
@@ -133,7 +139,10 @@ def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]
     if masses.broken:  # such views spoil the other moments
         return [masses]
     near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
-    return [masses, _across(shown), _heights(shown), *([_angles(shown, geometry.angles)] if near else [])]
+    turn = _angles(shown, geometry.angles)
+    if ends := _ends(data, geometry, shown.stretch):
+        turn = replace(turn, tolerance=_STRETCH, sentence=f"{ends} {turn.sentence}")
+    return [masses, _across(shown), _heights(shown), *([turn] if near else [])]
 
 
 def compare_with_flats(
@@ -262,6 +271,22 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
     return Law("mass of the views", float(high - low), tolerance, "of the mass", sentence)
 
 
+def _upright(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
+    """The mean view of a full turn is its own mirror image about the axis, in a cone, too."""
+    weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
+    mean = np.zeros(data.shape[1:])
+    for view, weight in zip(some, weights, strict=True):
+        mean += weight * data[view]
+    roll, sigma = roll_of_turn(mean, geometry.axis_col)
+    rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
+    sentence = (
+        f"The rotation axis seems to lean by {tilt_text(roll, sigma)} in the detector's plane, {abs(roll) * rows:.1f} "
+        f"px over {rows} rows: edges double in the first and last slices. Give --calibrate axis,roll with an iterative "
+        "method, such as -m fista-tv."
+    )
+    return Law("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
+
+
 def _across(shown: ViewMoments) -> Law:
     left, right = np.percentile(shown.across, _MOST_OF_THEM)
     sentence = (
@@ -296,6 +321,31 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> Law:
     )
     tolerance = max(_STRETCH, _SURE * shown.stretch_sigma)
     return Law("moments, scale of the angles", abs(shown.stretch), tolerance, "of the angles", sentence)
+
+
+def _ends(data: F32, geometry: Geometry, stretch: float) -> str:
+    """A sentence where the angles are spread over half a turn or a turn with both ends, and the views without, or the
+    reverse: by what the first and the last view show, and by the excess of the turn over the stated one."""
+    order = np.argsort(geometry.angles, kind="stable")
+    (first, second, *_, late, last), span = order, float(np.ptp(geometry.angles))
+    step = span / (order.size - 1)
+    closed = abs(math.remainder(span, math.pi)) < abs(math.remainder(span + step, math.pi))
+    turn = span if closed else span + step
+    if abs(math.remainder(turn, math.pi)) > step / 10 or not 0 < round(turn / math.pi) <= 2:
+        return ""
+    cols = np.arange(data.shape[2])
+    places = cols if round(turn / math.pi) == 2 else 2 * geometry.axis_col - cols
+    again = np.stack([np.interp(places, cols, row) for row in data[last]])
+    change = float(np.square(again - data[first]).mean())
+    of_step = (np.square(data[second] - data[first]).mean() + np.square(data[last] - data[late]).mean()) / 2
+    alike = change < of_step / 2  # 0 and noise where they are of one ray, 1 where they are a step apart
+    if alike == closed or not abs(stretch * order.size + (1 if closed else -1)) < _OF_A_STEP:
+        return ""
+    what = "a step apart" if closed else "of the same rays"
+    return (
+        f"The first and the last view are {what}, where the stated angles {'have' if closed else 'lack'} both ends of "
+        f"{math.degrees(turn):.4g} degrees: the step is {'too large' if closed else 'too small'}, by 1 in {order.size}."
+    )
 
 
 def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> Law:

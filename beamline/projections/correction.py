@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
@@ -27,13 +26,12 @@ from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import Mask
 from recon.base.views import spread
-from recon.prep.correct import NO_RUNS, Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
+from recon.prep.correct import Correction, GivenLines, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons
-from recon.prep.unmeasured import DARK, foreign_rows, runs_of, unmeasured
+from recon.prep.unmeasured import foreign_rows
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
-_NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
-_STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
+_STEPS = 3  # of a frame: it is read, divided by the flat, and freed of spots
 
 
 class NoViewError(DataError):
@@ -73,7 +71,7 @@ class ScanCorrection:
             current_scale(source)  # refuses a file without any
         self._named_unlit: set[int] = set()  # views without light that were named
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
-        self._stream: Correction | None = None
+        self._stream: Correction | GivenLines | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
     @property
@@ -92,7 +90,7 @@ class ScanCorrection:
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            progress: how many of how many frames are done; each is read, divided by the flat, and freed of zingers.
+            progress: how many of how many frames are done; each is read, divided by the flat, and freed of spots.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
@@ -105,7 +103,9 @@ class ScanCorrection:
             self._tell_unlit(asked, frames)
         if not frames.size:
             raise self._no_view()
-        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress)
+        return self._corrected(
+            self._correction(rows), data, frames, last=True, rows=rows, progress=progress, whole=True
+        )
 
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
@@ -125,38 +125,41 @@ class ScanCorrection:
                 f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
         self._look_for_shadow(frames)
+        in_time, frames = np.sort(frames), frames[self._by_angle(frames)]
         parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._beam is None else 2
-        stream, columns, alive = None, (0, 0), []
-        if self._beam is not None and (survey := self._correction(None)) is not None:
+        stream, alive, kept, begun = self._correction(None), [], [], (passes - 1) * frames.size
+        if self._beam is not None:
             for done, part in enumerate(parts):
                 data, usable = self._read(part, None)
                 alive.append(usable)
                 if usable.size:
-                    survey.survey(self._transmission(survey, data, usable))
+                    stream.survey(self._transmission(stream, data, usable))
                 progress(min((done + 1) * batch, frames.size), passes * frames.size)
-            columns = survey.air_columns
+            columns = stream.air_columns
             settings = replace(self._beam.settings, air=columns if any(columns) else "none")
             stream = Correction(
-                self._beam.references, settings, survey.masked, foreign=self._shadow and self._shadow[1]
+                self._beam.references, settings, stream.masked, foreign=self._shadow and self._shadow[1]
             )
             parts = [usable for usable in alive if usable.size]
-        at, kept, begun = 0, [], (passes - 1) * frames.size
         for done, part in enumerate(parts):
             last = done == len(parts) - 1
             data, usable = self._read(part, None)
-            if stream is None and not usable.size:
+            if not usable.size and not (last and stream.waiting):
                 continue
             corrected = self._corrected(stream, data, usable, last)
-            n = len(corrected.data)
-            out[at : at + n] = corrected.data
-            at += n
+            out[np.searchsorted(in_time, corrected.view_ids)] = corrected.data
             kept.append(replace(corrected, data=np.empty((0, *out.shape[1:]), np.float32)))
             progress(begun + min((done + 1) * batch, frames.size), passes * frames.size)
-        self._tell_unlit(frames, np.concatenate([part.view_ids for part in kept]) if kept else frames[:0])
-        if not at:
+        ids = np.sort(np.concatenate([part.view_ids for part in kept])) if kept else frames[:0]
+        self._tell_unlit(in_time, ids)
+        if not ids.size:
             raise self._no_view()
+        for at, place in enumerate(np.searchsorted(in_time, ids)):  # without the views that are left out
+            if at != place:
+                out[at] = out[place]
         masked = np.logical_and.reduce([part.masked for part in kept])
-        return replace(merge_and_empty(kept, out[:at]), masked=masked)
+        found = merge_and_empty(kept, out[: ids.size])
+        return replace(found, masked=masked, view_ids=ids, air=found.air[np.argsort(found.view_ids)])
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
         """Line integrals of the next frames; None while none is ready: the newest view waits for its successor.
@@ -306,14 +309,22 @@ class ScanCorrection:
         if self._beam is not None:
             self._shadow = self._beam.shadow(self._source, views, read.start, self.binning)
         elif views.size >= SHADOW_VIEWS:
-            lines = _as_given(read_binned(self._source, some, read, self.binning), some, None).data
+            given = read_binned(self._source, some, read, self.binning)
+            lines = GivenLines(np.inf).transmission(given, some.astype(np.float64), some).data
             foreign = foreign_rows(np.exp(-lines), self._source.angles[some])
             self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
-    def _correction(self, rows: slice | None) -> Correction | None:
-        """None: the scan holds line integrals already."""
+    def _by_angle(self, frames: NDArray[np.int64]) -> NDArray[np.intp]:
+        """The order of frames in which neighbours are beside each other: as taken, unless that skips angles."""
+        angles = self._source.angles[frames]
+        steps = np.diff(np.unwrap(angles))
+        in_time = (steps >= 0).all() or (steps <= 0).all()
+        return np.arange(frames.size) if in_time else np.argsort(angles, kind="stable")
+
+    def _correction(self, rows: slice | None) -> Correction | GivenLines:
         if self._beam is None:
-            return None
+            foreign = None if self._shadow is None else self._shadow[1][self._filters.within(rows)]
+            return GivenLines(self._selection.step(Preparation).zinger_threshold, foreign)
         try:
             return self._beam.correction(self._filters.within(rows), self._shadow)
         except ValueError as error:
@@ -321,23 +332,22 @@ class ScanCorrection:
 
     def _corrected(
         self,
-        correction: Correction | None,
+        correction: Correction | GivenLines,
         data: NDArray[Any],
         frames: NDArray[np.int64],
         last: bool,
         rows: slice | None = None,
         progress: Callable[[int, int], None] = lambda n, total: None,
+        whole: bool = False,
     ) -> Projections:
-        if correction is None:
-            foreign = None if self._shadow is None else self._shadow[1][self._filters.within(rows)]
-            return self._filters.apply(_as_given(data, frames, foreign), rows)
-        n = frames.size
+        """Line integrals; `whole`: no other frames come, and these have their neighbours by angle."""
+        n, order = frames.size, self._by_angle(frames) if whole else None
         try:
             views = None
             if n:
                 views = self._transmission(correction, data, frames, lambda done: progress((n + done) // _STEPS, n))
                 correction.survey(views)
-            lines = correction.line_integrals(views, last, lambda done: progress((2 * n + done) // _STEPS, n))
+            lines = correction.line_integrals(views, last, lambda done: progress((2 * n + done) // _STEPS, n), order)
             return self._filters.apply(lines, rows)
         except UnlitViewsError as error:
             judged = self._selection.step(Preparation).judged
@@ -350,7 +360,7 @@ class ScanCorrection:
 
     def _transmission(
         self,
-        correction: Correction,
+        correction: Correction | GivenLines,
         data: NDArray[Any],
         frames: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,
@@ -379,23 +389,3 @@ def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: 
     read = ViewFilters.of(source, selection).read(rows)
     pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
     return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
-
-
-def _as_given(data: NDArray[Any], frames: NDArray[np.int64], foreign: Mask | None) -> Projections:
-    """Line integrals that need no correction; a pixel that measured nothing, or is not finite, takes the value of the
-    nearest one. Exact zeros at the corners are measured where air is 0 without noise; `foreign` as of `Correction`."""
-    data = data.astype(np.float32, copy=False)
-    bad, unseen, runs = ~np.isfinite(data), np.zeros(data.shape, np.bool_), [NO_RUNS]
-    for view in range(len(data)):
-        light = DARK * (2 + data[view] / np.float32(np.log(DARK)))  # above DARK where transmission is
-        light[(data[view] == 0) & (np.mean(data[view] < 0) > _NOISY)] = 0
-        if (found := unmeasured(data[view], light, unseen[view], foreign)) is not None:
-            runs.append(runs_of(found, int(frames[view])))
-            unseen[view] = found
-    masked, replaced = np.asarray(bad.all(axis=0)), float((bad & ~unseen).mean())
-    for view in np.flatnonzero((bad | unseen).any(axis=(1, 2))).tolist():
-        lost = bad[view] | unseen[view]
-        nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
-        data[view] = data[view][tuple(nearest)]
-    ones = np.ones(len(frames), np.float32)
-    return Projections(data, frames, 0.0, ones, masked, replaced=replaced, unmeasured=np.concatenate(runs))

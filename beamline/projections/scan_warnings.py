@@ -145,7 +145,7 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
         (
             projections.replaced,
             Note,
-            "of the pixels were zingers or not finite: filled from their neighbours.",
+            "of the pixels were bright spots of single views (zingers), or not finite: filled from their neighbours.",
         ),
         (
             projections.floored,

@@ -167,7 +167,10 @@ class NamedArray:
         packed = None
         if array.dtype.kind in "uif":
             packed = packing(self.attrs, array.dtype, f"{name} in {file.filename}", by_cil=False)
-        self._values, self.dtype = packed or np.asarray, np.result_type(array.dtype, np.float32) if packed else array.dtype
+        self._values, self.dtype = (
+            packed or np.asarray,
+            np.result_type(array.dtype, np.float32) if packed else array.dtype,
+        )
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.array, name)

@@ -1,13 +1,15 @@
-"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and zingers; then -log, or likelihood."""
+"""correct: counts to line integrals by dark and flat; dead pixels, beam drift and spots; then -log, or likelihood."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from recon.base.arrays import I64, Mask, without_mask
 from recon.base.declared_types import check_arguments, check_settings
@@ -22,12 +24,13 @@ from recon.prep.references import (
     edge_depth,
     edge_profiles,
     flat_at,
-    zingers,
 )
-from recon.prep.unmeasured import runs_of, unmeasured
+from recon.prep.spots import SpotFilter
+from recon.prep.spots import Transmission as Transmission
+from recon.prep.unmeasured import DARK, NO_RUNS, runs_of, unmeasured
 
-NO_RUNS = np.zeros((0, 4), np.int64)
-NO_RUNS.flags.writeable = False
+_NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
+_DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
 
 
 class UnlitViewsError(ValueError):
@@ -42,8 +45,8 @@ class CorrectionSettings:
         floor: lowest transmission; below it, also for zero and negative values, the line integral is -log(floor).
         hot_threshold: robust standard deviations by which a pixel's dark, or its response to the beam, must differ from
             its neighbours to be masked; inf masks none.
-        zinger_threshold: robust standard deviations by which a pixel must be brighter than its neighbours, and than
-            itself in the neighbouring views, to be replaced; inf replaces none.
+        zinger_threshold: standard deviations by which a spot is brighter than what is around it, and than the
+            neighbouring views, see `recon.prep.spots.spots`; inf fills none.
         air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
         divided by their level, or by the line through the levels of both sides.
         sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
@@ -77,11 +80,11 @@ class Projections:
         air: float32 [view], transmission of the air, by which each view was divided, on average; 1 without air columns.
         masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
         air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
-        replaced: fraction of the live pixels that were zingers or not finite in one view; filled from their neighbours.
+        replaced: fraction of the live pixels that were spots or not finite in one view; filled from their neighbours.
         weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
             pixels; None: photons were not counted.
-        unmeasured: int64 [run, 4], pixels that measured nothing in one view, filled from their neighbours: its number
-            in `view_ids`, row, first column, column after the last.
+        unmeasured: int64 [run, 4], pixels that measured nothing in a view, filled from their neighbours: the view's
+            number, row, first column, column after the last.
     """
 
     data: NDArray[np.float32]
@@ -92,26 +95,7 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
-    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
-
-
-@dataclass(frozen=True, eq=False)
-class Transmission:
-    """Views divided by the flat, before the correction of air and zingers.
-
-    Attributes:
-        data: float32 [view, row, col], finite; `Correction.line_integrals` takes it over.
-        view_ids: int64 [view].
-        repaired: int64 [view], live pixels that were not finite; filled from their neighbours.
-        beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
-        unmeasured: as of `Projections`.
-    """
-
-    data: NDArray[np.float32]
-    view_ids: NDArray[np.int64]
-    repaired: NDArray[np.int64]
-    beam: NDArray[np.float32] | None = None
-    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
+    unmeasured: I64 = NO_RUNS
 
 
 class Correction:
@@ -162,23 +146,21 @@ class Correction:
         self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
         self._surveyed: list[NDArray[np.int64]] = []
-        self._before: Image | None = None  # the last returned view, before the logarithm
-        self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
+        self._spots = SpotFilter(self._settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
 
     @property
     def waiting(self) -> bool:
         """Whether the newest view waits for the one after it."""
-        return self._waiting is not None
+        return self._spots.waiting
 
     def provisional(self) -> Projections | None:
         """Line integrals of the waiting view, as if no view followed; None if no view waits.
 
-        It keeps waiting, because all its zingers show only beside both neighbours."""
-        if self._waiting is None:
+        It keeps waiting, because all its spots show only beside both neighbours."""
+        if not self.waiting:
             return None
-        waiting, before = self._waiting, self._before
-        lines = self.line_integrals(None)
-        self._waiting, self._before = waiting, before
+        spots, lines = copy(self._spots), self.line_integrals(None)
+        self._spots = spots
         return lines
 
     @property
@@ -240,7 +222,7 @@ class Correction:
                 bad |= unseen
             fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._fill)
             progress(v + 1)
-        return Transmission(data, ids, repaired, beam, np.concatenate(runs))
+        return Transmission(data, ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
@@ -258,23 +240,28 @@ class Correction:
             self._surveyed.append(views.view_ids)
 
     def line_integrals(
-        self, views: Transmission | None, last: bool = True, progress: Callable[[int], None] = lambda done: None
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
     ) -> Projections:
         """Line integrals of these views and of the waiting one; without `last` the newest view then waits.
 
         Args:
             views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
             last: no view comes after these.
-            progress: how many views are free of zingers, after each; the logarithm that follows takes little time.
+            progress: how many views are free of spots, after each; the logarithm that follows takes little time.
+            order: of their neighbours, see `SpotFilter.feed`.
 
         Raises:
             UnlitViewsError: the air columns of some views are dark; it has their numbers.
         """
         settings, columns = self._settings, self.air_columns
         if views is None:
-            rows, cols = self._dark.shape
-            none, empty = np.empty((0, rows, cols), np.float32), np.empty(0, np.int64)
-            views = Transmission(none, empty, empty, None if self._photons is None else none)
+            none, empty = np.empty((0, *self._dark.shape), np.float32), np.empty(0, np.int64)
+            air = np.empty(0, np.float32)
+            views = Transmission(none, empty, empty, air, None if self._photons is None else none)
         light = air_light(views.data, *columns)
         air = light.mean(axis=1)
         unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
@@ -283,38 +270,21 @@ class Correction:
                 f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
                 f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
             )
-        data, ids, repaired, runs = views.data, views.view_ids, views.repaired, views.unmeasured
-        data /= light[:, None]
+        views.data[...] /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
-        if self._waiting is not None:
-            first, first_air = self._waiting
-            data = np.concatenate((first.data, data))
-            ids, air = np.concatenate((first.view_ids, ids)), np.concatenate((first_air, air))
-            repaired = np.concatenate((first.repaired, repaired))
-            runs = np.concatenate((first.unmeasured, runs))
-            if beam is not None and first.beam is not None:
-                beam = np.concatenate((first.beam, beam))
-        n = len(data) if last else max(len(data) - 1, 0)
-        replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
-        self._waiting, done = None, np.isin(runs[:, 0], ids[:n])
-        if n < len(data):
-            waits = None if beam is None else beam[n:].copy()
-            self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits, runs[~done]), air[n:]
-        if n:
-            self._before = data[n - 1].copy()
-        data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
-        for v, view in enumerate(data):
-            if beam is not None:
-                self._likelihood(view, beam[v])
+        views = self._spots.feed(replace(views, air=air, beam=beam), last, progress, order)
+        floored = 0
+        for v, view in enumerate(views.data):
+            if views.beam is not None:
+                self._likelihood(view, views.beam[v])
                 continue
             low = view < settings.floor
             floored += int((low & ~self.masked).sum())
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
-        live = max(int((~self.masked).sum()) * n, 1)
-        return Projections(
-            data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam, runs[done]
-        )
+        live = max(int((~self.masked).sum()) * len(views.data), 1)
+        lines, replaced = (views.data, views.view_ids, floored / live), int(views.repaired.sum()) / live
+        return Projections(*lines, views.air, self.masked, columns, replaced, views.beam, views.unmeasured)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -324,21 +294,6 @@ class Correction:
         p, w = of_view(np.maximum(view * light, -extra), light, extra)
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
-
-    def _remove_zingers(self, data: NDArray[np.float32], n: int, progress: Callable[[int], None]) -> int:
-        """Take zingers out of the first `n` views; how many pixels they hit."""
-        if not np.isfinite(self._settings.zinger_threshold):
-            return 0
-        replaced = 0
-        for v in range(n):
-            before = data[v - 1] if v else self._before
-            after = data[v + 1] if v + 1 < len(data) else None
-            others = [image for image in (before, after) if image is not None]
-            r, c, value = zingers(data[v], others, self._settings.zinger_threshold)
-            data[v, r, c] = value
-            replaced += r.size
-            progress(v + 1)
-        return replaced
 
     def _check_views(self, counts: NDArray[np.generic], positions: NDArray[np.float64]) -> None:
         if counts.ndim != 3 or counts.size == 0:
@@ -353,6 +308,78 @@ class Correction:
             raise ValueError(
                 f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
             )
+
+
+class GivenLines:
+    """Line integrals as they are given, as a `Correction` for its caller: pixels that are not finite or measured
+    nothing, and spots, are filled. There is no air, and nothing is masked but pixels [row, col] that no view has.
+    Exact zeros at the corners are measured where air is 0 without noise."""
+
+    air_columns = (0, 0)
+
+    def __init__(self, zinger_threshold: float, foreign: Mask | None = None) -> None:
+        """`foreign`: as of a `Correction`."""
+        self.masked: Mask = np.ones((1, 1), np.bool_)
+        self._foreign = foreign
+        self._spots = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
+
+    @property
+    def waiting(self) -> bool:
+        """As of a `Correction`."""
+        return self._spots.waiting
+
+    def provisional(self) -> Projections | None:
+        """As of a `Correction`."""
+        if not self.waiting:
+            return None
+        spots, lines = copy(self._spots), self.line_integrals(None)
+        self._spots = spots
+        return lines
+
+    def transmission(
+        self,
+        lines: NDArray[np.generic],
+        positions: NDArray[np.float64],
+        view_ids: NDArray[np.int64],
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Transmission:
+        """The line integrals; a pixel that measured nothing, or is not finite, takes the value of the nearest one."""
+        data = lines.astype(np.float32, copy=False)
+        bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
+        hidden = np.zeros(data.shape[1:], np.bool_)
+        for v, view in enumerate(data):
+            light = DARK * (2 + view / np.float32(np.log(DARK)))  # above DARK where transmission is
+            light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
+            lost = bad[v]
+            if (unseen := unmeasured(view, light, hidden, self._foreign)) is not None:
+                runs.append(runs_of(unseen, int(view_ids[v])))
+                lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
+            repaired[v] += np.count_nonzero(bad[v])
+            if lost.any():
+                nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
+                view[...] = view[tuple(nearest)]
+        self.masked = self.masked & bad.all(axis=0)
+        return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), unmeasured=np.concatenate(runs))
+
+    def survey(self, views: Transmission) -> None:
+        """There is no air to be found."""
+
+    def line_integrals(
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
+    ) -> Projections:
+        """As of a `Correction`."""
+        if views is None:
+            none, empty = np.empty((0, *self.masked.shape), np.float32), np.empty(0, np.int64)
+            views = Transmission(none, empty, empty, np.empty(0, np.float32))
+        views = self._spots.feed(views, last, progress, order)
+        replaced = float(views.repaired.sum()) / max(views.data.size, 1)
+        return Projections(
+            views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured
+        )
 
 
 def correct(

@@ -1,4 +1,4 @@
-"""References: darks and flats, the flat of a view, dead pixels and zingers, and the air beside the sample."""
+"""References: darks and flats, the flat of a view, dead pixels, and the air beside the sample."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from recon.base.arrays import F32, F64, MEDIAN, Mask, median_deviation, without_mask
 from recon.base.declared_types import check_settings
-from recon.base.masks import NEIGHBOURS, Image
+from recon.base.masks import Image
 from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
 
@@ -163,35 +163,6 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     found = left | right[:, ::-1]
     return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))) | whole[:, None])
-
-
-def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """Median and third brightest of the eight neighbours of each (r, c); at the image's edge the brightest."""
-    rows, cols = image.shape
-    nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
-    inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
-    values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
-    values.sort(axis=1)  # NaN, for places outside, come last
-    n, at = inside.sum(axis=1), np.arange(r.size)
-    return (values[at, (n - 1) // 2] + values[at, n // 2]) / 2, values[at, np.where(n == 8, 5, n - 1)]
-
-
-def zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Image]:
-    """Pixels (r, c) hit by a stray photon, and the median around each.
-
-    Compared in √transmission, where photon noise is uniform. A bright feature of the sample is also in the neighbouring
-    views, or is larger than the two or three pixels of a zinger. A zinger is brighter than both.
-    """
-    root = np.sqrt(np.maximum(view, 0))
-    step = max(1, int(np.sqrt(view.size / 4096)))
-    r, c = (a.ravel() for a in np.meshgrid(*(np.arange(0, n, step) for n in view.shape), indexing="ij"))
-    spread = root[r, c] - _around(root, r, c)[0]
-    limit = threshold * max(median_deviation(spread), 0.005)
-    before = np.sqrt(np.maximum(np.maximum.reduce(others), 0)) if others else np.zeros_like(root)
-    r, c = np.nonzero(root > before + limit)
-    middle, brightest = _around(root, r, c)
-    spikes = root[r, c] > brightest + limit
-    return r[spikes], c[spikes], middle[spikes] ** 2
 
 
 _NEXT, _OUTER = 5, 3  # views next to flats; columns

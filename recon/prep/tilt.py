@@ -127,3 +127,36 @@ def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64
     return np.asarray(
         minimize(total, start, method="Nelder-Mead", options={"initial_simplex": corners, "xatol": 1e-5}).x
     )
+
+
+def roll_of_turn(mean: F64, axis_col: float) -> tuple[float, float]:
+    """The lean of the axis in the detector's plane, by the mean view of a full turn, and its standard deviation.
+
+    That is the view of the sample turned into a body of revolution, so that its halves beside the axis are mirror
+    images, in a cone as in a parallel beam. A lean turns it, a wrong axis moves it, a detector that faces the beam
+    askew or light that slopes across it skew it: the difference of the halves is fitted by all of these. The deviation
+    is the jackknife over bands of rows.
+
+    Args:
+        mean: float64 [row, col], line integrals.
+        axis_col: about which the halves are compared; it may be off by a pixel or two.
+
+    Returns:
+        Radians, as `Geometry.roll`; NaN where the field has no two halves.
+    """
+    rows, cols = mean.shape
+    reach = int(min(axis_col, cols - 1 - axis_col))
+    if reach < FEWEST_COLS // 2 or rows < 2 * FEWEST_BANDS:
+        return math.nan, math.nan
+    across, heights = np.arange(-reach, reach + 1.0), np.arange(rows)[:, None] - (rows - 1) / 2
+    seen = np.stack([np.interp(axis_col + across, np.arange(cols), row) for row in mean])
+    even, odd = (seen + seen[:, ::-1]) / 2, (seen - seen[:, ::-1]) / 2
+    down, along = np.gradient(even)
+    askew = across**2 * along + heights * across * down
+    parts = np.stack([across * down - heights * along, -along, askew, across * even, across + 0 * heights])
+    bands = [np.s_[:, part] for part in np.array_split(np.arange(rows), 2 * FEWEST_BANDS)]
+    flat = [(parts[band].reshape(len(parts), -1), odd[band[1]].ravel()) for band in bands]
+    normal, right = np.stack([p @ p.T for p, _ in flat]), np.stack([p @ o for p, o in flat])
+    without = np.linalg.pinv(normal.sum(axis=0) - normal) @ (right.sum(axis=0) - right)[..., None]
+    roll = float((np.linalg.pinv(normal.sum(axis=0)) @ right.sum(axis=0))[0])
+    return roll, float(np.sqrt((len(bands) - 1) * without[:, 0, 0].var()))

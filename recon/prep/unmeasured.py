@@ -17,6 +17,8 @@ from scipy import ndimage
 from recon.base.arrays import F32, F64, I64, Mask
 from recon.base.masks import areas, fill, plan_fill
 
+NO_RUNS = np.zeros((0, 4), np.int64)
+NO_RUNS.flags.writeable = False
 DARK = 0.01  # transmission, below which a pixel has no light that counts
 _BLOCK, _RIM = np.ones((3, 3), np.bool_), np.ones((5, 5), np.bool_)  # two pixels: interpolation, blur of an edge
 _FEWEST = 3  # dark pixels, at a border and in an area

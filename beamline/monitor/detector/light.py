@@ -104,15 +104,15 @@ class ZingersCheck(Logged):
         score = n / context.pixels
         if score > self.warn and n > FEW:
             advice = (
-                f"{n} bright spots that are in no other frame. `beamline recon` fills them, but so many hide what is "
-                "behind them: shield the detector against scattered and direct X-rays."
+                f"{n} bright spots that are in no other frame. `beamline recon` fills those of up to 3 x 3 pixels, "
+                "but so many hide what is behind them: shield the detector against scattered and direct X-rays."
             )
             return Look(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
         if state.views != VIEWS or not state.zingers:
             return Look(state)
         advice = (
             f"The first {VIEWS} views have {state.zingers} bright spots that are in one frame only. `beamline recon` "
-            "fills them from their neighbours."
+            "fills those of up to 3 x 3 pixels from their neighbours."
         )
         score = state.zingers / VIEWS / context.pixels
         return Look(state, Flag(self.name, Level.INFO, frame.index, score, self.warn, advice))

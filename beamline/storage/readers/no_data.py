@@ -86,7 +86,8 @@ def _end_in(source: ScanSource, row: int) -> Mask:
 def counts_photons(source: ScanSource) -> bool:
     """Whether flats fluctuate like counted photons: with the variance of their mean, so that they have no offset.
 
-    Of a camera the variance over the mean is its gain, times the share of the light in its counts.
+    Of a camera the variance over the mean is its gain, times the share of the light in its counts, which is less where
+    there is less light, as in dark corners: both halves of the pixels must agree.
     """
     rows = np.flatnonzero(source.image_key == FrameKind.FLAT)[: 2 * _LOOKED_AT]
     if rows.size < 2 or source.dtype.kind not in "iu":
@@ -98,6 +99,6 @@ def counts_photons(source: ScanSource) -> bool:
     pairs = (rows.size - 1) * int(lit.sum())
     if pairs < _FEWEST or not level.min() > 0:
         return False
-    even = flats[:, lit] * (level.mean() / level)[:, None]
-    ratio = float(np.square(np.diff(even, axis=0)).mean() / 2 / level.mean())
-    return abs(ratio - 1) < _PHOTONS + _ERRORS * np.sqrt(2 / pairs)
+    even, bright = flats * (level.mean() / level)[:, None], mean > np.median(mean[lit])
+    ratios = [np.square(np.diff(even[:, part], axis=0)).mean() / 2 / mean[part].mean() for part in (bright, ~bright)]
+    return all(abs(float(ratio) - 1) < _PHOTONS + _ERRORS * np.sqrt(4 / pairs) for ratio in ratios)

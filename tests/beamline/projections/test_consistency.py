@@ -54,6 +54,17 @@ def test_angles_of_another_scale(scale: float) -> None:
     assert "--angles" in sentence
 
 
+@pytest.mark.parametrize("turn", [180.0, 360.0])
+@pytest.mark.parametrize("taken", [True, False])
+def test_angles_with_both_ends_of_views_without_and_the_reverse(turn: float, taken: bool) -> None:
+    """The wrong ends are told by name, the right ones are not."""
+    stated = {ends: np.radians(np.linspace(0, turn, 45, endpoint=ends)) for ends in (True, False)}
+    views = Balls(stated[taken], (24, 72), AXIS).views() + np.random.default_rng(3).normal(0, 0.01, (45, 24, 72))
+    assert told(views, angles=stated[taken]) == []
+    (sentence,) = told(views, angles=stated[not taken])
+    assert f"both ends of {turn:g} degrees" in sentence and ("too small" if taken else "too large") in sentence
+
+
 def test_a_faint_sample_that_shrinks_is_told_by_views_of_the_same_rays() -> None:
     twice = np.linspace(0, 4 * np.pi, len(VIEWS))  # view 44 sees the rays of view 0
     noise = np.random.default_rng(3).normal(0, 0.002, VIEWS.shape)

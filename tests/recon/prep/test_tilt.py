@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recon.prep.resample import Resampling
-from recon.prep.tilt import TiltEstimate, find_tilt
+from recon.prep.tilt import TiltEstimate, find_tilt, roll_of_turn
 from tests.recon.prep.balls import Balls
 
 HALF = Balls(np.radians(np.arange(0, 180, 2.0)))
@@ -77,3 +77,19 @@ def test_what_does_not_show_an_axis_is_refused() -> None:
             _found(noise[:, :, :cols], HALF.angles)
     with pytest.raises(ValueError, match="3 bands of rows are too few; at least 4"):
         find_tilt(noise[:, :3], np.arange(3.0), HALF.angles)
+
+
+@pytest.mark.parametrize("roll", [0.0, -0.5, 1.0, 3.0])
+@pytest.mark.parametrize("off", [0.0, 0.7])
+def test_the_mean_of_a_turn_tells_a_lean(roll: float, off: float) -> None:
+    """Discs about an axis that leans, of unlike heights and sizes; a light that slopes, and an axis said wrongly."""
+    rows, cols = np.mgrid[:64, :64] - 31.5
+    lean = np.radians(roll)
+    across, down = cols * np.cos(lean) - rows * np.sin(lean), cols * np.sin(lean) + rows * np.cos(lean)
+    mean = 2e-3 * cols + sum(
+        mu * np.sqrt(np.clip(r**2 - across**2 - (down - z) ** 2, 0, None))
+        for z, r, mu in ((0, 20, 0.01), (22, 12, 0.02), (-20, 10, 0.03))
+    )
+    found, sigma = roll_of_turn(mean + np.random.default_rng(2).normal(0, 1e-3, mean.shape), 31.5 + off)
+    assert np.degrees(found) == pytest.approx(roll, abs=0.1 + 0.15 * abs(roll))
+    assert sigma > 0 and (abs(found) > 4 * sigma) == (roll != 0)

@@ -28,6 +28,8 @@ _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # growth of the largest line integral, as a share, from which on there is hardening
+_FEWEST, _BUSIEST = 30, 8  # views, and binned rows, by which hardening is sought where nobody asked
+_EVENED, _MATTERS = 0.5, 0.05  # a quarter of the variance, which of 30 views is no chance (F: 1e-4); share of density
 _AS_EVEN = 1e-3  # that the mass may vary more: the correction amplifies noise, too
 _CURVED = 16  # float32 copies of a view while a curve corrects it
 _RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
@@ -87,7 +89,7 @@ class Hardening:
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
         if self.model is None:
-            return StepDone("", {"hardening": "not corrected"})
+            return StepDone(_clearly_seen(views), {"hardening": "not corrected"})
         curve, sentence = curve_of(views.projections.data, views.geometry, self)
         if curve is not None:
             curve.linearise(views.projections.data, views.projections.weights)
@@ -137,7 +139,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
         curve, how = curve_of_spectrum(*step.spectrum, highest), f"of {step.model}"
     else:
         try:
-            curve, explained = fitted(views, geometry)
+            curve, explained, _ = fitted(views, geometry)
         except NoCurveError as error:
             return None, f"Hardening: not determined by the views ({error}); none corrected."
         how = f"fitted on the views; one material explains {explained:.1%} of them"
@@ -159,7 +161,31 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
     return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))
 
 
-def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
+def _clearly_seen(views: PreparedProjections) -> str:
+    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else nothing."""
+    from recon.features.beam_hardening import NoCurveError
+    from recon.voxels.field_edges import FieldEdges, busiest_rows
+
+    data, geometry = views.ordinary.projections.data, views.ordinary.geometry
+    plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
+    if not plain or geometry.n_views < _FEWEST or FieldEdges.of(data, geometry).beyond():
+        return ""
+    rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
+    try:
+        curve, _, evened = fitted(data[:, rows], geometry.rows(rows.start, rows.stop))
+    except (NoCurveError, ValueError):
+        return ""
+    corrected = float(np.interp(highest := float(data[:, rows].max()), curve.measured, curve.corrected))
+    if evened > _EVENED or corrected < (1 + _MATTERS) * highest:
+        return ""
+    return (
+        f"Hardening: line integrals of {highest:.3g} would be {corrected:.3g} by the curve of one material, and the "
+        f"mass of a row would vary {1 / evened:.2g} times less from view to view; nothing was corrected. Give "
+        "--hardening fit if the sample is of one material"
+    )
+
+
+def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     """Fit the curve to path lengths from a first reconstruction, assuming one material.
 
     The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of
@@ -167,6 +193,10 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
 
     A sample that is denser outside than inside looks the same in any one view. But all views of a row hold the same
     mass (the first of the Helgason-Ludwig conditions), and a wrong curve spoils that.
+
+    Returns:
+        The curve, the share of the line integrals that path lengths explain, and the variation of the masses of
+        corrected views over that of the views.
 
     Raises:
         NoCurveError: the sample is of several materials, the curve does not settle, or it makes masses differ more. Or
@@ -201,7 +231,7 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
                     f"corrected views agree less with each other: their mass varies by {after:.2%} instead of "
                     f"{uneven:.2%}, as where a sample is denser outside"
                 )
-            return curve, explained
+            return curve, explained, after / max(uneven, 1e-30)
     raise NoCurveError(f"the curve does not converge in {_ROUNDS} iterations")
 
 

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.projections.corrections.beam_hardening.hardening import Hardening, curve_of
+from beamline.projections.selection import Selection
 from recon.base.geometry import Geometry
 from simulators.effects.beam.energies import BeamHardening
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder
+from tests.beamline.array_source import ArraySource
+from tests.beamline.prepared_views import prepare
 from tests.simulators import shots
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,6 +50,18 @@ def test_a_body_is_as_dense_inside_as_near_its_surface(sample: Phantom, wanted: 
     assert after[middle].mean() == pytest.approx(ATTENUATION, rel=within)  # few rays are thin enough to fix the scale
     assert after[middle].mean() == pytest.approx(after[outside].mean(), rel=0.03)
     assert before[middle].mean() < 0.88 * before[outside].mean()
+
+
+def test_hardening_that_nobody_asked_to_correct_is_said_where_the_masses_show_it() -> None:
+    bar = Phantom.of((Box((60.0, 16.0, 8.0), ATTENUATION), Cylinder(5.0, 8.0, ATTENUATION, centre=(15.0, 18.0, 0.0))))
+    said = {}
+    for energies in (ENERGIES, (30.0,)):
+        source = ArraySource(views := _views(bar, energies), [0] * len(views), GEOMETRY.angles)
+        source.quantity = "line_integrals"
+        scan, _ = prepare(source, Selection(axis_col=49.5))
+        said[energies] = scan.done["hardening"].sentence
+        np.testing.assert_array_equal(scan.projections.data, views)
+    assert "Give --hardening fit" in said[ENERGIES] and not said[(30.0,)]
 
 
 def test_one_energy_and_two_materials_are_left_as_they_are() -> None:

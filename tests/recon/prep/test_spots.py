@@ -1,0 +1,89 @@
+"""Spots of a single view are filled, and nothing that a sample, a detector or noise shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from recon.base.arrays import F32
+from recon.prep.spots import SpotFilter, Transmission
+
+VIEWS, ROWS, COLS, LIGHT = 12, 24, 60, 4e4
+
+
+def light(views: int = VIEWS, photons: float = LIGHT, rows: int = ROWS) -> F32:
+    """Transmission of two opaque pins with sharp edges that turn by many pixels a view, and of a smooth body."""
+    rng, cols = np.random.default_rng(1), np.arange(COLS)
+    out = np.empty((views, rows, COLS), np.float32)
+    for at, angle in enumerate(np.linspace(0, np.pi, views, endpoint=False)):
+        lines = 0.05 * np.sqrt(np.clip(25.0**2 - (cols - 29.5) ** 2, 0, None))
+        for radius, phase in ((18.0, 0.0), (15.0, 2.0)):
+            lines = lines + 1.0 * (np.abs(cols - 29.5 - radius * np.cos(angle + phase)) < 3)
+        out[at] = rng.poisson(photons * np.exp(-np.broadcast_to(lines, (rows, COLS)))) / photons
+    return out
+
+
+def filtered(views: F32, ends: tuple[int, ...] = (), threshold: float = 8.0) -> Transmission:
+    """The views after the filter, in batches that end at `ends`."""
+    spots, parts = SpotFilter(threshold, lambda image: np.sqrt(np.maximum(image, 0))), []
+    for first, end in zip((0, *ends), (*ends, len(views)), strict=True):
+        ids = np.arange(first, end)
+        parts.append(
+            spots.feed(
+                Transmission(views[first:end].copy(), ids, np.zeros(ids.size, int), np.ones(ids.size, np.float32)),
+                end == len(views),
+            )
+        )
+    whole = parts[0]
+    for part in parts[1:]:
+        whole = whole.and_then(part)
+    return whole
+
+
+@pytest.mark.parametrize("rows", [ROWS, 1])
+@pytest.mark.parametrize(
+    ("down", "across", "amount"), [(1, 1, 0.4), (2, 2, 0.4), (3, 3, 1.5), (1, 9, 1.5), (12, 2, 1.5)]
+)
+def test_a_spot_goes_and_nothing_else(down: int, across: int, amount: float, rows: int) -> None:
+    """Also as a line, where it is brighter than all light of the view before; but not of one row."""
+    clean = light(rows=rows)
+    views, hit = clean.copy(), np.zeros(clean.shape, bool)
+    for view, row, col in ((3, 6, 4), (7, 10, 50), (8, 0, 30)):
+        hit[view, row % rows : row % rows + down, col : col + across] = True
+    views[hit] += amount
+    found = filtered(views)
+    edge = rows == 1 and across > 3
+    assert (found.repaired.sum() < 0.5 * hit.sum()) if edge else (found.repaired.sum() >= 0.9 * hit.sum())
+    np.testing.assert_array_equal(found.data[~hit], clean[~hit])
+    assert edge or np.abs(found.data[hit] - clean[hit]).mean() < amount / 4
+
+
+@pytest.mark.parametrize("views", [4, 12, 90])
+@pytest.mark.parametrize("photons", [30.0, 100.0, LIGHT])
+def test_sharp_edges_of_few_views_noise_and_pixels_that_stay_are_left(views: int, photons: float) -> None:
+    clean = light(views, photons)
+    clean[:, 5, 7] += 1.0  # a hot pixel
+    assert not filtered(clean).repaired.any()
+
+
+@pytest.mark.parametrize("ends", [(1, 2, 3), (5,), (11,)])
+def test_batches_are_the_views_at_once_to_the_bit(ends: tuple[int, ...]) -> None:
+    clean = light(90)
+    hit = np.random.default_rng(4).random(clean.shape) < 0.02
+    views = clean + hit.astype(np.float32)
+    whole, parts = filtered(views), filtered(views, ends)
+    np.testing.assert_array_equal(parts.data, whole.data)
+    np.testing.assert_array_equal(parts.repaired, whole.repaired)
+    assert whole.repaired.sum() > 0.85 * hit.sum()  # the others lie where edges pass, or beside one another
+
+
+def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
+    views = light(90)
+    views[np.random.default_rng(4).random(views.shape) < 0.01] += 0.5
+    passes = np.concatenate([np.arange(first, 90, 9) for first in range(9)])
+    root: Callable[[F32], F32] = lambda image: np.sqrt(np.maximum(image, 0))  # noqa: E731
+    taken = Transmission(views[passes], passes, np.zeros(90, int), np.ones(90, np.float32))
+    found = SpotFilter(8.0, root).feed(taken, order=np.argsort(passes))
+    np.testing.assert_array_equal(found.data[np.argsort(passes)], filtered(views).data)
