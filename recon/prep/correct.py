@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -95,7 +95,7 @@ class Projections:
     air_columns: tuple[int, int] = (0, 0)
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
-    unmeasured: I64 = NO_RUNS
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
 
 class Correction:

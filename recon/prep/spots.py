@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ class Transmission:
     repaired: NDArray[np.int64]
     air: F32
     beam: F32 | None = None
-    unmeasured: I64 = NO_RUNS
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
     def __getitem__(self, part: slice | NDArray[np.intp]) -> Transmission:
         """Some of the views."""
