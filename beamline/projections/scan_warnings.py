@@ -124,7 +124,7 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
         first_row: of the detector, at which the (binned) rows begin.
     """
     unseen, runs = areas(projections.masked), projections.unmeasured
-    runs = runs[~projections.masked.all(axis=1)[runs[:, 1]]]
+    runs = runs[~np.asarray(projections.masked.all(axis=1))[runs[:, 1]]]
     if runs.size:
         frames, rows = np.unique(runs[:, 0]), spans(np.unique(first_row + binning * runs[:, 1]).tolist(), 4)
         ends = np.unique(runs[:, 2:], axis=0) * binning

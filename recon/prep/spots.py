@@ -44,9 +44,9 @@ class Transmission:
 
     def __getitem__(self, part: slice | NDArray[np.intp]) -> Transmission:
         """Some of the views."""
-        *of_views, runs = vars(self).values()
-        parts: list[Any] = [None if each is None else each[part] for each in of_views]
-        return Transmission(*parts, unmeasured=runs[np.isin(runs[:, 0], self.view_ids[part])])
+        ids, beam = self.view_ids[part], None if self.beam is None else self.beam[part]
+        runs = self.unmeasured[np.isin(self.unmeasured[:, 0], ids)]
+        return Transmission(self.data[part], ids, self.repaired[part], self.air[part], beam, runs)
 
     def and_then(self, later: Transmission) -> Transmission:
         """These views and later ones."""

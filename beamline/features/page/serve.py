@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 import psutil
 import uvicorn
@@ -131,7 +132,7 @@ class _Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.since = time.monotonic()
-        there = [each for each in self.connections if not each.transport.is_closing()]
+        there: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
         idle = [each for each in there if each.cycle is None or each.cycle.response_complete]
         if idle and len(there) > CONNECTIONS:
             min(idle, key=attrgetter("since")).transport.abort()
