@@ -66,6 +66,10 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
         light: transmission [view, row, col], finite, of views all around.
         angles: of these, radians.
     """
+    lit = (light > DARK).any(axis=(1, 2))
+    light, angles = light[lit], angles[lit]
+    if not lit.any():
+        return np.zeros(light.shape[1], np.bool_)
     dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
     there: Mask = np.any(dark, axis=2)
     rows = there.any(axis=0) & ~there.all(axis=0)

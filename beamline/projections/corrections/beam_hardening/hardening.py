@@ -171,6 +171,8 @@ def _clearly_seen(views: PreparedProjections) -> str:
     if not plain or geometry.n_views < _FEWEST or FieldEdges.of(data, geometry).beyond():
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
+    if not data[:, rows].mean() > 0:
+        return ""
     try:
         curve, _, evened = fitted(data[:, rows], geometry.rows(rows.start, rows.stop))
     except (NoCurveError, ValueError):
