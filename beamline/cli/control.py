@@ -44,34 +44,37 @@ def _command(verb: str, help_text: str) -> click.Command:
 def _send(run: Path | None, word: str) -> None:
     """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # here: help does not need it
+    from beamline.core.files import EVENTS, parts_of
     from beamline.scan.control import Verb, tell
 
     runs = Path(StorageSection.model_fields["folder"].default)
     if run is not None and not run.is_dir():
         raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
     run = run or _only(runs)
-    before = len(_decisions(run)) if word in CHOICES else 0
+    log = parts_of(run)[-1] / EVENTS
+    before = log.stat().st_size if log.is_file() else 0
     state = tell(run, Choice(word) if word in CHOICES else Verb(word))
     if word in CHOICES:
-        _require_chosen(run, word, before)
+        _require_chosen(run, log.parent, word, before)
     click.echo(f"{run}: {state}")
 
 
-def _decisions(run: Path) -> list[Mapping[str, Any]]:
-    """What the scan of the newest part of a run has chosen so far, oldest first; nothing where it has no log."""
+def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
+    """What the scan of a part has chosen, from this byte of its log on, oldest first; nothing where it has no log."""
     from beamline.core.event_lines import event_in
-    from beamline.core.files import EVENTS, open_below, parts_of
+    from beamline.core.files import EVENTS, open_below
 
-    with suppress(OSError), open_below(parts_of(run)[-1], EVENTS) as log:
+    with suppress(OSError), open_below(part, EVENTS) as log:
+        log.seek(since)
         return [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
     return []
 
 
-def _require_chosen(run: Path, choice: str, before: int) -> None:
-    """Raise ConfigError where the scan, after its first `before` decisions, does not take this choice: it was not on
-    offer, or another one came first."""
+def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
+    """Raise ConfigError where the scan, after so many bytes of its log, does not take this choice: it was not on offer,
+    or another one came first."""
     for _ in range(_LOOKS):
-        newer = _decisions(run)[before:]
+        newer = _decisions(part, before)
         if choice in [decision.get("choice") for decision in newer]:
             return
         time.sleep(0.1)
@@ -240,7 +243,7 @@ def print_schema() -> None:
     """Print the JSON schema of a configuration, for editors that complete and check YAML files."""
     from beamline.config.load import schema
 
-    click.echo(json.dumps(schema(), indent=2))
+    click.echo(json.dumps(schema(), indent=2, allow_nan=False))
 
 
 @click.command()

@@ -81,7 +81,7 @@ def _recipe_value(option: click.Option, value: Any) -> Any:
 
 def _scalar(value: Any) -> str:
     text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if _PLAIN.fullmatch(text) else json.dumps(text)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, allow_nan=False)
 
 
 def typed_line(ctx: click.Context) -> str:

@@ -188,7 +188,9 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
             last = event.data
         else:
             warned.extend([event.message] if isinstance(event, Warned) else [])
-            said = {"message": _whose(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
+            said: dict[str, Any] = (
+                {"message": _whose(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
+            )
             sink(replace(event, scan=row.scan, **said))
 
     place = options.folder / row.name
