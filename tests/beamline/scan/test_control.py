@@ -3,6 +3,8 @@
 import os
 import stat
 import threading
+import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Event, NextChosen
 from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.page.run_files import Reader, watched
 from beamline.plan.passes import Choice
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
@@ -84,14 +87,15 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     assert running(Path("runs")) == []
 
 
+@pytest.mark.parametrize("size", [0, 10**9])  # of the log before; read whole, the larger one would take minutes
 def test_what_is_measured_next_is_said_only_while_the_scan_asks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "a"
     run.mkdir(parents=True)
     (run / "config.resolved.yaml").touch()
-    (run / "events.jsonl").touch()
+    _sparse(run / "events.jsonl", size)
     chosen: list[Choice] = []
     file = RecordFile(run, RunRecord(State.ACQUIRING))
 
@@ -128,6 +132,38 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     assert not (run / "control").exists()
     for words in (["again", "again", "again"], ["sideways"], []):
         assert CliRunner().invoke(main, ["decide", *words]).exit_code == 2
+
+
+def _sparse(log: Path, size: int = 10**9) -> None:
+    with log.open("wb") as file:
+        file.truncate(size)
+
+
+LOGS = {"none": lambda log: None, "pipe": os.mkfifo, "device": lambda log: log.symlink_to("/dev/zero"), "long": _sparse}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+@pytest.mark.parametrize("kind", LOGS)
+def test_a_log_that_is_none_or_has_no_end_keeps_no_command_waiting_and_fills_no_memory(
+    tmp_path: Path, kind: str
+) -> None:
+    run = tmp_path / "runs" / "a"
+    run.mkdir(parents=True)
+    LOGS[kind](run / "events.jsonl")
+    tracemalloc.start()
+    for words in (["decide", str(run), "next"], *([verb, str(run)] for verb in Verb)):
+        refused = CliRunner().invoke(main, words)
+        assert refused.exit_code == 2 and f"no scan is running in {run}. Nothing was changed." in refused.stderr
+    assert CliRunner().invoke(main, ["runs", str(run.parent)]).exit_code == 0
+    if kind == "long":
+        with closing(Reader(watched(run))) as reader:
+            assert {reader.state()["frames"] for _ in range(3)} == {0}
+    else:
+        shown = CliRunner().invoke(main, ["watch", str(run), "--port", "0"])
+        assert shown.exit_code == 5 and f"{run} is no folder of a run" in shown.stderr
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**28
 
 
 def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
