@@ -15,6 +15,7 @@ import click
 from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
 from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.events import DeviceRead, Done, Sink
+from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import one_line
 from beamline.plan.passes import Choice
@@ -44,7 +45,6 @@ def _command(verb: str, help_text: str) -> click.Command:
 def _send(run: Path | None, word: str) -> None:
     """Send a verb, or a choice of what is measured next, to a run (None: the only one), and print its state."""
     from beamline.config.models import StorageSection  # here: help does not need it
-    from beamline.core.files import EVENTS, parts_of
     from beamline.scan.control import Verb, tell
 
     runs = Path(StorageSection.model_fields["folder"].default)
@@ -62,7 +62,6 @@ def _send(run: Path | None, word: str) -> None:
 def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
     """What the scan of a part has chosen, from this byte of its log on, oldest first; nothing where it has no log."""
     from beamline.core.event_lines import event_in
-    from beamline.core.files import EVENTS, open_below
 
     with suppress(OSError), open_below(part, EVENTS) as log:
         log.seek(since)
@@ -187,7 +186,6 @@ def recover(file: Path, as_json: bool) -> None:
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is. The frames
     are copied, which takes time and room; whatever stops it leaves FILE as it was.
     """
-    from beamline.core.files import JOINED, SCAN
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan
 

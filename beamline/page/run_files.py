@@ -154,10 +154,8 @@ class Reader:
             age = now - self._seen[1]
         volume = newest(self.what.volumes)
         record = None if self.what.folder is None else read_record(self.what.folder)
-        if record is None:
-            over = status == "running" and abandoned(self.what.scan)
-        else:
-            over = record.over or record.state == DIED
+        died = record.state == DIED if record is not None else status == "running" and abandoned(self.what.scan)
+        over = died or (record is not None and record.over)
         if over:
             status = DIED if record is None else record.state
             if (looked := (status, now // _ADVISED_FOR)) != self._advice[0]:

@@ -31,7 +31,6 @@ RowState = Literal["waiting", "done", "poor", "failed"]
 TABLE, RECIPE = "batch.csv", "recipe.yaml"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
 COMMAND = (sys.executable, "-m", "beamline.cli.main")
-_MADE_BEFORE = "made by a call that ended before it wrote its row; the report beside it has what was warned of"
 _SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
 
 
@@ -195,7 +194,10 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
 
     place = options.folder / row.name
     if (place / RECON).is_file():
-        return replace(row, state="done", seconds=0.0, message=_MADE_BEFORE)
+        return replace(
+            row, state="done", seconds=0.0,
+            message="made by a call that ended before it wrote its row; its report has what was warned of",
+        )  # fmt: skip
     try:
         with whole_file(place) as work:
             work.mkdir()
@@ -322,8 +324,8 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         failed = [row for row in rows if not row.has_volume]
         warned = sum(row.has_volume and row.warnings > 0 for row in rows)
         counts = {"done": len(rows) - len(failed), "warned": warned, "failed": len(failed), "output": output / TABLE}
-        of_these = f", {warned} with warnings" if warned else ""
-        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{of_these}: {output / TABLE}"]
+        some = f", {warned} with warnings" if warned else ""
+        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{some}: {output / TABLE}"]
         answer.done(counts, *every)
     if failed:
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
