@@ -116,7 +116,7 @@ class Reader:
         self._volume: ShownVolume | None = None
         self._volume_file: VolumeFile | None = None
         self._seen = 0, time.time()
-        self._advice: tuple[tuple[str, float], str] = ("", 0.0), ""  # when it was looked up, and the next step
+        self._advice: tuple[tuple[bool, float], str] = (False, 0.0), ""  # when it was looked up, and the next step
         self._lock = threading.Lock()
 
     def close(self) -> None:
@@ -156,13 +156,11 @@ class Reader:
         record = None if self.what.folder is None else read_record(self.what.folder)
         died = record.state == DIED if record is not None else status == "running" and abandoned(self.what.scan)
         over = died or (record is not None and record.over)
-        if over:
-            status = DIED if record is None else record.state
-            if (looked := (status, now // _ADVISED_FOR)) != self._advice[0]:
-                self._advice = looked, next_step(self.what.scan)
+        if over and (looked := (died, now // _ADVISED_FOR)) != self._advice[0]:
+            self._advice = looked, next_step(self.what.scan)
         return {
             "frames": frames,
-            "status": status,
+            "status": DIED if died else record.state if record is not None and record.over else status,
             "over": over,
             "next": self._advice[1] if over else "",
             "age_s": round(age, 1),
