@@ -97,7 +97,11 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     (run / "config.resolved.yaml").touch()
     _sparse(run / "events.jsonl", size)
     chosen: list[Choice] = []
-    file = RecordFile(run, RunRecord(State.ACQUIRING))
+    file, alone = RecordFile(run, RunRecord(State.ACQUIRING)), threading.Lock()
+
+    def enter(state: State) -> None:
+        with alone:  # of a scan, one thread writes its record
+            file.put(RunRecord(state))
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
@@ -109,22 +113,22 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
         if chosen.count(choice) == 1:  # a second time it changes nothing
             threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
-        file.put(RunRecord(State.TAXI))
+        enter(State.TAXI)
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
         assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
         assert list((run / "control").iterdir()) == [] and not chosen
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])
         assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         monkeypatch.setattr("beamline.cli.control._LOOKS", 5)
         twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
         assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr
         (run / "control" / "enough").touch()
