@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from beamline.core.events import json_of
 from beamline.core.files import write_whole
 from beamline.core.flag import PixelBox
 from beamline.storage.volumes.files import whole_volume
@@ -75,7 +75,7 @@ def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None
             for run in runs
         ],
     }
-    write_whole(path, json.dumps(content) + "\n")
+    write_whole(path, json_of(content) + "\n")
 
 
 def volumes_beside(folder: Path) -> ReadVolume:

@@ -5,7 +5,6 @@ One index is one row of the file, darks and flats included. A trigger without a 
 
 from __future__ import annotations
 
-import json
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +18,7 @@ import click
 
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone, Sink
+from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone, Sink, json_of
 from beamline.scan.preflight import dry_run
 from beamline.storage.writers import layout
 
@@ -200,7 +199,7 @@ def file_url(path: Path) -> str:
 
 def _write_line(stream: TextIO, name: str, document: Mapping[str, Any]) -> None:
     """Writes a document as one line, as bluesky's own JSONLinesWriter does, and flushes it."""
-    stream.write(json.dumps({"name": name, "doc": document}) + "\n")
+    stream.write(json_of({"name": name, "doc": document}) + "\n")
     stream.flush()
 
 

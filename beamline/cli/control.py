@@ -15,6 +15,7 @@ import click
 from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
 from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.events import DeviceRead, Done, Sink
+from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import one_line
 from beamline.plan.passes import Choice
@@ -50,28 +51,29 @@ def _send(run: Path | None, word: str) -> None:
     if run is not None and not run.is_dir():
         raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
     run = run or _only(runs)
-    before = len(_decisions(run)) if word in CHOICES else 0
+    log = parts_of(run)[-1] / EVENTS
+    before = log.stat().st_size if log.is_file() else 0
     state = tell(run, Choice(word) if word in CHOICES else Verb(word))
     if word in CHOICES:
-        _require_chosen(run, word, before)
+        _require_chosen(run, log.parent, word, before)
     click.echo(f"{run}: {state}")
 
 
-def _decisions(run: Path) -> list[Mapping[str, Any]]:
-    """What the scan of the newest part of a run has chosen so far, oldest first; nothing where it has no log."""
+def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
+    """What the scan of a part has chosen, from this byte of its log on, oldest first; nothing where it has no log."""
     from beamline.core.event_lines import event_in
-    from beamline.core.files import EVENTS, open_below, parts_of
 
-    with suppress(OSError), open_below(parts_of(run)[-1], EVENTS) as log:
+    with suppress(OSError), open_below(part, EVENTS) as log:
+        log.seek(since)
         return [event_in(line) or {} for line in log if b'"event": "next_chosen"' in line]
     return []
 
 
-def _require_chosen(run: Path, choice: str, before: int) -> None:
-    """Raise ConfigError where the scan, after its first `before` decisions, does not take this choice: it was not on
-    offer, or another one came first."""
+def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
+    """Raise ConfigError where the scan, after so many bytes of its log, does not take this choice: it was not on offer,
+    or another one came first."""
     for _ in range(_LOOKS):
-        newer = _decisions(run)[before:]
+        newer = _decisions(part, before)
         if choice in [decision.get("choice") for decision in newer]:
             return
         time.sleep(0.1)
@@ -184,7 +186,6 @@ def recover(file: Path, as_json: bool) -> None:
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is. The frames
     are copied, which takes time and room; whatever stops it leaves FILE as it was.
     """
-    from beamline.core.files import JOINED, SCAN
     from beamline.scan.resume import recover_run
     from beamline.storage.recover import recover as recover_scan
 
@@ -240,7 +241,7 @@ def print_schema() -> None:
     """Print the JSON schema of a configuration, for editors that complete and check YAML files."""
     from beamline.config.load import schema
 
-    click.echo(json.dumps(schema(), indent=2))
+    click.echo(json.dumps(schema(), indent=2, allow_nan=False))
 
 
 @click.command()

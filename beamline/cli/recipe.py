@@ -16,7 +16,6 @@ from click.core import ParameterSource
 
 from beamline.cli.options import Declared, Decorator, name_of
 from beamline.cli.options import option as declared_option
-from beamline.config.tree import yaml_faults
 from beamline.core.files import SETTINGS, require_regular, text_in
 from recon.base.registry import unknown
 
@@ -81,7 +80,7 @@ def _recipe_value(option: click.Option, value: Any) -> Any:
 
 def _scalar(value: Any) -> str:
     text = str(value).lower() if isinstance(value, bool) else str(value)
-    return text if _PLAIN.fullmatch(text) else json.dumps(text)
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, allow_nan=False)
 
 
 def typed_line(ctx: click.Context) -> str:
@@ -130,6 +129,8 @@ def _read(path: Path) -> Mapping[str, Any]:
         text = _text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
+    from beamline.config.tree import yaml_faults  # here, because it loads pydantic
+
     with yaml_faults(text, str(path)):
         content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     if not isinstance(content, dict):

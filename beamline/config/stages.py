@@ -43,7 +43,7 @@ def settings_file(said: Mapping[str, object], folder: Path) -> Path:
     """
     which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
     name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
-    return folder / f"{name}-{crc32(json.dumps(which).encode()):08x}.json"
+    return folder / f"{name}-{crc32(json.dumps(which, allow_nan=False).encode()):08x}.json"
 
 
 class StageSection(Section):

@@ -76,7 +76,7 @@ class Event:
 Sink = Callable[[Event], None]  # Takes events
 
 
-def json_of(values: Mapping[str, Any]) -> str:
+def json_of(values: object) -> str:
     """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
     from pydantic_core import to_jsonable_python  # here, because most commands write no line
 

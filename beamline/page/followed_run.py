@@ -158,7 +158,7 @@ class StampedValues:
         taken["percent"] = 100.0 * stored / before.planned if before.planned > 0 else before.percent
         taken["skipped"] = seen.get("skipped_lines", 0)
         stamps = {**self.stamps, **dict.fromkeys(_OF_FILE, frame), "free": Stamp(now), "age": Stamp(now)}
-        ended = status == DIED or (not before.run and status != "running")  # the log does not say how it ended
+        ended = status == DIED or seen.get("over") or (not before.run and status != "running")  # as no log may say
         if ended and status != before.state:
             why = one_line(seen["next"], LONGEST)
             taken |= {"state": status, "message": why, "wait": 0.0}

@@ -23,6 +23,7 @@ from beamline.storage.parts import joined_file_of
 from beamline.storage.run_record import DIED, read_record
 from beamline.storage.writer_lock import abandoned
 
+_ADVISED_FOR = 10.0  # s for which the next step holds: to find it opens files
 _AT_ONCE = 2**24  # bytes of a log that are read in one call
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
@@ -115,6 +116,7 @@ class Reader:
         self._volume: ShownVolume | None = None
         self._volume_file: VolumeFile | None = None
         self._seen = 0, time.time()
+        self._advice: tuple[tuple[bool, float], str] = (False, 0.0), ""  # when it was looked up, and the next step
         self._lock = threading.Lock()
 
     def close(self) -> None:
@@ -137,8 +139,8 @@ class Reader:
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
-        """Frames in the file, its status, what can be done if its scan has died, seconds since the last frame, the
-        time of the newest, free bytes, name of the newest volume."""
+        """Frames in the file; its status, or that of the run once its process has ended (`over`), and then what can be
+        done next; seconds since the last frame, the time of the newest, free bytes, name of the newest volume."""
         self.events.refresh()
         try:
             progress = self.do(Recording.progress)
@@ -153,10 +155,14 @@ class Reader:
         volume = newest(self.what.volumes)
         record = None if self.what.folder is None else read_record(self.what.folder)
         died = record.state == DIED if record is not None else status == "running" and abandoned(self.what.scan)
+        over = died or (record is not None and record.over)
+        if over and (looked := (died, now // _ADVISED_FOR)) != self._advice[0]:
+            self._advice = looked, next_step(self.what.scan)
         return {
             "frames": frames,
-            "status": DIED if died else status,
-            "next": next_step(self.what.scan) if died else "",
+            "status": DIED if died else record.state if record is not None and record.over else status,
+            "over": over,
+            "next": self._advice[1] if over else "",
             "age_s": round(age, 1),
             "newest": newest_frame,
             "free": shutil.disk_usage(self.what.scan.parent).free,

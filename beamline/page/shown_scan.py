@@ -103,7 +103,7 @@ class ShownScan:
         return {
             "said": f"{self._source.format}, {known.size} of {self._degrees.size} views with angles, {angles}; {over}",
             "means": [name for name, mean in self._means().items() if mean is not None],
-            "light": [None if np.isnan(each) else float(each) for each in self._views.light],
+            "light": [float(each) if np.isfinite(each) else None for each in self._views.light],
             "pair": self._pair(),
         }
 

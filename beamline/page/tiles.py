@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from beamline.core.errors import DataError
+from beamline.core.events import json_of
 from beamline.monitor.view import BRIGHT, UNLIT
 
 MOST = 1024
@@ -87,7 +87,7 @@ def pack(values: NDArray[np.float32]) -> PackedValues:
 def tile_of(values: Any, facts: dict[str, Any]) -> Response:
     """A header in JSON, its length before it as u4, and the numbers of `pack`."""
     packed = pack(values)
-    head = json.dumps({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
+    head = json_of({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
     padded = head.encode() + b" " * (-len(head.encode()) % 4)
     body = len(padded).to_bytes(4, "little") + padded + packed.numbers.tobytes()
     return Response(body, media_type="application/octet-stream")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,6 +15,7 @@ from beamline.config.beam import NoBeamMonitor
 from beamline.config.load import Config, at_energies, camera_settings, plan_of, quantities, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
+from beamline.core.events import json_of
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
 from beamline.core.quantities import doubt, doubt_span
@@ -324,7 +324,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         saturation=_saturation(instrument.devices.camera.timing),
         exposure=plan.exposure,
         period=timeline.views.period,
-        plan=json.dumps(asked),
+        plan=json_of(asked),
         wide_views=bool(plan.wide_places),
         decides=config.scan.decide != "off",
         filter=plan.filter or known.filter,

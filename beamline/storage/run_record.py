@@ -7,14 +7,14 @@ system drops it with the process. A process that recovers a run or goes on with 
 
 from __future__ import annotations
 
-import json
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
 
+from beamline.core.events import json_of
 from beamline.core.files import CONFIG, RECORD, SETTINGS, bytes_below
 from beamline.storage.writer_lock import WriterLock, held
 
@@ -70,7 +70,7 @@ def write_record(part: Path, record: RunRecord) -> None:
     """Write the record of a part: readers see the one before or this one. Raises OSError."""
     path = part / RECORD
     partial = path.with_name(f".{RECORD}.new")
-    partial.write_text(json.dumps(asdict(replace(record, time=time.time()))), encoding="utf-8")
+    partial.write_text(json_of(replace(record, time=time.time())), encoding="utf-8")
     partial.replace(path)
 
 

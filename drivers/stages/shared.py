@@ -39,7 +39,7 @@ class FoundSettings:
         self._file, whole = file, file.with_suffix(".new")
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            whole.write_text(json.dumps(self.values), encoding="utf-8")
+            whole.write_text(json.dumps(self.values, allow_nan=False), encoding="utf-8")
             whole.replace(file)
         if changed:
             self.notice = (

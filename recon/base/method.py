@@ -250,10 +250,16 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
-        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays.
+        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays; NaN
+        and infinities are null.
         """
-        settings = {name: value for name, value in self.settings.items() if not isinstance(value, np.ndarray)}
-        self.volume.save(path, method=self.method, seconds=self.seconds, settings=json.dumps(settings, default=str))
+        settings = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in self.settings.items()
+            if not isinstance(value, np.ndarray)
+        }
+        text = json.dumps(settings, default=str, allow_nan=False)
+        self.volume.save(path, method=self.method, seconds=self.seconds, settings=text)
 
 
 @dataclass(frozen=True)

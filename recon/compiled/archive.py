@@ -94,7 +94,9 @@ def write_archive(archive: Path, members: Mapping[str, Mapping[str, bytes]], roo
         for module, files in sorted(members.items()):
             sources[module] = {path: str(digest(root / path)) for path in source_files(module, root)}
             packed.writestr(zipfile.ZipInfo(module, _EPOCH), lzma.compress(_tar(files)))
-        packed.writestr(zipfile.ZipInfo(SOURCES, _EPOCH), json.dumps(sources, indent=0), zipfile.ZIP_DEFLATED)
+        packed.writestr(
+            zipfile.ZipInfo(SOURCES, _EPOCH), json.dumps(sources, indent=0, allow_nan=False), zipfile.ZIP_DEFLATED
+        )
 
 
 def _tar(files: Mapping[str, bytes]) -> bytes:

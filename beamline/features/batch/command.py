@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -21,7 +22,7 @@ from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned
 from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import SENTENCE, csv_text, one_line, printable, safe_name
+from beamline.core.text import SENTENCE, count, csv_text, one_line, printable, safe_name
 from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
 
@@ -42,7 +43,8 @@ class BatchRow:
         state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
             one; "waiting": not tried yet.
         residual: of the volume, of views held out where there were any.
-        message: why it failed, or is poor; what its reconstruction warned of.
+        warnings: how many its reconstruction gave; a volume with some is not to be trusted before they are read.
+        message: why it failed, or is poor; then these warnings.
     """
 
     name: str
@@ -51,6 +53,7 @@ class BatchRow:
     seconds: float | None = None
     method: str = ""
     residual: float | None = None
+    warnings: int = 0
     message: str = ""
 
     @property
@@ -104,7 +107,8 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
             sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
             row = rows[n] = _one(rows[n], options, sink, clock)
             _write(folder, rows)
-            sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+            state = row.state + (f" with {count(row.warnings, 'warning')}" if row.warnings else "")
+            sentence = f"{row.name}: {state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
             now = clock.now()
             sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
         return rows
@@ -182,12 +186,18 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         if isinstance(event, Done | Failed):
             last = event.data
         else:
-            sink(replace(event, scan=row.scan))
             warned.extend([event.message] if isinstance(event, Warned) else [])
+            said: dict[str, Any] = (
+                {"message": _whose(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
+            )
+            sink(replace(event, scan=row.scan, **said))
 
     place = options.folder / row.name
     if (place / RECON).is_file():
-        return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
+        return replace(
+            row, state="done", seconds=0.0,
+            message="made by a call that ended before it wrote its row; its report has what was warned of",
+        )  # fmt: skip
     try:
         with whole_file(place) as work:
             work.mkdir()
@@ -201,14 +211,20 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
                 reason = f"no output from its process for {_SILENCE:g} s; it was ended"
             if code not in _WITH_VOLUME or not (work / RECON).is_file():
                 raise DataError(reason or f"no volume: its process ended with code {code}")
-        state = _WITH_VOLUME[code]
+        state, why = _WITH_VOLUME[code], [reason] if code else []
     except DataError as error:  # also of a folder of this name that somebody else made
-        state, reason = "failed", str(error)
+        state, why = "failed", [str(error)]
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
-        residual=last.get("residual_held_out", last.get("residual")),
-        message=one_line(" ".join(warned) if state == "done" else reason, SENTENCE),
+        residual=last.get("residual_held_out", last.get("residual")), warnings=len(warned),
+        message=one_line(_whose(" ".join([*why, *warned]), row), SENTENCE),
     )  # fmt: skip
+
+
+def _whose(message: str, row: BatchRow) -> str:
+    """A message of a reconstruction; where it names options, with the command whose they are."""
+    named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
+    return f"{message} These options are those of `beamline recon {row.scan}`." if named else message
 
 
 def _read(folder: Path) -> list[BatchRow]:
@@ -306,8 +322,10 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         except KeyboardInterrupt as stop:
             raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
         failed = [row for row in rows if not row.has_volume]
-        counts = {"done": len(rows) - len(failed), "failed": len(failed), "output": output / TABLE}
-        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume: {output / TABLE}"]
+        warned = sum(row.has_volume and row.warnings > 0 for row in rows)
+        counts = {"done": len(rows) - len(failed), "warned": warned, "failed": len(failed), "output": output / TABLE}
+        some = f", {warned} with warnings" if warned else ""
+        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume{some}: {output / TABLE}"]
         answer.done(counts, *every)
     if failed:
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")

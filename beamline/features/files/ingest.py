@@ -7,7 +7,6 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.events import json_of
 from beamline.core.files import whole_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
@@ -82,7 +82,7 @@ def ingest(
             axis_col=source.axis_col,
             distance_mm=distance if isinstance(distance, int | float) else None,
             source_distance_mm=None if source.cone is None else source.cone[0],
-            plan=json.dumps({} if other_angles else dict(source.plan)),
+            plan=json_of({} if other_angles else dict(source.plan)),
             wide_views=source.aside_mm is not None,
             decides=source.pass_ends.size > 0,
         )
@@ -133,7 +133,7 @@ def _copy(
     if source.part_starts.size > 1:
         file[layout.PART_STARTS] = source.part_starts
     if info.decides:
-        lines = [json.dumps(values).encode() for values in source.decisions]
+        lines = [json_of(values).encode() for values in source.decisions]
         for path, column in ((layout.PASS_ENDS, source.pass_ends), (layout.DECISIONS, lines)):
             file[path].resize(len(column), 0)
             file[path][...] = np.array(column, file[path].dtype)

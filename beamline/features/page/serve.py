@@ -68,11 +68,12 @@ class RunBrowser:
         return guarded("runs.html", routes, access)
 
     def table(self, request: Request) -> Response:
-        """Head and rows, newest first, each with the number of its page."""
+        """Head and rows, newest first, each with the number of its page and the next step for the run."""
         with self._lock:
             rows = [
-                {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(describe(run))}
+                {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(it), "next": it.next_step}
                 for run in runs_in(self._folder)
+                for it in [describe(run)]
             ]
         return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 import time
@@ -15,7 +14,7 @@ import numpy as np
 
 from beamline.core.durations import seconds_left
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import FrameStored, Sink
+from beamline.core.events import FrameStored, Sink, json_of
 from beamline.core.files import refuse_existing
 from beamline.core.text import size
 from beamline.monitor.digest import digest
@@ -144,7 +143,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         exposure=scene.scene.detector.exposure_s,
         period=scan.period,
         axis_col=scan.detector.axis_col,
-        plan=json.dumps(plan),
+        plan=json_of(plan),
         config=scene.text,
         saturation=2**BITS - 1,
         devices={

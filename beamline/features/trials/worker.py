@@ -286,7 +286,7 @@ def main(folder: Path) -> int:
     except (ValueError, DataError) as error:  # DataError: the disk
         code = error.exit_code if isinstance(error, DataError) else 1
         event = {"event": "failed", "message": str(error)}
-    print(json.dumps(event), flush=True)  # noqa: T201 - stdout is this process's only way out
+    print(json.dumps(event, allow_nan=True), flush=True)  # noqa: T201 - stdout is this process's only way out
     return code
 
 

@@ -8,7 +8,6 @@ the death of this process. Every second they are brought to the disk (fsync), wh
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -20,6 +19,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError, user_message
+from beamline.core.events import json_of
 from beamline.core.text import size
 from beamline.monitor.check import Flag
 from beamline.monitor.checks import bitmask
@@ -204,7 +204,7 @@ class NXtomoWriter:
 
     def add_decision(self, values: Mapping[str, object]) -> None:
         """Record what was chosen after a pass, likewise."""
-        self._append_last(layout.DECISIONS, json.dumps(values, default=str).encode(), "a decision")
+        self._append_last(layout.DECISIONS, json_of(values).encode(), "a decision")
 
     def _append_last(self, path: str, value: int | bytes, what: str) -> None:
         if self._broken or path not in self._last:

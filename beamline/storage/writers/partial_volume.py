@@ -114,7 +114,7 @@ def create_partial(
             file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
             group = file[_SLABS]
             group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
-            group["kept"] = json.dumps(kept, default=_plain)
+            group["kept"] = json.dumps(kept, default=_plain, allow_nan=True)  # taken back to the bit
             for name, value in made_from.items():
                 group[f"made_from/{name}"] = value
             deepest = max(1, *(len(_shared(slab)) for slab in slabs))

@@ -3,6 +3,8 @@
 import os
 import stat
 import threading
+import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Event, NextChosen
 from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.page.run_files import Reader, watched
 from beamline.plan.passes import Choice
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, state_of, tell, verbs_taken
@@ -84,16 +87,21 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     assert running(Path("runs")) == []
 
 
+@pytest.mark.parametrize("size", [0, 10**9])  # of the log before; read whole, the larger one would take minutes
 def test_what_is_measured_next_is_said_only_while_the_scan_asks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "a"
     run.mkdir(parents=True)
     (run / "config.resolved.yaml").touch()
-    (run / "events.jsonl").touch()
+    _sparse(run / "events.jsonl", size)
     chosen: list[Choice] = []
-    file = RecordFile(run, RunRecord(State.ACQUIRING))
+    file, alone = RecordFile(run, RunRecord(State.ACQUIRING)), threading.Lock()
+
+    def enter(state: State) -> None:
+        with alone:  # of a scan, one thread writes its record
+            file.put(RunRecord(state))
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
@@ -105,22 +113,22 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
         if chosen.count(choice) == 1:  # a second time it changes nothing
             threading.Timer(0.3 if choice is Choice.RETAKE else 0, write).start()  # which is another thread's
-        file.put(RunRecord(State.TAXI))
+        enter(State.TAXI)
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
         assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
         assert list((run / "control").iterdir()) == [] and not chosen
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])
         assert (taken.exit_code, taken.stdout) == (0, f"{run}: taxi\n") and chosen == [Choice.AGAIN]
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         assert CliRunner().invoke(main, ["decide", "retake"]).exit_code == 0
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         monkeypatch.setattr("beamline.cli.control._LOOKS", 5)
         twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
         assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
-        file.put(RunRecord(State.ASKING))
+        enter(State.ASKING)
         other = CliRunner().invoke(main, ["decide", str(run), "wide"])
         assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr
         (run / "control" / "enough").touch()
@@ -128,6 +136,38 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     assert not (run / "control").exists()
     for words in (["again", "again", "again"], ["sideways"], []):
         assert CliRunner().invoke(main, ["decide", *words]).exit_code == 2
+
+
+def _sparse(log: Path, size: int = 10**9) -> None:
+    with log.open("wb") as file:
+        file.truncate(size)
+
+
+LOGS = {"none": lambda log: None, "pipe": os.mkfifo, "device": lambda log: log.symlink_to("/dev/zero"), "long": _sparse}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+@pytest.mark.parametrize("kind", LOGS)
+def test_a_log_that_is_none_or_has_no_end_keeps_no_command_waiting_and_fills_no_memory(
+    tmp_path: Path, kind: str
+) -> None:
+    run = tmp_path / "runs" / "a"
+    run.mkdir(parents=True)
+    LOGS[kind](run / "events.jsonl")
+    tracemalloc.start()
+    for words in (["decide", str(run), "next"], *([verb, str(run)] for verb in Verb)):
+        refused = CliRunner().invoke(main, words)
+        assert refused.exit_code == 2 and f"no scan is running in {run}. Nothing was changed." in refused.stderr
+    assert CliRunner().invoke(main, ["runs", str(run.parent)]).exit_code == 0
+    if kind == "long":
+        with closing(Reader(watched(run))) as reader:
+            assert {reader.state()["frames"] for _ in range(3)} == {0}
+    else:
+        shown = CliRunner().invoke(main, ["watch", str(run), "--port", "0"])
+        assert shown.exit_code == 5 and f"{run} is no folder of a run" in shown.stderr
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**28
 
 
 def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(

@@ -5,7 +5,7 @@ import { Passes } from "./passes.js";
 
 const $ = (id) => document.getElementById(id);
 const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "invalid" };
-const COLOURS = { done: "good", complete: "good", paused: "warn", asking: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
+const COLOURS = { done: "good", complete: "good", paused: "warn", asking: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad", died: "bad" };
 const columns = { kind: [], angle: [], time: [], mean: [] };
 const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] }, error: { x: [], y: [] } };
 let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, ended = "", rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
@@ -298,9 +298,10 @@ async function onState(event) {
   if (now.volume !== volumeKey) { volumeKey = now.volume; if (now.volume) fetchVolume(); }
 }
 
+let nextStep = "";  // for a scan that has died or ended early
 function header(now) {
-  const word = now.next ? now.status : state || now.status, chip = $("state");
-  if (now.next || ended) $("said").textContent = now.next || ended;
+  const word = now.over ? now.status : state || now.status, chip = $("state"), told = now.next || ended;
+  if (told !== nextStep) $("said").textContent = nextStep = told;
   chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
   $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
   const shown = { frames: planned ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${planned} planned` : `${now.frames}` };
@@ -358,7 +359,7 @@ function onEnd() {
   for (const button of document.querySelectorAll("#verbs button")) button.disabled = true;
   passes.update(false, false);
   $("viewer-link").hidden = true;
-  $("said").textContent = `This page has ended and shows what it had last. ${again()}`;
+  $("said").textContent = `${nextStep} This page has ended and shows what it had last. ${again()}`.trim();
 }
 function again() { const path = facts ? facts.path : "RUN"; return `To see the run again: beamline watch ${/\s/.test(path) ? `"${path}"` : path}`; }
 // A browser has six connections to a server for all its tabs: one that nobody sees keeps none.
@@ -366,7 +367,7 @@ document.addEventListener("visibilitychange", () => { if (over) return; feed.clo
 setInterval(() => {
   const silent = (Date.now() - lastSeen) / 1000, lost = !over && !document.hidden && feed.readyState !== EventSource.OPEN;
   document.body.classList.toggle("lost", lost && silent > 3);
-  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; $("said").textContent = `The scan does not need its page. ${again()}`; }
+  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; $("said").textContent = `${nextStep || "The scan does not need its page."} ${again()}`; }
 }, 1000);
 
 function element(name, text, kind = "") { const made = document.createElement(name); made.textContent = text; if (kind) made.className = kind; return made; }

@@ -26,7 +26,11 @@ async function show() {
     document.title = `Runs in ${folder}`;
     $("#folder").textContent = `${rows.length} ${rows.length === 1 ? "run" : "runs"} in ${folder}`;
     $("thead").replaceChildren(row(head, "th"));
-    $("tbody").replaceChildren(...rows.map(({ number, cells }) => row(cells, "td", `/run/${number}/`)));
+    $("tbody").replaceChildren(...rows.flatMap(({ number, cells, next }) => {
+      const advice = row(next ? [next] : [], "td");
+      if (next) advice.firstChild.colSpan = head.length;
+      return [row(cells, "td", `/run/${number}/`), ...(next ? [advice] : [])];
+    }));
     $("#said").textContent = "";
   } catch (error) { $("#said").textContent = error.message; said = ""; }
 }

@@ -7,12 +7,14 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
+from beamline.core.events import Event, Failed, StateEntered, Warned
 from beamline.core.process import ProcessEnd
 from beamline.core.text import csv_text, safe_name
 from beamline.features.batch import command as batch
@@ -104,6 +106,38 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     other.release()
     assert refused.exit_code == 5
     assert "Another batch works in out" in refused.output
+
+
+@pytest.mark.parametrize(
+    ("events", "code", "warnings", "said"),
+    [
+        ([], 0, 0, ""),
+        ([Warned("A."), StateEntered("rings", "Take --rings auto."), Warned("B.")], 0, 2, "A. B."),
+        ([Warned("Give --cone.")], 0, 1, "Give --cone. These options are those of `beamline recon "),
+        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. These options are those of "),
+        ([Warned("A (-log)."), Failed("`beamline scan --resume R`.")], 5, 1, "`beamline scan --resume R`. A (-log)."),
+    ],
+)
+def test_a_row_has_what_its_reconstruction_warned_of_and_whose_the_options_are(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, events: Sequence[Event], code: int, warnings: int, said: str
+) -> None:
+    def run(
+        command: Sequence[str], log: Path, on_line: Callable[[str], None], silence: float
+    ) -> tuple[object, int, str]:
+        log.touch()
+        Path(command[command.index("--output") + 1]).touch()
+        for event in events:
+            on_line(replace(event, time=0.0).to_json())
+        return ProcessEnd.EXITED, code, ""
+
+    monkeypatch.setattr(batch, "run_to_end", run)
+    passed_on: list[Event] = []
+    (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), passed_on.append, SystemClock())
+    assert (row.warnings, row.message[: len(said)]) == (warnings, said)
+    assert ("`beamline recon" in row.message) == ("These options" in said)
+    assert _table(Path("out"))["scan"]["warnings"] == str(warnings)
+    for event in passed_on:
+        assert "--" not in event.data.get("message", "") or "`beamline " in event.data["message"]
 
 
 def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

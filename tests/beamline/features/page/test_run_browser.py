@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from beamline.page.followed_run import FollowedRun
 from beamline.page.run_files import EventLog
+from beamline.scan.resume import recover_run
+from beamline.scan.runs import describe
+from beamline.storage.interrupted import next_step
 from beamline.storage.run_record import RunRecord, write_record
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.features.page.served import Served, listed
-from tests.beamline.features.page.test_app import tile
+from tests.beamline.features.page.served import Served, listed, served
+from tests.beamline.features.page.test_app import page_feed, tile
 from tests.beamline.features.run_folder import write_run
 from tests.beamline.ran import Ran
+from tests.beamline.scan.test_resume import ENDS
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders()
@@ -44,6 +50,25 @@ def test_the_table_is_that_of_the_terminal_newest_first(tmp_path: Path) -> None:
     assert before["cells"][1:4] == ["first", "49 of 60", "stopped"]
     assert newer["cells"][1] == EVIL
     assert newer["number"] != older["number"]
+
+
+@pytest.mark.parametrize(("end", "recovered"), [("killed", False), ("killed", True), ("aborted", False)])
+def test_a_run_that_ended_early_has_the_state_the_frames_and_the_next_step_that_commands_tell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, recovered: bool
+) -> None:
+    run = ENDS[end](tmp_path, monkeypatch, at=9)
+    if recovered:
+        recover_run(run)
+    told, advice = describe(run), next_step(run / "scan.h5")
+    with served(run) as page, page_feed(page) as feed:
+        state = json.loads(next(line for line in feed if line.startswith(b'data: {"frames"'))[6:])
+    assert (state["status"], state["frames"], state["next"]) == (told.state, told.frames, advice)
+    assert "--resume" in advice and (told.state == "died") == ("beamline recover" in advice)
+    with listed(tmp_path) as page:
+        assert [row["next"] for row in rows(page)] == [told.next_step]
+    with closing(FollowedRun(tmp_path)) as followed:
+        values = followed.look().values
+    assert (values.state, values.message == advice) == (told.state, end == "killed")
 
 
 def test_each_run_has_its_page(tmp_path: Path) -> None:
