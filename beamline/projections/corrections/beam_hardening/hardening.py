@@ -163,7 +163,6 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 def _clearly_seen(views: PreparedProjections) -> str:
     """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else nothing."""
-    from recon.features.beam_hardening import NoCurveError
     from recon.voxels.field_edges import FieldEdges, busiest_rows
 
     data, geometry = views.ordinary.projections.data, views.ordinary.geometry
@@ -171,8 +170,10 @@ def _clearly_seen(views: PreparedProjections) -> str:
     if not plain or geometry.n_views < _FEWEST or FieldEdges.of(data, geometry).beyond():
         return ""
     rows = busiest_rows(data, _BUSIEST * _small(geometry)[1])
-    if not data[:, rows].mean() > 0:
+    if not data[:, rows].mean() > 0 or _unevenness(data[:, rows]) < _AS_EVEN:
         return ""
+    from recon.features.beam_hardening import NoCurveError  # here, because it loads scipy.optimize
+
     try:
         curve, _, evened = fitted(data[:, rows], geometry.rows(rows.start, rows.stop))
     except (NoCurveError, ValueError):
