@@ -278,6 +278,8 @@ def _upright(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
     for view, weight in zip(some, weights, strict=True):
         mean += weight * data[view]
     roll, sigma = roll_of_turn(mean, geometry.axis_col)
+    if math.isnan(sigma):
+        return Law("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
         f"The rotation axis seems to lean by {tilt_text(roll, sigma)} in the detector's plane, {abs(roll) * rows:.1f} "
