@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
@@ -328,7 +328,8 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
         if rows.size:
             some = spread(rows, _LOOKED_AT)
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
-            yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
+            with suppress(DataError):  # what cannot be read is told where it is used
+                yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
