@@ -79,7 +79,11 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
     lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
     mass = lines.sum(axis=(1, 2), dtype=np.float64)
     for view in np.flatnonzero(some):
-        fill(lines[view], plan_fill(ndimage.binary_dilation(dark[view], _RIM)[rows]))
+        hidden = ndimage.binary_dilation(dark[view], _RIM)[rows]
+        if hidden.all():
+            lines[view] = 0
+        else:
+            fill(lines[view], plan_fill(hidden))
     free = np.flatnonzero(~some)[np.argsort(angles[~some])]
     usual = np.interp(angles[some], angles[free], mass[free])
     more, less = mass[some] - usual, lines[some].sum(axis=(1, 2), dtype=np.float64) - usual
