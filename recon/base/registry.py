@@ -12,7 +12,7 @@ import threading
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
@@ -91,10 +91,9 @@ def signals_waiting() -> Iterator[None]:
         yield
 
 
-@cache
 def loaded(module: str) -> Any:
     """The module, as `importlib.import_module`; its first import ends before a signal is handled."""
-    with signals_waiting():
+    with nullcontext() if module in sys.modules else signals_waiting():
         return import_module(module)
 
 
