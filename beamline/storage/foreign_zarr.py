@@ -161,7 +161,7 @@ class NamedArray:
 
     is_virtual = False
 
-    def __init__(self, array: Any, name: str, file: Arrays) -> None:
+    def __init__(self, array: Any, name: str, file: ArrayFile) -> None:
         self.array, self.name, self.file, self.attrs = array, name, file, dict(getattr(array, "attrs", {}))
         self.chunks: tuple[int, ...] | None = getattr(array, "chunks", None)
         packed = None
@@ -182,7 +182,7 @@ class NamedArray:
             raise OSError(f"{type(error).__name__}: {error}") from error
 
 
-class Arrays(dict[str, NamedArray]):
+class ArrayFile(dict[str, NamedArray]):
     """The arrays of a file by the paths of their names; "" is the only one of a file."""
 
     def __init__(self, path: Path) -> None:
@@ -207,9 +207,9 @@ class Arrays(dict[str, NamedArray]):
         return self.get(name) or next(iter(self.values()))
 
 
-def opened(path: Path, follow: bool = False) -> Any:
-    """A file with arrays by their names: HDF5, which may still grow, or `Arrays`."""
-    return Arrays(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
+def open_array_file(path: Path, follow: bool = False) -> Any:
+    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
+    return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
 _NUMPY = ".npy"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import opened, zarr_root
+from beamline.storage.foreign_zarr import open_array_file, zarr_root
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
@@ -50,7 +50,7 @@ PLACES = (
 
 def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = opened(path, follow)
+    file = open_array_file(path, follow)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
@@ -269,7 +269,7 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
 def _recognises(path: Path, opening: Opening) -> bool:
     if not hdf5.is_hdf5(path, opening.follow) and zarr_root(path) is None:
         return False
-    with closing(opened(path, opening.follow)) as file:
+    with closing(open_array_file(path, opening.follow)) as file:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.foreign_zarr import Arrays, NamedArray, opened
+from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.superblock import marked
@@ -206,7 +206,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
-    file = opened(path)
+    file = open_array_file(path)
     with hdf5.closed_on_error(file):
         views, where, order = _named_order(file, data)
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
@@ -251,7 +251,7 @@ _CIL = (
 
 def open_arrays(path: Path) -> StacksSource:
     """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
-    with closing(Arrays(path)) as file:
+    with closing(ArrayFile(path)) as file:
         images = [name for name, item in file.items() if item.ndim > 1]
         if len(images) != 1:
             raise DataError(
@@ -311,7 +311,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
     Raises:
         DataError: it is not there, is no list, or nothing says its unit.
     """
-    with closing(opened(path)) as file, hdf5.readable(path):
+    with closing(open_array_file(path)) as file, hdf5.readable(path):
         if not where and isinstance(file, h5py.File):
             where = _only_angles(file)
         item = dataset_at(file, where)
@@ -356,7 +356,7 @@ _LISTED = 10  # datasets of a file that an error names
 
 
 def _arrays_of(file: Any) -> list[Any]:
-    if isinstance(file, Arrays):
+    if isinstance(file, ArrayFile):
         return [*file.values()]
     arrays = list[h5py.Dataset]()
     file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)

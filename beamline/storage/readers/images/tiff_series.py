@@ -45,7 +45,7 @@ from beamline.storage.readers.tiff import (
     is_hidden,
     is_untyped,
     no_image,
-    opened,
+    open_tiff,
     refuse_volume,
     stated,
 )
@@ -164,7 +164,7 @@ class TiffSeriesSource(ScanSource):
     def _tiff(self, name: str) -> Iterator[TiffFile]:
         """The head of an image, whose pixels are not read."""
         try:
-            with self._opened(name, LARGEST_IMAGE) as file, opened(file) as tif:
+            with self._opened(name, LARGEST_IMAGE) as file, open_tiff(file) as tif:
                 yield tif
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
