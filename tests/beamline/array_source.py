@@ -48,7 +48,7 @@ class ArraySource:
     row_period: float | None = None
     flags = None
     currents: NDArray[np.float64] | None = None
-    unpacking: int = 0
+    unpack_bytes: int = 0
     energies: NDArray[np.float64] | None = None
     pixel_mask = None
     used: tuple[Any, ...] = ()

@@ -188,7 +188,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         else:
             warned.extend([event.message] if isinstance(event, Warned) else [])
             said: dict[str, Any] = (
-                {"message": _whose(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
+                {"message": _with_command(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
             )
             sink(replace(event, scan=row.scan, **said))
 
@@ -196,7 +196,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
     if (place / RECON).is_file():
         return replace(
             row, state="done", seconds=0.0,
-            message="made by a call that ended before it wrote its row; its report has what was warned of",
+            message="made by a call that ended before it wrote this row; the report has the warnings",
         )  # fmt: skip
     try:
         with whole_file(place) as work:
@@ -217,14 +217,14 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
         residual=last.get("residual_held_out", last.get("residual")), warnings=len(warned),
-        message=one_line(_whose(" ".join([*why, *warned]), row), SENTENCE),
+        message=one_line(_with_command(" ".join([*why, *warned]), row), SENTENCE),
     )  # fmt: skip
 
 
-def _whose(message: str, row: BatchRow) -> str:
+def _with_command(message: str, row: BatchRow) -> str:
     """A message of a reconstruction; where it names options, with the command whose they are."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
-    return f"{message} These options are those of `beamline recon {row.scan}`." if named else message
+    return f"{message} Give these options to `beamline recon {row.scan}`." if named else message
 
 
 def _read(folder: Path) -> list[BatchRow]:

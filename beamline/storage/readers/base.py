@@ -70,7 +70,7 @@ class ScanSource(ABC):
         energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
         currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
             NaN where unknown, None where there is no monitor.
-        unpacking: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
+        unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
@@ -104,7 +104,7 @@ class ScanSource(ABC):
     not_used: tuple[NotUsed, ...] = ()
     energies: NDArray[np.float64] | None = None
     currents: NDArray[np.float64] | None = None
-    unpacking: int = 0
+    unpack_bytes: int = 0
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None

@@ -98,8 +98,8 @@ class ExchangeSource(StacksSource):
         if not self.grows:
             return super().refresh()
         ended, theta = self.finished, datasets.dataset(self._file, "exchange/theta") if self.own_angles else None
-        there = [hdf5.written(stack.frames) for stack in self._stacks]
-        angled = hdf5.written(theta) if theta is not None else there[-1]
+        there = [hdf5.n_written(stack.frames) for stack in self._stacks]
+        angled = hdf5.n_written(theta) if theta is not None else there[-1]
         there[-1] = min(there[-1], angled)
         self.take([len(stack.frames) for stack in self._stacks] if ended else there)
         views = self.image_key == FrameKind.PROJECTION

@@ -22,7 +22,7 @@ from beamline.storage.datasets import bytes_unpacked
 from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
-from beamline.storage.superblock import marked
+from beamline.storage.superblock import marked_as_being_written
 from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 
@@ -150,7 +150,7 @@ class StacksSource(ScanSource):
 
     @property
     def finished(self) -> bool:
-        return not isinstance(self._file, h5py.File) or not marked(self.path)
+        return not isinstance(self._file, h5py.File) or not marked_as_being_written(self.path)
 
     def _check(self) -> None:
         views = self._stacks[-1]
@@ -164,7 +164,7 @@ class StacksSource(ScanSource):
                 )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset | NamedArray):
-                self.unpacking = max(self.unpacking, datasets.require_possible(stack.frames))
+                self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
@@ -316,7 +316,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
             where = _only_angles(file)
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{item.name} in {path} is {item.shape}; expected a list of angles.")
+            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
         return datasets.radians(item, unit, default)
 
 
@@ -329,8 +329,8 @@ def _only_angles(file: h5py.File) -> str:
     ]
     if len(found) != 1:
         raise DataError(
-            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the one: --angles "
-            "FILE::DATASET, and where it states no unit, --angles-unit deg or rad."
+            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
+            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
         )
     return found[0]
 
@@ -379,7 +379,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     if order is None and len(fits) > 1:
         raise DataError(
             f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "which side the views are is not known. Say --order view,col or --order col,view."
+            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
         )
     order = order or ("col,view" if fits[0] else "view,col")
     images = in_order(_Images(base), stated_order(order))

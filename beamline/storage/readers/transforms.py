@@ -287,7 +287,7 @@ _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 
 
-def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
     """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
     all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
 
@@ -316,9 +316,9 @@ def without_wraps(base: ScanSource, edges: int) -> ScanSource:
     """A scan whose counts near the end of their range, which lay below a dark taken off them, are 0."""
     least = 2**16 - 2**16 // _NEAR
     fact = (
-        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as whole numbers "
-        f"of 16 bits do where the dark taken off them is above them. Those from {least} on are taken as 0. Take darks "
-        "off in reals or signed numbers, so that the noise about 0 is kept."
+        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as 16-bit "
+        f"whole numbers do where the dark subtracted from them was larger. Those from {least} on are taken as 0. "
+        "Subtract darks in real or signed numbers, so that the noise about 0 is kept."
     )
     return Frames(
         base,

@@ -113,8 +113,8 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     [
         ([], 0, 0, ""),
         ([Warned("A."), StateEntered("rings", "Take --rings auto."), Warned("B.")], 0, 2, "A. B."),
-        ([Warned("Give --cone.")], 0, 1, "Give --cone. These options are those of `beamline recon "),
-        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. These options are those of "),
+        ([Warned("Give --cone.")], 0, 1, "Give --cone. Give these options to `beamline recon "),
+        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. Give these options to "),
         ([Warned("A (-log)."), Failed("`beamline scan --resume R`.")], 5, 1, "`beamline scan --resume R`. A (-log)."),
     ],
 )
