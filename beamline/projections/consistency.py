@@ -30,7 +30,7 @@ from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.prep.repeats import changes_seen
-from recon.prep.tilt import roll_of_turn
+from recon.prep.tilt import roll_of_mean_view
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import circle_weights, covers_the_circle
 
@@ -277,7 +277,7 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
     mean = np.zeros(data.shape[1:])
     for view, weight in zip(some, weights, strict=True):
         mean += weight * data[view]
-    roll, sigma = roll_of_turn(mean, geometry.axis_col)
+    roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
         return Law("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))

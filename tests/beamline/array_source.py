@@ -37,7 +37,7 @@ class ArraySource:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
-    central: tuple[float, float] | None = None
+    central_ray: tuple[float, float] | None = None
     untyped = False
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None

@@ -57,7 +57,7 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        central: (row, column) that the central ray meets, by the file, which is shown and not used; NaN: not stated.
+        central_ray: (row, column) that it meets, by the file, which is shown and not used; NaN: not stated.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
         row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
@@ -93,7 +93,7 @@ class ScanSource(ABC):
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
-    central: tuple[float, float] | None = None
+    central_ray: tuple[float, float] | None = None
     unreadable: Mapping[int, str] = MappingProxyType({})
     row_pitch_mm: float | None = None
     in_order: bool = True

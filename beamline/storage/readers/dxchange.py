@@ -28,9 +28,9 @@ from beamline.storage.readers.stacks import (
     FrameStack,
     Order,
     StacksSource,
-    dimensions,
-    in_order,
-    shape_without_ones,
+    as_frames,
+    dimensions_without_ones,
+    order_of_axes,
 )
 from drivers.base.frame import FrameKind
 
@@ -56,9 +56,9 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
         items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0] or 0)) for kind, where in PLACES)
-        usual = order or (SINOGRAM if len(shape_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
+        usual = order or (SINOGRAM if len(dimensions_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
         stacks = [
-            FrameStack(kind, where, in_order(item, _order(item) or usual))
+            FrameStack(kind, where, as_frames(item, _order(item) or usual))
             for kind, where, item in items
             if item is not None
         ]
@@ -101,7 +101,7 @@ class ExchangeSource(StacksSource):
         there = [hdf5.n_written(stack.frames) for stack in self._stacks]
         angled = hdf5.n_written(theta) if theta is not None else there[-1]
         there[-1] = min(there[-1], angled)
-        self.take([len(stack.frames) for stack in self._stacks] if ended else there)
+        self.number_frames([len(stack.frames) for stack in self._stacks] if ended else there)
         views = self.image_key == FrameKind.PROJECTION
         if self.own_angles:
             self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
@@ -198,7 +198,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
 
 def _order(item: h5py.Dataset) -> Order | None:
     """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
-    return dimensions(_axes(item))
+    return order_of_axes(_axes(item))
 
 
 def _set_scale(source: ExchangeSource, file: h5py.File) -> None:

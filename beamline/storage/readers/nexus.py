@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets
-from beamline.storage.readers.stacks import dimensions
+from beamline.storage.readers.stacks import order_of_axes
 
 _LISTED = 6  # detectors, or lists of angles, that a sentence names
 _LONGEST = 100  # steps of a chain of transformations
@@ -162,7 +162,7 @@ class NexusGeometry:
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
-        central: (row, column) that the central ray meets, counted as frames are read; NaN where it is not stated.
+        central_ray: (row, column) that it meets, counted as frames are read; NaN where it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
         turned: turns of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
@@ -170,7 +170,7 @@ class NexusGeometry:
 
     pixel_mm: tuple[float | None, float | None]
     cone: tuple[float, float] | None
-    central: tuple[float, float]
+    central_ray: tuple[float, float]
     mirrored: tuple[bool, bool]
     turned: str
     remarks: dict[str, str]
@@ -245,7 +245,7 @@ def require_order(places: Places) -> None:
         axes = [
             datasets.text(axis) for part in np.ravel(nxdata.attrs["axes"]) for axis in datasets.text(part).split(":")
         ]
-        if dimensions(axes) not in (None, (0, 1, 2)):
+        if order_of_axes(axes) not in (None, (0, 1, 2)):
             raise DataError(
                 f"{nxdata.name} in {places.entry.file.filename} says that its axes are {', '.join(axes)}; expected "
                 "frames [frame, row, col]: the rotation angle, then y, then x. Turn the frames in a copy of the file, "

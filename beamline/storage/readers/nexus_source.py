@@ -83,7 +83,7 @@ class NexusSource(ScanSource):
         """
         geometry = read_geometry(self._places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
-        self.central = geometry.central
+        self.central_ray = geometry.central_ray
         self.pixel_size_mm, height = geometry.pixel_mm
         self.row_pitch_mm = differing(height, self.pixel_size_mm)
         self.pixel_mask = self._mask()

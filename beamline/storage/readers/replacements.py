@@ -28,7 +28,7 @@ from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, dataset_at, in_order
+from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, as_frames, dataset_at
 from beamline.storage.readers.tiff import (
     DECODERS,
     UNREADABLE,
@@ -345,7 +345,7 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
         raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
-    frames = in_order(item)
+    frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
     datasets.require_possible(frames)

@@ -62,7 +62,7 @@ class TurnedFrames:
         ]
 
 
-def dimensions(axes: Sequence[str]) -> Order | None:
+def order_of_axes(axes: Sequence[str]) -> Order | None:
     """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
 
     x, u or columns; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
@@ -81,7 +81,7 @@ SINOGRAM = (0, None, 1)
 """The order of one sinogram [view, col]."""
 
 
-def shape_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
+def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
     """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
     no column of pixels is, or the first of them."""
     kept = dict(enumerate(shape))
@@ -91,12 +91,12 @@ def shape_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
     return kept
 
 
-def in_order(item: Any, order: Order = USUAL) -> Any:
+def as_frames(item: Any, order: Order = USUAL) -> Any:
     """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
     n = 3 - order.count(None)
     if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
         return item
-    kept = [*shape_without_ones(item.shape, n)]
+    kept = [*dimensions_without_ones(item.shape, n)]
     if len(kept) == n - 1 and (frames := order[0]) is not None:
         order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
     elif len(kept) != n:
@@ -134,12 +134,12 @@ class StacksSource(ScanSource):
         self._check()
         self.shape = tuple(stacks[-1].frames.shape[1:])
         self.dtype = np.result_type(*(stack.frames.dtype for stack in stacks))
-        self.take([len(stack.frames) for stack in stacks])
+        self.number_frames([len(stack.frames) for stack in stacks])
         kinds = {stack.kind for stack in stacks}
         self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
         self.in_order = kinds == {FrameKind.PROJECTION}
 
-    def take(self, sizes: Sequence[int]) -> None:
+    def number_frames(self, sizes: Sequence[int]) -> None:
         """Number the frames of stacks of these sizes after those that are known already; angles and exposures are then
         NaN."""
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
@@ -213,11 +213,11 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
         n_angles = None if angles is None else dataset_at(file, angles).size
         shapes = [
-            tuple(shape_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
+            tuple(dimensions_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
         ]
-        order = order or _order_of(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
-        stacks = [FrameStack(kind, name, in_order(item, order)) for kind, name, item in references]
-        stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
+        order = order or _order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
+        stacks = [FrameStack(kind, name, as_frames(item, order)) for kind, name, item in references]
+        stacks.append(FrameStack(FrameKind.PROJECTION, where, as_frames(views, order)))
         names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
         stored = isinstance(file, h5py.File)
@@ -239,7 +239,7 @@ def _take_geometry(source: StacksSource, pixel_mm: float, config: h5py.Group) ->
         source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
         foot = start + source.cone[1] * normal - end  # from the middle of the detector
         middle = (np.array(source.shape) - 1) / 2
-        source.central = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
+        source.central_ray = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
 
 
 _CIL = (
@@ -271,7 +271,7 @@ def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
 
 def stated_order(names: str) -> Order:
     """The order that a caller states, as in "row,view,col". DataError for another text."""
-    if (order := dimensions(names.split(","))) is None:
+    if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
             f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
             "a sinogram."
@@ -279,7 +279,7 @@ def stated_order(names: str) -> Order:
     return order
 
 
-def _order_of(
+def _order_by_shapes(
     views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
 ) -> Order:
     """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
@@ -382,7 +382,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
             "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
         )
     order = order or ("col,view" if fits[0] else "view,col")
-    images = in_order(_Images(base), stated_order(order))
+    images = as_frames(_ImageStack(base), stated_order(order))
     if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
         raise DataError(
             f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
@@ -412,7 +412,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     )
 
 
-class _Images:
+class _ImageStack:
     """All images of a scan as an array [image, row, col]."""
 
     def __init__(self, base: ScanSource) -> None:

@@ -60,7 +60,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         cols=cols,
         shape=(base.shape[0], end - first),
         axis_col=None if base.axis_col is None else base.axis_col - first,
-        central=None if base.central is None else (base.central[0], base.central[1] - first),
+        central_ray=None if base.central_ray is None else (base.central_ray[0], base.central_ray[1] - first),
         flags=moved,
     )
 
@@ -81,7 +81,9 @@ def turned(base: ScanSource) -> ScanSource:
         pixels=lambda read, frames, rows: np.ascontiguousarray(np.rot90(read(frames), axes=(1, 2))[:, rows]),
         shape=base.shape[::-1],
         axis_col=None,
-        central=None if base.central is None else (base.shape[1] - 1 - base.central[1], base.central[0]),
+        central_ray=None
+        if base.central_ray is None
+        else (base.shape[1] - 1 - base.central_ray[1], base.central_ray[0]),
         pixel_size_mm=sizes[0],
         row_pitch_mm=sizes[1],
         shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],
