@@ -138,7 +138,7 @@ class Geometry:
         if not 0 < sod <= sdd <= LONGEST or sdd > _MAGNIFIED * sod:
             raise ValueError(
                 f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}; at most "
-                f"{LONGEST:g} mm, beyond which rays are parallel, and a magnification of {_MAGNIFIED:g}"
+                f"{LONGEST:g} mm, from where rays are parallel, and a magnification of {_MAGNIFIED:g}"
             )
         return cls(**placed_views(angles, detector_shape, pixel_pitch, **where), sod=float(sod), sdd=float(sdd))
 

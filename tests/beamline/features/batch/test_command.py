@@ -134,7 +134,7 @@ def test_a_row_has_what_its_reconstruction_warned_of_and_whose_the_options_are(
     passed_on: list[Event] = []
     (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), passed_on.append, SystemClock())
     assert (row.warnings, row.message[: len(said)]) == (warnings, said)
-    assert ("`beamline recon" in row.message) == ("These options" in said)
+    assert ("`beamline recon" in row.message) == ("Give these options" in said)
     assert _table(Path("out"))["scan"]["warnings"] == str(warnings)
     for event in passed_on:
         assert "--" not in event.data.get("message", "") or "`beamline " in event.data["message"]
