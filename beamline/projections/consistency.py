@@ -272,7 +272,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
 
 
 def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
-    """The mean view of a full turn is its own mirror image about the axis, in a cone, too."""
+    """The law that the mean view of a full turn is its own mirror image about the axis, in a cone, too."""
     weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
     mean = np.zeros(data.shape[1:])
     for view, weight in zip(some, weights, strict=True):

@@ -143,7 +143,7 @@ def read_part(item: Any, where: Any) -> Any:
 
 
 def _not_installed(item: h5py.Dataset) -> Iterator[str]:
-    """Filters of a dataset, and of those that it draws on, that are not installed, each as the begin of a sentence."""
+    """Filters of a dataset and of those it draws on that are not installed, each as the beginning of a sentence."""
     made = item.id.get_create_plist()
     for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
         if not h5py.h5z.filter_avail(number):

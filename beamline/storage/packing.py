@@ -32,7 +32,7 @@ class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
 
 
 def unpacked(item: h5py.Dataset) -> h5py.Dataset:
-    """A dataset that is read as the values of its numbers. DataError as of `packing`."""
+    """The dataset, read as the values of its numbers where these are packed. DataError as of `packing`."""
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or not _NAMES & {*item.attrs}:
         return item  # an array of a Zarr has done so
     by_cil = "cil_version" in item.file.attrs or "NEXUSDataWriter" in str(item.file.attrs.get("creator"))

@@ -222,7 +222,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
 
 
 def _with_command(message: str, row: BatchRow) -> str:
-    """A message of a reconstruction; where it names options, with the command whose they are."""
+    """A message of a reconstruction; where it names options, with the command that takes them."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
     return f"{message} Give these options to `beamline recon {row.scan}`." if named else message
 

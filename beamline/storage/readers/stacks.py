@@ -140,7 +140,7 @@ class StacksSource(ScanSource):
         self.in_order = kinds == {FrameKind.PROJECTION}
 
     def number_frames(self, sizes: Sequence[int]) -> None:
-        """Number the frames of stacks of these sizes after those that are known already; angles and exposures are then
+        """Number the frames of stacks of these sizes, new ones after those known so far; angles and exposures become
         NaN."""
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]

@@ -162,7 +162,7 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 
 def _clearly_seen(views: PreparedProjections) -> str:
-    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else nothing."""
+    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else ""."""
     from recon.voxels.field_edges import FieldEdges, busiest_rows
 
     data, geometry = views.ordinary.projections.data, views.ordinary.geometry

@@ -153,7 +153,7 @@ def find_jumps(
 
 
 def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
-    """What was done at the jumps, and where views show nothing."""
+    """What was done at the jumps, and at which alarms the views show none."""
     text = list[str]()
     if lost:
         verb = "is" if lost == 1 else "are"
