@@ -189,7 +189,7 @@ class ArrayFile(dict[str, NamedArray]):
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
         if path.suffix.lower() == _NUMPY:
             require_regular(path)
-            found: dict[str, Any] = {"": np.load(path, mmap_mode="r", allow_pickle=False)}
+            arrays: dict[str, Any] = {"": np.load(path, mmap_mode="r", allow_pickle=False)}
         else:
             zarr, store = zarr_library(path), str(path)
             if path.is_file():
@@ -197,8 +197,8 @@ class ArrayFile(dict[str, NamedArray]):
                 self.close = store.close
             root = zarr.open(store=store, path=zarr_root(path) or "", mode="r")
             members = [("", root)] if hasattr(root, "chunks") else islice(root.members(max_depth=None), _MOST)
-            found, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
-        self.update({name: NamedArray(array, f"/{name}", self) for name, array in found.items()})
+            arrays, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
+        self.update({name: NamedArray(array, f"/{name}", self) for name, array in arrays.items()})
 
     def __missing__(self, path: str) -> NamedArray:
         name = path.strip("/")

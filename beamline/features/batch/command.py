@@ -163,13 +163,13 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
     from beamline.storage.interrupted import whole_scan  # here: help needs none of it
 
-    given = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
+    by_name = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
     rows = [
-        row if row.has_volume else replace(row, scan=str(whole_scan(given.get(row.scan, Path(row.scan)))))
+        row if row.has_volume else replace(row, scan=str(whole_scan(by_name.get(row.scan, Path(row.scan)))))
         for row in earlier
     ]
     old = {printable(row.scan) for row in rows}
-    new = [path for shown, path in given.items() if shown not in old]
+    new = [path for shown, path in by_name.items() if shown not in old]
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
@@ -187,10 +187,10 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
             last = event.data
         else:
             warned.extend([event.message] if isinstance(event, Warned) else [])
-            said: dict[str, Any] = (
+            with_command: dict[str, Any] = (
                 {"message": _with_command(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
             )
-            sink(replace(event, scan=row.scan, **said))
+            sink(replace(event, scan=row.scan, **with_command))
 
     place = options.folder / row.name
     if (place / RECON).is_file():

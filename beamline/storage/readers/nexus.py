@@ -101,17 +101,22 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
     The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
     group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
     """
-    here, where, steps, found = datasets.resolve(entry, "sample"), datasets.text_at(entry, "sample/depends_on"), 0, []
+    here, where, steps, rotations = (
+        datasets.resolve(entry, "sample"),
+        datasets.text_at(entry, "sample/depends_on"),
+        0,
+        [],
+    )
     while where not in ("", ".") and steps < _LONGEST and (item := datasets.resolve(here, where)) is not None:
         inner = isinstance(item, h5py.Group)
         values = datasets.dataset(item, "value") if inner else datasets.dataset(here, where)
         if values is not None and values.size > 1 and datasets.attribute(item, "transformation_type") == "rotation":
             vector = np.ravel(item.attrs.get("vector", 1))
             against = vector.dtype.kind in "if" and vector[np.abs(vector).argmax()] < 0
-            found.append((values, -1 if against else 1))
+            rotations.append((values, -1 if against else 1))
         here, where, steps = item.parent, datasets.attribute(item, "depends_on"), steps + 1
-    changing = [each for each in found if np.unique(datasets.values_of(each[0])).size > 1]
-    return changing or found
+    changing = [each for each in rotations if np.unique(datasets.values_of(each[0])).size > 1]
+    return changing or rotations
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:

@@ -50,15 +50,15 @@ class TurnedFrames:
         return int(self.shape[0])
 
     def __getitem__(self, wanted: tuple[slice, ...]) -> NDArray[Any]:
-        stored, given = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
-        for axis, part in zip(self._order, given, strict=True):
+        stored, parts = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
+        for axis, part in zip(self._order, parts, strict=True):
             if axis is not None:
                 stored[axis] = part
-        found, kept = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
-        found = found.transpose([*kept, *({*range(found.ndim)} - {*kept})])
-        sizes = [1 if axis is None else found.shape[kept.index(axis)] for axis in self._order]
-        return found.reshape(sizes)[
-            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, given, strict=True))
+        values, axes = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
+        values = values.transpose([*axes, *({*range(values.ndim)} - {*axes})])
+        sizes = [1 if axis is None else values.shape[axes.index(axis)] for axis in self._order]
+        return values.reshape(sizes)[
+            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, parts, strict=True))
         ]
 
 
@@ -84,11 +84,11 @@ SINOGRAM = (0, None, 1)
 def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
     """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
     no column of pixels is, or the first of them."""
-    kept = dict(enumerate(shape))
-    while len(kept) > n and 1 in kept.values():
-        last = max(kept)
-        del kept[last if kept[last] == 1 else next(axis for axis, size in kept.items() if size == 1)]
-    return kept
+    sizes = dict(enumerate(shape))
+    while len(sizes) > n and 1 in sizes.values():
+        last = max(sizes)
+        del sizes[last if sizes[last] == 1 else next(axis for axis, size in sizes.items() if size == 1)]
+    return sizes
 
 
 def as_frames(item: Any, order: Order = USUAL) -> Any:
@@ -96,12 +96,12 @@ def as_frames(item: Any, order: Order = USUAL) -> Any:
     n = 3 - order.count(None)
     if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
         return item
-    kept = [*dimensions_without_ones(item.shape, n)]
-    if len(kept) == n - 1 and (frames := order[0]) is not None:
+    places = [*dimensions_without_ones(item.shape, n)]
+    if len(places) == n - 1 and (frames := order[0]) is not None:
         order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
-    elif len(kept) != n:
+    elif len(places) != n:
         return item
-    return TurnedFrames(item, tuple(axis if axis is None else kept[axis] for axis in order))  # type: ignore[arg-type]
+    return TurnedFrames(item, tuple(axis if axis is None else places[axis] for axis in order))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -322,17 +322,17 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
 
 def _only_angles(file: h5py.File) -> str:
     """The path of the only list of a file whose unit is one of angles."""
-    found = [
+    names = [
         str(item.name)
         for item in _arrays_of(file)
         if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
     ]
-    if len(found) != 1:
+    if len(names) != 1:
         raise DataError(
-            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
             "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
         )
-    return found[0]
+    return names[0]
 
 
 def dataset_at(file: Any, where: str) -> Any:

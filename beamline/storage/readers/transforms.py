@@ -310,8 +310,8 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool
         return 0, False
     if np.median(of_low) < _ALIKE * np.median(of_high):
         return 0, False
-    left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
-    return edges, bool(left.sum() < _A_ROW * edges)
+    steps_left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
+    return edges, bool(steps_left.sum() < _A_ROW * edges)
 
 
 def without_wraps(base: ScanSource, edges: int) -> ScanSource:
