@@ -294,10 +294,10 @@ def _read_devices(config: Config, as_json: bool, sink: Sink) -> None:
             sink(DeviceRead({"name": state.name, "fault": state.fault, **state.values}, time=clock.now()))
             silent += [state.name] if state.fault else []
             if not as_json:
-                said = state.fault or ", ".join(
+                sentence = state.fault or ", ".join(
                     f"{name} {one_line(str(value))}" for name, value in state.values.items() if name in SHOWN
                 )
-                click.echo(f"{state.name:<14}{said}")
+                click.echo(f"{state.name:<14}{sentence}")
     if silent:
         advice = "Nothing has moved. Each line above says what to do"
         raise DeviceError("devices", f"{' and '.join(silent)} cannot be used", advice=advice)

@@ -28,7 +28,7 @@ _LONGEST, _MOST, _DEEPEST, _DIGITS = 2**18, 20_000, 64, 500
 """Of a YAML text: characters, values (as often as aliases repeat them), groups within groups, digits of a number."""
 _TOO_MUCH = (
     f"this is more than settings hold: at most {_LONGEST} characters, {_MOST} values, {_DEEPEST} groups within each "
-    f"other, numbers of {_DIGITS} digits. Nothing was started."
+    f"other and numbers of {_DIGITS} digits. Nothing was started."
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
 _BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
@@ -91,12 +91,12 @@ def yaml_faults(text: str, name: str) -> Iterator[None]:
     except RecursionError:
         raise ConfigError(f"{name}: a value contains itself. Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
-        line, what = _in_words(error, text)
+        line, what = _line_and_fault(error, text)
         place = f"{name}:{line}" if line and "\n" in text else name
         raise ConfigError(f"{place}: this is not YAML ({what}). Nothing was started.") from None
 
 
-def _in_words(error: Exception, text: str) -> tuple[int, str]:
+def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     """The line of a fault of YAML, 0: not known, and what is wrong with it, for who does not know YAML."""
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
@@ -115,7 +115,7 @@ def _in_words(error: Exception, text: str) -> tuple[int, str]:
     ]
     of_key = "mapping values" in problem or "expected ':'" in problem
     deeper = len(this) - len(this.lstrip()) > len(above) - len(above.lstrip())
-    told = (
+    faults = (
         (is_quote and "end of stream" in problem, f"the {opened} of this line is never closed"),
         (is_open, f"the {opened} of this line is never closed"),
         ("'\\t'" in problem and not this[: mark.column].strip(), "this line begins with a tab; indent it with spaces"),
@@ -126,12 +126,15 @@ def _in_words(error: Exception, text: str) -> tuple[int, str]:
         (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
         (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
         (of_key and ": " in this[: mark.column], "a colon is missing, or a value that has a colon needs quotes"),
-        (of_key and deeper and ": " in above, "this line is indented deeper than the one above, which has its value"),
+        (
+            of_key and deeper and ": " in above,
+            "this line is indented deeper than the one above, which already has a value",
+        ),
         (of_key, "a colon is missing after a key of this line or the one above"),
         ("<block end>" in problem, "the indentation of this line is that of no group above it"),
     )
     at = context if (is_open or is_quote) and context else mark
-    return at.line + 1, next((sentence for holds, sentence in told if holds), problem)
+    return at.line + 1, next((sentence for holds, sentence in faults if holds), problem)
 
 
 def _locate(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
@@ -202,7 +205,7 @@ REMOVED = {
     "0.5 dB at most",
     "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
 }
-"""Keys of 1.0.0 that are none any more, each with what does the same."""
+"""Keys of 1.0.0 that were removed, each with what does the same."""
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
 
 
@@ -259,7 +262,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         sentence = message.removeprefix(_OF_VALIDATOR)
         return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden" and name in REMOVED:
-        return f"{name} is no key any more; leave it out. {REMOVED[name]}"
+        return f"{name} is no longer a key; leave it out. {REMOVED[name]}"
     if kind == "extra_forbidden":
         keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
         others = [key for key in _value(data, path[:-1]) if key not in keys]

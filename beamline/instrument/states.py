@@ -21,7 +21,7 @@ from drivers.base.protocols import ConnectedShutter
 
 @dataclass(frozen=True)
 class DeviceState:
-    """What a device says.
+    """What a device says of itself, or why it cannot be used.
 
     Attributes:
         name: of the device.

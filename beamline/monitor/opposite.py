@@ -131,11 +131,11 @@ class OppositeCheck(Logged):
         if (
             not one.turned
             and abs(turn - other) <= beside
-            and self._goes_on(one, one.after, (turn - other) / step, grid)
+            and self._predicts(one, one.after, (turn - other) / step, grid)
         ):
             kept = (*state.kept[:at], replace(one, turned=True), *state.kept[at + 1 :])
             return self._mirrored(replace(state, kept=kept), one, (turn - other) / step, view, context)
-        if not one.again and abs(turn) <= beside and self._goes_on(one, one.after, turn / step, grid):
+        if not one.again and abs(turn) <= beside and self._predicts(one, one.after, turn / step, grid):
             kept = (*state.kept[:at], replace(one, again=True), *state.kept[at + 1 :])
             fit = lay_on(one, turn / step, view, grid, mirrored=False)
             again = f"frame {one.view.index}, taken again"
@@ -144,7 +144,7 @@ class OppositeCheck(Logged):
             )
         return None
 
-    def _goes_on(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> bool:
+    def _predicts(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> bool:
         """Whether a kept view with its velocity predicts one some steps later, to within the limit of a change.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it

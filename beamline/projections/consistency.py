@@ -30,7 +30,7 @@ from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.prep.repeats import changes_seen
-from recon.prep.tilt import roll_of_turn
+from recon.prep.tilt import roll_of_mean_view
 from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import circle_weights, covers_the_circle
 
@@ -122,7 +122,7 @@ def _laws_of(prepared: PreparedProjections, *, whole: bool) -> list[Law]:
         elif data.shape[1] >= _LEAST_ROWS and whole:
             laws = _laws_within_the_field(prepared, some)
     if geometry.is_cone and not wide and covers_the_circle(geometry.angles):
-        laws.append(_upright(data, some, geometry))
+        laws.append(_lean_of_axis(data, some, geometry))
     if (wide or not air_is_off) and not any(law.broken for law in laws):
         laws.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
     return laws
@@ -140,7 +140,7 @@ def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]
         return [masses]
     near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
     turn = _angles(shown, geometry.angles)
-    if ends := _ends(data, geometry, shown.stretch):
+    if ends := _ends_of_turn(data, geometry, shown.stretch):
         turn = replace(turn, tolerance=_STRETCH, sentence=f"{ends} {turn.sentence}")
     return [masses, _across(shown), _heights(shown), *([turn] if near else [])]
 
@@ -271,13 +271,13 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
     return Law("mass of the views", float(high - low), tolerance, "of the mass", sentence)
 
 
-def _upright(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
-    """The mean view of a full turn is its own mirror image about the axis, in a cone, too."""
+def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
+    """The law that the mean view of a full turn is its own mirror image about the axis, in a cone, too."""
     weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
     mean = np.zeros(data.shape[1:])
     for view, weight in zip(some, weights, strict=True):
         mean += weight * data[view]
-    roll, sigma = roll_of_turn(mean, geometry.axis_col)
+    roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
         return Law("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
@@ -325,7 +325,7 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> Law:
     return Law("moments, scale of the angles", abs(shown.stretch), tolerance, "of the angles", sentence)
 
 
-def _ends(data: F32, geometry: Geometry, stretch: float) -> str:
+def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     """A sentence where the angles are spread over half a turn or a turn with both ends, and the views without, or the
     reverse: by what the first and the last view show, and by the excess of the turn over the stated one."""
     order = np.argsort(geometry.angles, kind="stable")

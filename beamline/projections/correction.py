@@ -26,7 +26,14 @@ from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import Mask
 from recon.base.views import spread
-from recon.prep.correct import Correction, GivenLines, Projections, Transmission, UnlitViewsError, merge_and_empty
+from recon.prep.correct import (
+    Correction,
+    LineIntegralCorrection,
+    Projections,
+    Transmission,
+    UnlitViewsError,
+    merge_and_empty,
+)
 from recon.prep.counts import Photons
 from recon.prep.unmeasured import foreign_rows
 
@@ -71,7 +78,7 @@ class ScanCorrection:
             current_scale(source)  # refuses a file without any
         self._named_unlit: set[int] = set()  # views without light that were named
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
-        self._stream: Correction | GivenLines | None = None
+        self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
     @property
@@ -310,7 +317,7 @@ class ScanCorrection:
             self._shadow = self._beam.shadow(self._source, views, read.start, self.binning)
         elif views.size >= SHADOW_VIEWS:
             given = read_binned(self._source, some, read, self.binning)
-            lines = GivenLines(np.inf).transmission(given, some.astype(np.float64), some).data
+            lines = LineIntegralCorrection(np.inf).transmission(given, some.astype(np.float64), some).data
             foreign = foreign_rows(np.exp(-lines), self._source.angles[some])
             self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
@@ -321,10 +328,10 @@ class ScanCorrection:
         in_time = (steps >= 0).all() or (steps <= 0).all()
         return np.arange(frames.size) if in_time else np.argsort(angles, kind="stable")
 
-    def _correction(self, rows: slice | None) -> Correction | GivenLines:
+    def _correction(self, rows: slice | None) -> Correction | LineIntegralCorrection:
         if self._beam is None:
             foreign = None if self._shadow is None else self._shadow[1][self._filters.within(rows)]
-            return GivenLines(self._selection.step(Preparation).zinger_threshold, foreign)
+            return LineIntegralCorrection(self._selection.step(Preparation).zinger_threshold, foreign)
         try:
             return self._beam.correction(self._filters.within(rows), self._shadow)
         except ValueError as error:
@@ -332,7 +339,7 @@ class ScanCorrection:
 
     def _corrected(
         self,
-        correction: Correction | GivenLines,
+        correction: Correction | LineIntegralCorrection,
         data: NDArray[Any],
         frames: NDArray[np.int64],
         last: bool,
@@ -360,7 +367,7 @@ class ScanCorrection:
 
     def _transmission(
         self,
-        correction: Correction | GivenLines,
+        correction: Correction | LineIntegralCorrection,
         data: NDArray[Any],
         frames: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,

@@ -101,8 +101,8 @@ def warn_of_unmeasured_rows(prepared: PreparedProjections, warn: Warn) -> None:
         if rows.size:
             warn(
                 f"No ray measured {count(rows.size, what)} of {len(prepared.projections.masked)} (from 0: "
-                f"{spans(rows.tolist())}): in all views these rows have no beam, no numbers, or dead pixels. They are "
-                f"{so if what == 'slice' else 'not used'}."
+                f"{spans(rows.tolist())}): in all views these rows have no beam, no finite values, or dead pixels. "
+                f"They are {so if what == 'slice' else 'not used'}."
             )
 
 
@@ -131,9 +131,9 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
             f"In {count(frames.size, 'view')} of {projections.view_ids.size} (frames {spans(frames.tolist())}) pixels "
-            f"of columns {cols} and rows {rows} measured nothing: zeros or no numbers at a border, as where views were "
-            "shifted or turned before, or something opaque in the beam that is not the sample, as a post or a clamp. "
-            "These rays weigh nothing."
+            f"of columns {cols} and rows {rows} measured nothing: zeros or values that are not finite at a border, as "
+            "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
+            "as a post or a clamp. These rays have no weight."
         )
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),

@@ -133,8 +133,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
     findings = [*scan_findings(source), *scan_ended(source)]
-    given = {"central-column": selection.axis_col, "central-row": selection.central_row}
-    findings += [hit for hit in central_ray_taken(source, selection.cone) if given[hit.rule] is None]
+    by_option = {"central-column": selection.axis_col, "central-row": selection.central_row}
+    findings += [hit for hit in central_ray_taken(source, selection.cone) if by_option[hit.rule] is None]
     findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]

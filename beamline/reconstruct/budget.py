@@ -18,7 +18,7 @@ _TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
 def in_budget(
     method: Method, budget: float, geometry: Geometry, grid: Grid, now: Clock, warn: Warn
 ) -> tuple[Method, str]:
-    """The choice without the methods that would end too late, or the only one that is left; and in words who is.
+    """The choice without the methods that would end too late, or the only method left; and in words who stays, and why.
 
     A few iterations of each are timed, then forecasts are compared with the seconds that are left. Nothing else
     changes: the methods that are left run as without a budget, to their own end.
@@ -40,20 +40,20 @@ def in_budget(
             refused.append(f"{each.name}: {error}")
     if not kept:
         raise ValueError("; ".join(refused))
-    chosen, expected = _of(method, kept), 0.0
+    chosen, expected = _without_slow(method, kept), 0.0
     while (expected := timing.of(chosen).most) > end - now() and len(kept) > 1:
         kept.remove(max(kept, key=lambda each: seconds[each.name]))
-        chosen = _of(method, kept)
+        chosen = _without_slow(method, kept)
     if (late := expected - (end - now())) > 0:
         warn(
-            f"{duration_text(budget)} are too few for this scan: the quickest method, {kept[0].name}, will be about "
-            f"{duration_text(late)} late."
+            f"{duration_text(budget)} are too short for this scan: the quickest method, {kept[0].name}, runs all "
+            f"the same and ends about {duration_text(late)} late."
         )
     names = [each.name for each in kept]
     out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]
     return chosen, "; ".join((f"{duration_text(budget)} for {' or '.join(names)}", *out))
 
 
-def _of(method: Method, kept: list[Method]) -> Method:
-    """The choice among these alone."""
+def _without_slow(method: Method, kept: list[Method]) -> Method:
+    """The choice among `kept` alone; the only method left as itself."""
     return kept[0] if len(kept) == 1 else cast(Method, replace(cast(Any, method), candidates=tuple(kept)))

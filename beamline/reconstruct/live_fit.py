@@ -316,7 +316,7 @@ class ScanFollower:
         self._settle_newest()  # the scan was stopped: no other view comes
         if wide := int((self.source.image_key == FrameKind.WIDE_VIEW).sum()):
             self._warn(
-                f"{count(wide, 'wide view')} of this scan are not used: this volume grew with the scan, of ordinary "
+                f"{count(wide, 'wide view')} of this scan are not used: this volume grew with the scan, from ordinary "
                 f"views. `beamline recon {self.source.path}` uses them, which gives densities near the axis."
             )
         steps = in_order(self._options.selection)

@@ -329,11 +329,11 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
             f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
             "frames recorded so far. Nothing was written."
         )
-    if source.unpacking > (allowed := memory_of(options)):
+    if source.unpack_bytes > (allowed := memory_of(options)):
         raise DataError(
-            f"{source.path} is stored in chunks of which one takes {size(source.unpacking)} of memory to unpack, "
-            f"{size(allowed)} may be used. Give --memory {math.ceil(source.unpacking / 1e6)}M if there is as much, or "
-            "copy the file with a frame a chunk. Nothing was read."
+            f"{source.path} is stored in chunks of which one takes {size(source.unpack_bytes)} of memory to unpack; "
+            f"{size(allowed)} may be used. Give --memory {math.ceil(source.unpack_bytes / 1e6)}M if there is as much, "
+            "or copy the file with one frame in each chunk. Nothing was read."
         )
 
 

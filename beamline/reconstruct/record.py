@@ -220,8 +220,8 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "command": context.command,
     }
     parts = np.unique(prepared.projections.unmeasured[:, 0]), prepared.unmeasured_rows[0]
-    found = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
-    parameters |= {name: numbers for name, numbers in found if numbers.size}
+    unmeasured = zip(("frames_unmeasured_in_part", "rows_unmeasured"), parts, strict=True)
+    parameters |= {name: numbers for name, numbers in unmeasured if numbers.size}
     if prepared.view_weights is not None:
         parameters["view_weights"] = prepared.view_weights
     if facts.frames_per_view > 1:

@@ -99,7 +99,7 @@ def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Datas
 
 def first_of(item: h5py.Dataset) -> Any:
     """The first value of a dataset, which may have many; of an empty dataset nothing."""
-    return taken(item, () if item.size <= 1 else (0,) * item.ndim)
+    return read_part(item, () if item.size <= 1 else (0,) * item.ndim)
 
 
 def values_of(item: h5py.Dataset) -> Any:
@@ -109,7 +109,7 @@ def values_of(item: h5py.Dataset) -> Any:
             f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
             f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
         )
-    return taken(item, ())
+    return read_part(item, ())
 
 
 # Filters that The HDF Group has registered and that no package brings on which we depend, by number
@@ -121,7 +121,7 @@ FILTERS = {
 }  # fmt: skip
 
 
-def taken(item: Any, where: Any) -> Any:
+def read_part(item: Any, where: Any) -> Any:
     """`item[where]` of a dataset.
 
     Raises:
@@ -143,18 +143,18 @@ def taken(item: Any, where: Any) -> Any:
 
 
 def _not_installed(item: h5py.Dataset) -> Iterator[str]:
-    """Filters of a dataset, and of those that it draws on, that are not installed, each as the begin of a sentence."""
+    """Filters of a dataset and of those it draws on that are not installed, each as the beginning of a sentence."""
     made = item.id.get_create_plist()
     for number, _, _, said in map(made.get_filter, range(made.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
             name = FILTERS.get(number) or one_line(text(said), 40) or "name unknown"
             yield f"{item.name} in {item.file.filename} is stored with the HDF5 filter {number} ({name})"
     for name, where in dict.fromkeys(drawn_on(made)) if item.is_virtual else ():
-        with suppress(DataError, OSError, LookupError), _opened(item, name) as file:
+        with suppress(DataError, OSError, LookupError), _source_file(item, name) as file:
             yield from _not_installed(file[where])
 
 
-def _opened(item: h5py.Dataset, name: str) -> AbstractContextManager[h5py.File]:
+def _source_file(item: h5py.Dataset, name: str) -> AbstractContextManager[h5py.File]:
     """A file that a virtual dataset names, "." for its own."""
     return nullcontext(item.file) if name == "." else open_hdf5(Path(item.file.filename).parent / name)
 
@@ -308,7 +308,7 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
     for (name, where), places in drawn.items():
         path = Path(item.file.filename) if name == "." else Path(item.file.filename).parent / name
         key = os.path.realpath(path), where
-        with suppress(DataError, OSError), _opened(item, name) as file:
+        with suppress(DataError, OSError), _source_file(item, name) as file:
             source = dataset(file, where)
             if source is not None and all(_holds(source, place) for place in places):
                 if key not in whole:
@@ -355,8 +355,8 @@ def require_possible(item: Any) -> int:
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
             f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "
-            f"{size(needed)} of memory, {size(free)} are free. Copy it with a frame a chunk (h5repack -l CHUNK=...), "
-            "where there is more. Nothing was read."
+            f"{size(needed)} of memory, {size(free)} are free. On a machine with more, copy it with one frame in each "
+            "chunk (h5repack -l CHUNK=...). Nothing was read."
         )
     return needed
 
@@ -370,7 +370,7 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
     start = 0
     for first, end in runs(indices):
         try:
-            out[start : start + end - first] = taken(item, (slice(first, end), rows))
+            out[start : start + end - first] = read_part(item, (slice(first, end), rows))
         except OSError as error:
             which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
             raise UnreadableError(

@@ -161,7 +161,7 @@ class NamedArray:
 
     is_virtual = False
 
-    def __init__(self, array: Any, name: str, file: Arrays) -> None:
+    def __init__(self, array: Any, name: str, file: ArrayFile) -> None:
         self.array, self.name, self.file, self.attrs = array, name, file, dict(getattr(array, "attrs", {}))
         self.chunks: tuple[int, ...] | None = getattr(array, "chunks", None)
         packed = None
@@ -182,14 +182,14 @@ class NamedArray:
             raise OSError(f"{type(error).__name__}: {error}") from error
 
 
-class Arrays(dict[str, NamedArray]):
+class ArrayFile(dict[str, NamedArray]):
     """The arrays of a file by the paths of their names; "" is the only one of a file."""
 
     def __init__(self, path: Path) -> None:
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
         if path.suffix.lower() == _NUMPY:
             require_regular(path)
-            found: dict[str, Any] = {"": np.load(path, mmap_mode="r", allow_pickle=False)}
+            arrays: dict[str, Any] = {"": np.load(path, mmap_mode="r", allow_pickle=False)}
         else:
             zarr, store = zarr_library(path), str(path)
             if path.is_file():
@@ -197,8 +197,8 @@ class Arrays(dict[str, NamedArray]):
                 self.close = store.close
             root = zarr.open(store=store, path=zarr_root(path) or "", mode="r")
             members = [("", root)] if hasattr(root, "chunks") else islice(root.members(max_depth=None), _MOST)
-            found, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
-        self.update({name: NamedArray(array, f"/{name}", self) for name, array in found.items()})
+            arrays, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
+        self.update({name: NamedArray(array, f"/{name}", self) for name, array in arrays.items()})
 
     def __missing__(self, path: str) -> NamedArray:
         name = path.strip("/")
@@ -207,9 +207,9 @@ class Arrays(dict[str, NamedArray]):
         return self.get(name) or next(iter(self.values()))
 
 
-def opened(path: Path, follow: bool = False) -> Any:
-    """A file with arrays by their names: HDF5, which may still grow, or `Arrays`."""
-    return Arrays(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
+def open_array_file(path: Path, follow: bool = False) -> Any:
+    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
+    return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
 _NUMPY = ".npy"

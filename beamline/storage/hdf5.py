@@ -131,7 +131,7 @@ def look_again(item: h5py.Dataset) -> None:
         item.refresh()
 
 
-def written(item: Any) -> int:
+def n_written(item: Any) -> int:
     """How many frames or values of a growing dataset are there.
 
     Its writer may have made room for more: for frames of which no chunk is stored yet, or for values at the end of a

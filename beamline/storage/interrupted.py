@@ -31,7 +31,7 @@ from beamline.storage.parts import (
     wide_planned,
 )
 from beamline.storage.run_record import DIED, alive, read_record
-from beamline.storage.superblock import marked, superblock
+from beamline.storage.superblock import marked_as_being_written, superblock
 from beamline.storage.writer_lock import QUIET, abandoned, held
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
@@ -96,7 +96,7 @@ def next_step(scan: Path) -> str:
     """A sentence on the next step for a scan that is running, died or ended early; "" if nothing is missing."""
     if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file():
         return _step_of_run(run_of(scan.parent))
-    if not scan.is_file() or not marked(scan):
+    if not scan.is_file() or not marked_as_being_written(scan):
         return ""
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
         if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives

@@ -32,7 +32,7 @@ class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
 
 
 def unpacked(item: h5py.Dataset) -> h5py.Dataset:
-    """A dataset that is read as the values of its numbers. DataError as of `packing`."""
+    """The dataset, read as the values of its numbers where these are packed. DataError as of `packing`."""
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or not _NAMES & {*item.attrs}:
         return item  # an array of a Zarr has done so
     by_cil = "cil_version" in item.file.attrs or "NEXUSDataWriter" in str(item.file.attrs.get("creator"))
@@ -41,27 +41,29 @@ def unpacked(item: h5py.Dataset) -> h5py.Dataset:
 
 
 def packing(
-    said: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
+    attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
 ) -> Callable[[Any], NDArray[Any]] | None:
-    """What makes values of packed numbers [...] of a type, NaN of those that are none; None where they are the values.
+    """A function that makes values of stored numbers [...], NaN of those that are none; None: they are the values.
 
     Values are of a real type that holds all that is stored: by CF stored * scale_factor + add_offset, by CIL (stored -
     offset) / scale.
 
     Args:
-        said: the attributes of the numbers.
+        attributes: of the numbers.
+        dtype: of the stored numbers.
+        where: names them in an error.
         by_cil: CIL wrote them: others mean something else by scale and offset.
 
     Raises:
         DataError: nobody says what they mean, or no number has such a value.
     """
     real = np.result_type(dtype, np.float32)
-    pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*said} and not {*_CF} & {*said} else _CF
-    given = [np.ravel(said.get(name, plain))[:1] for name, plain in zip(pair, (1, 0), strict=True)]
-    scale, offset = (float(each[0]) if each.size and each.dtype.kind in "uif" else np.nan for each in given)
+    pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*attributes} and not {*_CF} & {*attributes} else _CF
+    pair_values = [np.ravel(attributes.get(name, plain))[:1] for name, plain in zip(pair, (1, 0), strict=True)]
+    scale, offset = (float(each[0]) if each.size and each.dtype.kind in "uif" else np.nan for each in pair_values)
     if not (scale and np.isfinite(scale + offset)) or (pair is _CIL and not by_cil and (scale, offset) != (1, 0)):
         shown = " and ".join(
-            f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, given, strict=True)
+            f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, pair_values, strict=True)
         )
         raise DataError(
             f"{where} has the attributes {shown}, and nothing says how its numbers are read by them. In a copy, name "
@@ -69,12 +71,14 @@ def packing(
         )
     if pair is _CIL:
         scale, offset = 1 / scale, -offset / scale
-    unsigned = dtype.kind == "i" and "true" in str(said.get("_Unsigned")).lower()
+    unsigned = dtype.kind == "i" and "true" in str(attributes.get("_Unsigned")).lower()
     signed = np.dtype(dtype.str.replace("i", "u")) if unsigned else dtype
-    fills = np.concatenate([np.ravel(said.get(name, [])) for name in ("_FillValue", "missing_value")])
+    fills = np.concatenate([np.ravel(attributes.get(name, [])) for name in ("_FillValue", "missing_value")])
     ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     fills = fills[(fills >= ends[0]) & (fills <= ends[1])].astype(dtype).view(signed)  # NaN are no values as they are
-    limits = np.ravel(said.get("valid_range", [said.get("valid_min", -np.inf), said.get("valid_max", np.inf)]))
+    limits = np.ravel(
+        attributes.get("valid_range", [attributes.get("valid_min", -np.inf), attributes.get("valid_max", np.inf)])
+    )
     if limits.dtype.kind == "f" and dtype.kind != "f":  # in the unit of the values, as these have another type
         limits = np.rint((limits - offset) / scale)
     low, high = limits.min(), limits.max()

@@ -73,7 +73,7 @@ def superblock(path: Path) -> Superblock | None:
     return Superblock(head, path.stat().st_size) if head[_CHECKSUM] == lookup3(head[: _CHECKSUM.start]) else None
 
 
-def marked(path: Path) -> bool:
+def marked_as_being_written(path: Path) -> bool:
     """Whether the file is marked as being written: a program writes it, or died while writing."""
     head = superblock(path)
     return head is not None and head.open_for_writing

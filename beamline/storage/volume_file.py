@@ -205,7 +205,7 @@ def _from_hdf5(
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
     _check_size(path, item.nbytes)
-    return datasets.taken(item, ()), axes_of(file, name)[0]
+    return datasets.read_part(item, ()), axes_of(file, name)[0]
 
 
 def _only(path: Path, axes: dict[str, int]) -> str:

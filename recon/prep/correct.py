@@ -310,7 +310,7 @@ class Correction:
             )
 
 
-class GivenLines:
+class LineIntegralCorrection:
     """Line integrals as they are given, as a `Correction` for its caller: pixels that are not finite or measured
     nothing, and spots, are filled. There is no air, and nothing is masked but pixels [row, col] that no view has.
     Exact zeros at the corners are measured where air is 0 without noise."""

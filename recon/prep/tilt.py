@@ -129,7 +129,7 @@ def _best_line(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64
     )
 
 
-def roll_of_turn(mean: F64, axis_col: float) -> tuple[float, float]:
+def roll_of_mean_view(mean: F64, axis_col: float) -> tuple[float, float]:
     """The lean of the axis in the detector's plane, by the mean view of a full turn, and its standard deviation.
 
     That is the view of the sample turned into a body of revolution, so that its halves beside the axis are mirror

@@ -42,21 +42,21 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
     unknown = low & ~np.isfinite(light) & ~hidden
     if not (_corners(low).any() or (foreign is not None and foreign.any()) or unknown.any()):
         return None
-    labels, found = _at_borders(low, hidden), np.zeros_like(low)
+    labels, nothing_seen = _at_borders(low, hidden), np.zeros_like(low)
     for label in {*_corners(labels).flat} - {0}:
         part = (labels == label) & low & ~hidden & ~unknown
         solid = np.mean((low | hidden)[labels == label]) > _ONE_VALUE
-        given, seen = values[part], light[part].astype(np.float64)
+        stored, seen = values[part], light[part].astype(np.float64)
         if (
             part.any()
             and solid
-            and (np.mean(given == np.median(given)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std())
+            and (np.mean(stored == np.median(stored)) > _ONE_VALUE or seen.mean() < -_BELOW * seen.std())
         ):
-            found |= labels == label
+            nothing_seen |= labels == label
     if foreign is not None:
-        found |= (labels > 0) & foreign[:, None]
-    found = (ndimage.binary_dilation(found, _RIM) | areas(unknown)) & ~hidden
-    return found if found.any() and not (found | hidden).all() else None
+        nothing_seen |= (labels > 0) & foreign[:, None]
+    nothing_seen = (ndimage.binary_dilation(nothing_seen, _RIM) | areas(unknown)) & ~hidden
+    return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
 
 
 def foreign_rows(light: F32, angles: F64) -> Mask:
@@ -71,40 +71,40 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
     if not lit.any():
         return np.zeros(light.shape[1], np.bool_)
     dark: Mask = np.stack([_at_borders(view <= DARK, np.zeros(view.shape, np.bool_)) > 0 for view in light])
-    there: Mask = np.any(dark, axis=2)
-    rows = there.any(axis=0) & ~there.all(axis=0)
-    some = there[:, rows].any(axis=1)
-    if some.all() or not some.any():
+    has_dark: Mask = np.any(dark, axis=2)
+    rows = has_dark.any(axis=0) & ~has_dark.all(axis=0)
+    with_dark = has_dark[:, rows].any(axis=1)
+    if with_dark.all() or not with_dark.any():
         return np.zeros_like(rows)
     lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
     mass = lines.sum(axis=(1, 2), dtype=np.float64)
-    for view in np.flatnonzero(some):
+    for view in np.flatnonzero(with_dark):
         hidden = ndimage.binary_dilation(dark[view], _RIM)[rows]
         if hidden.all():
             lines[view] = 0
         else:
             fill(lines[view], plan_fill(hidden))
-    free = np.flatnonzero(~some)[np.argsort(angles[~some])]
-    usual = np.interp(angles[some], angles[free], mass[free])
-    more, less = mass[some] - usual, lines[some].sum(axis=(1, 2), dtype=np.float64) - usual
-    return rows & (more.sum() > 0 and np.abs(less).sum() < _CLEARLY * np.abs(more).sum())
+    free = np.flatnonzero(~with_dark)[np.argsort(angles[~with_dark])]
+    usual = np.interp(angles[with_dark], angles[free], mass[free])
+    brought, remaining = mass[with_dark] - usual, lines[with_dark].sum(axis=(1, 2), dtype=np.float64) - usual
+    return rows & (brought.sum() > 0 and np.abs(remaining).sum() < _CLEARLY * np.abs(brought).sum())
 
 
-def without_borders(image: NDArray[Any]) -> NDArray[Any]:
+def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
     """An image of counts whose areas of exact zeros at its corners have the value of the nearest pixel beside them."""
     if (_corners(image) != 0).all():
         return image
     labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
-    found = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _RIM)
-    nearest = ndimage.distance_transform_edt(found, return_distances=False, return_indices=True)
-    return image if found.all() else image[tuple(nearest)]
+    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _RIM)
+    nearest = ndimage.distance_transform_edt(blank, return_distances=False, return_indices=True)
+    return image if blank.all() else image[tuple(nearest)]
 
 
 def runs_of(mask: Mask, view: int) -> I64:
     """Runs [run, 4] of the pixels [row, col] of a view: its number, row, first column, column after the last."""
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, left), right = np.nonzero(edges > 0), np.nonzero(edges < 0)[1]
-    return np.stack([np.full(row.size, view), row, left, right], axis=1).astype(np.int64)
+    (row, first), end = np.nonzero(edges > 0), np.nonzero(edges < 0)[1]
+    return np.stack([np.full(row.size, view), row, first, end], axis=1).astype(np.int64)
 
 
 def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:

@@ -37,7 +37,7 @@ class ArraySource:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
-    central: tuple[float, float] | None = None
+    central_ray: tuple[float, float] | None = None
     untyped = False
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
@@ -48,7 +48,7 @@ class ArraySource:
     row_period: float | None = None
     flags = None
     currents: NDArray[np.float64] | None = None
-    unpacking: int = 0
+    unpack_bytes: int = 0
     energies: NDArray[np.float64] | None = None
     pixel_mask = None
     used: tuple[Any, ...] = ()

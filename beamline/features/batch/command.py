@@ -163,13 +163,13 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     """The earlier rows, and one for each scan that is new. Runs may have been resumed since rows without a volume."""
     from beamline.storage.interrupted import whole_scan  # here: help needs none of it
 
-    given = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
+    by_name = {printable(str(path)): path for path in map(whole_scan, scans)}  # as the table shows them
     rows = [
-        row if row.has_volume else replace(row, scan=str(whole_scan(given.get(row.scan, Path(row.scan)))))
+        row if row.has_volume else replace(row, scan=str(whole_scan(by_name.get(row.scan, Path(row.scan)))))
         for row in earlier
     ]
     old = {printable(row.scan) for row in rows}
-    new = [path for shown, path in given.items() if shown not in old]
+    new = [path for shown, path in by_name.items() if shown not in old]
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
@@ -187,16 +187,16 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
             last = event.data
         else:
             warned.extend([event.message] if isinstance(event, Warned) else [])
-            said: dict[str, Any] = (
-                {"message": _whose(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
+            with_command: dict[str, Any] = (
+                {"message": _with_command(event.message, row)} if isinstance(event, Warned | StateEntered) else {}
             )
-            sink(replace(event, scan=row.scan, **said))
+            sink(replace(event, scan=row.scan, **with_command))
 
     place = options.folder / row.name
     if (place / RECON).is_file():
         return replace(
             row, state="done", seconds=0.0,
-            message="made by a call that ended before it wrote its row; its report has what was warned of",
+            message="made by a call that ended before it wrote this row; the report has the warnings",
         )  # fmt: skip
     try:
         with whole_file(place) as work:
@@ -217,14 +217,14 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")),
         residual=last.get("residual_held_out", last.get("residual")), warnings=len(warned),
-        message=one_line(_whose(" ".join([*why, *warned]), row), SENTENCE),
+        message=one_line(_with_command(" ".join([*why, *warned]), row), SENTENCE),
     )  # fmt: skip
 
 
-def _whose(message: str, row: BatchRow) -> str:
-    """A message of a reconstruction; where it names options, with the command whose they are."""
+def _with_command(message: str, row: BatchRow) -> str:
+    """A message of a reconstruction; where it names options, with the command that takes them."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
-    return f"{message} These options are those of `beamline recon {row.scan}`." if named else message
+    return f"{message} Give these options to `beamline recon {row.scan}`." if named else message
 
 
 def _read(folder: Path) -> list[BatchRow]:

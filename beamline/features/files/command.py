@@ -115,7 +115,7 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
         facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
         lines = [aligned(rows, ">"), *(f"light   {line}" for line in dose)]
         beyond = (
-            f"! No data are pixels that are no number, or beyond {LARGEST:g}, as no detector counts: left out above."
+            f"! Pixels without data, not finite or beyond what a detector counts ({LARGEST:g}), are left out above."
         )
         lines += [beyond] * any(each.not_finite for each in statistics)
         lines += [] if output is None else [f"output  {output}"]

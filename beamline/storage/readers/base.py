@@ -57,7 +57,7 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        central: (row, column) that the central ray meets, by the file, which is shown and not used; NaN: not stated.
+        central_ray: (row, column) that it meets, by the file, which is shown and not used; NaN: not stated.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
         row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
@@ -70,7 +70,7 @@ class ScanSource(ABC):
         energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
         currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
             NaN where unknown, None where there is no monitor.
-        unpacking: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
+        unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
@@ -93,7 +93,7 @@ class ScanSource(ABC):
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
-    central: tuple[float, float] | None = None
+    central_ray: tuple[float, float] | None = None
     unreadable: Mapping[int, str] = MappingProxyType({})
     row_pitch_mm: float | None = None
     in_order: bool = True
@@ -104,7 +104,7 @@ class ScanSource(ABC):
     not_used: tuple[NotUsed, ...] = ()
     energies: NDArray[np.float64] | None = None
     currents: NDArray[np.float64] | None = None
-    unpacking: int = 0
+    unpack_bytes: int = 0
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
     aside_mm: NDArray[np.float64] | None = None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import opened, zarr_root
+from beamline.storage.foreign_zarr import open_array_file, zarr_root
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
@@ -28,9 +28,9 @@ from beamline.storage.readers.stacks import (
     FrameStack,
     Order,
     StacksSource,
-    dimensions,
-    in_order,
-    shape_without_ones,
+    as_frames,
+    dimensions_without_ones,
+    order_of_axes,
 )
 from drivers.base.frame import FrameKind
 
@@ -50,15 +50,15 @@ PLACES = (
 
 def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) -> StacksSource:
     """Open a Data Exchange file. `own_angles` False: the caller supplies the angles, so theta may be absent."""
-    file = opened(path, follow)
+    file = open_array_file(path, follow)
     with hdf5.closed_on_error(file):
         for _, where in PLACES:
             datasets.refuse_broken(file, where)
         order = _order(file["exchange/data"])
         items = ((kind, where, datasets.dataset(file, where, (order or USUAL)[0] or 0)) for kind, where in PLACES)
-        usual = order or (SINOGRAM if len(shape_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
+        usual = order or (SINOGRAM if len(dimensions_without_ones(file["exchange/data"].shape)) == 2 else USUAL)
         stacks = [
-            FrameStack(kind, where, in_order(item, _order(item) or usual))
+            FrameStack(kind, where, as_frames(item, _order(item) or usual))
             for kind, where, item in items
             if item is not None
         ]
@@ -98,10 +98,10 @@ class ExchangeSource(StacksSource):
         if not self.grows:
             return super().refresh()
         ended, theta = self.finished, datasets.dataset(self._file, "exchange/theta") if self.own_angles else None
-        there = [hdf5.written(stack.frames) for stack in self._stacks]
-        angled = hdf5.written(theta) if theta is not None else there[-1]
+        there = [hdf5.n_written(stack.frames) for stack in self._stacks]
+        angled = hdf5.n_written(theta) if theta is not None else there[-1]
         there[-1] = min(there[-1], angled)
-        self.take([len(stack.frames) for stack in self._stacks] if ended else there)
+        self.number_frames([len(stack.frames) for stack in self._stacks] if ended else there)
         views = self.image_key == FrameKind.PROJECTION
         if self.own_angles:
             self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
@@ -198,7 +198,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
 
 def _order(item: h5py.Dataset) -> Order | None:
     """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
-    return dimensions(_axes(item))
+    return order_of_axes(_axes(item))
 
 
 def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
@@ -269,7 +269,7 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
 def _recognises(path: Path, opening: Opening) -> bool:
     if not hdf5.is_hdf5(path, opening.follow) and zarr_root(path) is None:
         return False
-    with closing(opened(path, opening.follow)) as file:
+    with closing(open_array_file(path, opening.follow)) as file:
         return datasets.dataset(file, "exchange/data") is not None or bool(datasets.broken_link(file, "exchange/data"))
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets
-from beamline.storage.readers.stacks import dimensions
+from beamline.storage.readers.stacks import order_of_axes
 
 _LISTED = 6  # detectors, or lists of angles, that a sentence names
 _LONGEST = 100  # steps of a chain of transformations
@@ -101,17 +101,22 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
     The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
     group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
     """
-    here, where, steps, found = datasets.resolve(entry, "sample"), datasets.text_at(entry, "sample/depends_on"), 0, []
+    here, where, steps, rotations = (
+        datasets.resolve(entry, "sample"),
+        datasets.text_at(entry, "sample/depends_on"),
+        0,
+        [],
+    )
     while where not in ("", ".") and steps < _LONGEST and (item := datasets.resolve(here, where)) is not None:
         inner = isinstance(item, h5py.Group)
         values = datasets.dataset(item, "value") if inner else datasets.dataset(here, where)
         if values is not None and values.size > 1 and datasets.attribute(item, "transformation_type") == "rotation":
             vector = np.ravel(item.attrs.get("vector", 1))
             against = vector.dtype.kind in "if" and vector[np.abs(vector).argmax()] < 0
-            found.append((values, -1 if against else 1))
+            rotations.append((values, -1 if against else 1))
         here, where, steps = item.parent, datasets.attribute(item, "depends_on"), steps + 1
-    changing = [each for each in found if np.unique(datasets.values_of(each[0])).size > 1]
-    return changing or found
+    changing = [each for each in rotations if np.unique(datasets.values_of(each[0])).size > 1]
+    return changing or rotations
 
 
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
@@ -162,7 +167,7 @@ class NexusGeometry:
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
-        central: (row, column) that the central ray meets, counted as frames are read; NaN where it is not stated.
+        central_ray: (row, column) that it meets, counted as frames are read; NaN where it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
         turned: turns of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
@@ -170,7 +175,7 @@ class NexusGeometry:
 
     pixel_mm: tuple[float | None, float | None]
     cone: tuple[float, float] | None
-    central: tuple[float, float]
+    central_ray: tuple[float, float]
     mirrored: tuple[bool, bool]
     turned: str
     remarks: dict[str, str]
@@ -245,7 +250,7 @@ def require_order(places: Places) -> None:
         axes = [
             datasets.text(axis) for part in np.ravel(nxdata.attrs["axes"]) for axis in datasets.text(part).split(":")
         ]
-        if dimensions(axes) not in (None, (0, 1, 2)):
+        if order_of_axes(axes) not in (None, (0, 1, 2)):
             raise DataError(
                 f"{nxdata.name} in {places.entry.file.filename} says that its axes are {', '.join(axes)}; expected "
                 "frames [frame, row, col]: the rotation angle, then y, then x. Turn the frames in a copy of the file, "

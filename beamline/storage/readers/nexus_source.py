@@ -30,7 +30,7 @@ from beamline.storage.readers.nexus import (
     require_order,
 )
 from beamline.storage.structure import drawn_on
-from beamline.storage.superblock import marked
+from beamline.storage.superblock import marked_as_being_written
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
@@ -83,7 +83,7 @@ class NexusSource(ScanSource):
         """
         geometry = read_geometry(self._places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone
-        self.central = geometry.central
+        self.central_ray = geometry.central_ray
         self.pixel_size_mm, height = geometry.pixel_mm
         self.row_pitch_mm = differing(height, self.pixel_size_mm)
         self.pixel_mask = self._mask()
@@ -106,7 +106,7 @@ class NexusSource(ScanSource):
         for item in (self._places.data, self._places.image_key, finer):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
-        self.unpacking = datasets.require_possible(self._places.data)
+        self.unpack_bytes = datasets.require_possible(self._places.data)
         require_order(self._places)
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
         if lost:
@@ -116,7 +116,7 @@ class NexusSource(ScanSource):
 
     @property
     def finished(self) -> bool:
-        return not any(map(marked, {self.path, Path(self._places.data.file.filename)}))
+        return not any(map(marked_as_being_written, {self.path, Path(self._places.data.file.filename)}))
 
     @guarded
     def refresh(self) -> int:
@@ -124,7 +124,7 @@ class NexusSource(ScanSource):
         key = datasets.dataset(places.detector, "image_key_control") or places.image_key
         hdf5.look_again(key)
         angle = places.angle if self._own_angles else None
-        there = [hdf5.written(each) for each in (places.data, angle) if each is not None]
+        there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
         n = len(places.data) if ended else min(*there, len(key))
         self._read_rows(key, n, n if ended else np.inf)
         if n != before:

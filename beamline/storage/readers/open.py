@@ -47,7 +47,7 @@ from beamline.storage.readers.transforms import (
     type_wrapped,
     with_kinds,
     without_wraps,
-    wrapped,
+    wrapped_edges,
 )
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
@@ -216,9 +216,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
         base = as_unsigned(base, dtype)
     counted = base.finished and not base.plan and base.dtype == np.uint16
-    found = [wrapped(images, images.dtype) for images in _some_of_each_kind(base)] if counted else []
-    if any(below for _, below in found) and all(below for edges, below in found if edges):
-        base = without_wraps(base, sum(edges for edges, _ in found))
+    wraps = [wrapped_edges(images, images.dtype) for images in _some_of_each_kind(base)] if counted else []
+    if any(below for _, below in wraps) and all(below for edges, below in wraps if edges):
+        base = without_wraps(base, sum(edges for edges, _ in wraps))
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
@@ -344,7 +344,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
     if not hdf5.is_hdf5(path):
         raise DataError(
             f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip "
-            "of images, also of a single one."
+            "of one or more images."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

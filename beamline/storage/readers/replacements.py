@@ -22,15 +22,22 @@ from beamline.core.files import text_in
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.foreign_zarr import holds_arrays, opened
+from beamline.storage.foreign_zarr import holds_arrays, open_array_file
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, dataset_at, in_order
-from beamline.storage.readers.tiff import DECODERS, UNREADABLE, images_among, is_untyped, no_image, read_image
-from beamline.storage.readers.tiff import opened as opened_tiff
+from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, as_frames, dataset_at
+from beamline.storage.readers.tiff import (
+    DECODERS,
+    UNREADABLE,
+    images_among,
+    is_untyped,
+    no_image,
+    open_tiff,
+    read_image,
+)
 from beamline.storage.readers.transforms import real_type, type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
@@ -264,7 +271,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
     if name.isdecimal() and shape is not None and not path.exists():
         return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
     if holds_arrays(path):
-        with closing(opened(path)) as arrays, hdf5.readable(path):
+        with closing(open_array_file(path)) as arrays, hdf5.readable(path):
             return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
     if path.is_file() and hdf5.is_hdf5(path):
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -290,7 +297,7 @@ def _of_images(path: Path) -> NDArray[Any]:
     try:
         decoders = [DECODERS.get(file.suffix.lower(), read_image) for file in files]
         if untyped := decoders[0] is read_image:
-            with opened_tiff(files[0]) as tif:
+            with open_tiff(files[0]) as tif:
                 untyped = is_untyped(tif)
         parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
@@ -338,7 +345,7 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
         raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
-    frames = in_order(item)
+    frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
     datasets.require_possible(frames)

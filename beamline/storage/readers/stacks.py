@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.foreign_zarr import Arrays, NamedArray, opened
+from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
-from beamline.storage.superblock import marked
+from beamline.storage.superblock import marked_as_being_written
 from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
 
@@ -50,19 +50,19 @@ class TurnedFrames:
         return int(self.shape[0])
 
     def __getitem__(self, wanted: tuple[slice, ...]) -> NDArray[Any]:
-        stored, given = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
-        for axis, part in zip(self._order, given, strict=True):
+        stored, parts = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
+        for axis, part in zip(self._order, parts, strict=True):
             if axis is not None:
                 stored[axis] = part
-        found, kept = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
-        found = found.transpose([*kept, *({*range(found.ndim)} - {*kept})])
-        sizes = [1 if axis is None else found.shape[kept.index(axis)] for axis in self._order]
-        return found.reshape(sizes)[
-            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, given, strict=True))
+        values, axes = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
+        values = values.transpose([*axes, *({*range(values.ndim)} - {*axes})])
+        sizes = [1 if axis is None else values.shape[axes.index(axis)] for axis in self._order]
+        return values.reshape(sizes)[
+            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, parts, strict=True))
         ]
 
 
-def dimensions(axes: Sequence[str]) -> Order | None:
+def order_of_axes(axes: Sequence[str]) -> Order | None:
     """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
 
     x, u or columns; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
@@ -81,27 +81,27 @@ SINOGRAM = (0, None, 1)
 """The order of one sinogram [view, col]."""
 
 
-def shape_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
+def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
     """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
     no column of pixels is, or the first of them."""
-    kept = dict(enumerate(shape))
-    while len(kept) > n and 1 in kept.values():
-        last = max(kept)
-        del kept[last if kept[last] == 1 else next(axis for axis, size in kept.items() if size == 1)]
-    return kept
+    sizes = dict(enumerate(shape))
+    while len(sizes) > n and 1 in sizes.values():
+        last = max(sizes)
+        del sizes[last if sizes[last] == 1 else next(axis for axis, size in sizes.items() if size == 1)]
+    return sizes
 
 
-def in_order(item: Any, order: Order = USUAL) -> Any:
+def as_frames(item: Any, order: Order = USUAL) -> Any:
     """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
     n = 3 - order.count(None)
     if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
         return item
-    kept = [*shape_without_ones(item.shape, n)]
-    if len(kept) == n - 1 and (frames := order[0]) is not None:
+    places = [*dimensions_without_ones(item.shape, n)]
+    if len(places) == n - 1 and (frames := order[0]) is not None:
         order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
-    elif len(kept) != n:
+    elif len(places) != n:
         return item
-    return TurnedFrames(item, tuple(axis if axis is None else kept[axis] for axis in order))  # type: ignore[arg-type]
+    return TurnedFrames(item, tuple(axis if axis is None else places[axis] for axis in order))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ class StacksSource(ScanSource):
         self._check()
         self.shape = tuple(stacks[-1].frames.shape[1:])
         self.dtype = np.result_type(*(stack.frames.dtype for stack in stacks))
-        self.take([len(stack.frames) for stack in stacks])
+        self.number_frames([len(stack.frames) for stack in stacks])
         kinds = {stack.kind for stack in stacks}
         self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
         self.in_order = kinds == {FrameKind.PROJECTION}
 
-    def take(self, sizes: Sequence[int]) -> None:
-        """Number the frames of stacks of these sizes after those that are known already; angles and exposures are then
+    def number_frames(self, sizes: Sequence[int]) -> None:
+        """Number the frames of stacks of these sizes, new ones after those known so far; angles and exposures become
         NaN."""
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
@@ -150,7 +150,7 @@ class StacksSource(ScanSource):
 
     @property
     def finished(self) -> bool:
-        return not isinstance(self._file, h5py.File) or not marked(self.path)
+        return not isinstance(self._file, h5py.File) or not marked_as_being_written(self.path)
 
     def _check(self) -> None:
         views = self._stacks[-1]
@@ -164,7 +164,7 @@ class StacksSource(ScanSource):
                 )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset | NamedArray):
-                self.unpacking = max(self.unpacking, datasets.require_possible(stack.frames))
+                self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
                     raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
         if not len(views.frames):
@@ -206,18 +206,18 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
-    file = opened(path)
+    file = open_array_file(path)
     with hdf5.closed_on_error(file):
         views, where, order = _named_order(file, data)
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
         references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
         n_angles = None if angles is None else dataset_at(file, angles).size
         shapes = [
-            tuple(shape_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
+            tuple(dimensions_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
         ]
-        order = order or _order_of(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
-        stacks = [FrameStack(kind, name, in_order(item, order)) for kind, name, item in references]
-        stacks.append(FrameStack(FrameKind.PROJECTION, where, in_order(views, order)))
+        order = order or _order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
+        stacks = [FrameStack(kind, name, as_frames(item, order)) for kind, name, item in references]
+        stacks.append(FrameStack(FrameKind.PROJECTION, where, as_frames(views, order)))
         names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
         facts = {"data": where, "dimensions": ",".join(names)}
         stored = isinstance(file, h5py.File)
@@ -239,7 +239,7 @@ def _take_geometry(source: StacksSource, pixel_mm: float, config: h5py.Group) ->
         source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
         foot = start + source.cone[1] * normal - end  # from the middle of the detector
         middle = (np.array(source.shape) - 1) / 2
-        source.central = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
+        source.central_ray = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
 
 
 _CIL = (
@@ -251,7 +251,7 @@ _CIL = (
 
 def open_arrays(path: Path) -> StacksSource:
     """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
-    with closing(Arrays(path)) as file:
+    with closing(ArrayFile(path)) as file:
         images = [name for name, item in file.items() if item.ndim > 1]
         if len(images) != 1:
             raise DataError(
@@ -271,7 +271,7 @@ def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
 
 def stated_order(names: str) -> Order:
     """The order that a caller states, as in "row,view,col". DataError for another text."""
-    if (order := dimensions(names.split(","))) is None:
+    if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
             f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
             "a sinogram."
@@ -279,7 +279,7 @@ def stated_order(names: str) -> Order:
     return order
 
 
-def _order_of(
+def _order_by_shapes(
     views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
 ) -> Order:
     """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
@@ -311,28 +311,28 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
     Raises:
         DataError: it is not there, is no list, or nothing says its unit.
     """
-    with closing(opened(path)) as file, hdf5.readable(path):
+    with closing(open_array_file(path)) as file, hdf5.readable(path):
         if not where and isinstance(file, h5py.File):
             where = _only_angles(file)
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{item.name} in {path} is {item.shape}; expected a list of angles.")
+            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
         return datasets.radians(item, unit, default)
 
 
 def _only_angles(file: h5py.File) -> str:
     """The path of the only list of a file whose unit is one of angles."""
-    found = [
+    names = [
         str(item.name)
         for item in _arrays_of(file)
         if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
     ]
-    if len(found) != 1:
+    if len(names) != 1:
         raise DataError(
-            f"{file.filename} has {len(found)} lists in a unit of angles. {datasets_text(file)} Name the one: --angles "
-            "FILE::DATASET, and where it states no unit, --angles-unit deg or rad."
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
+            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
         )
-    return found[0]
+    return names[0]
 
 
 def dataset_at(file: Any, where: str) -> Any:
@@ -356,7 +356,7 @@ _LISTED = 10  # datasets of a file that an error names
 
 
 def _arrays_of(file: Any) -> list[Any]:
-    if isinstance(file, Arrays):
+    if isinstance(file, ArrayFile):
         return [*file.values()]
     arrays = list[h5py.Dataset]()
     file.visititems(lambda _, item: arrays.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
@@ -379,10 +379,10 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     if order is None and len(fits) > 1:
         raise DataError(
             f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "which side the views are is not known. Say --order view,col or --order col,view."
+            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
         )
     order = order or ("col,view" if fits[0] else "view,col")
-    images = in_order(_Images(base), stated_order(order))
+    images = as_frames(_ImageStack(base), stated_order(order))
     if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
         raise DataError(
             f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
@@ -412,7 +412,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     )
 
 
-class _Images:
+class _ImageStack:
     """All images of a scan as an array [image, row, col]."""
 
     def __init__(self, base: ScanSource) -> None:

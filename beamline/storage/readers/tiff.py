@@ -62,7 +62,7 @@ def is_hidden(name: str) -> bool:
     return name.rpartition("/")[2].startswith(".")
 
 
-def opened(file: Path | IO[bytes]) -> tifffile.TiffFile:
+def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
     """A TIFF and the pages in it: where it is one of a set, its metadata list the pages of all files."""
     if isinstance(file, Path):
         require_regular(file)
@@ -121,7 +121,7 @@ def read_image(file: Path | IO[bytes], most: float = math.inf) -> NDArray[Any]:
     """Read all pages of a TIFF; [row, col] for one page. Raises ValueError if it claims more bytes than allowed, or
     than it can contain.
     """
-    with opened(file) as tif:
+    with open_tiff(file) as tif:
         refuse_packed(tif)
         require_possible(tif, most)
         return upright(images_of(tif)[0].asarray(), orientation(tif))

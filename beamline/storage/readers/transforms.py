@@ -60,7 +60,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         cols=cols,
         shape=(base.shape[0], end - first),
         axis_col=None if base.axis_col is None else base.axis_col - first,
-        central=None if base.central is None else (base.central[0], base.central[1] - first),
+        central_ray=None if base.central_ray is None else (base.central_ray[0], base.central_ray[1] - first),
         flags=moved,
     )
 
@@ -81,7 +81,9 @@ def turned(base: ScanSource) -> ScanSource:
         pixels=lambda read, frames, rows: np.ascontiguousarray(np.rot90(read(frames), axes=(1, 2))[:, rows]),
         shape=base.shape[::-1],
         axis_col=None,
-        central=None if base.central is None else (base.shape[1] - 1 - base.central[1], base.central[0]),
+        central_ray=None
+        if base.central_ray is None
+        else (base.shape[1] - 1 - base.central_ray[1], base.central_ray[0]),
         pixel_size_mm=sizes[0],
         row_pitch_mm=sizes[1],
         shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],
@@ -287,7 +289,7 @@ _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 
 
-def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
     """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
     all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
 
@@ -308,17 +310,17 @@ def wrapped(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
         return 0, False
     if np.median(of_low) < _ALIKE * np.median(of_high):
         return 0, False
-    left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
-    return edges, bool(left.sum() < _A_ROW * edges)
+    steps_left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
+    return edges, bool(steps_left.sum() < _A_ROW * edges)
 
 
 def without_wraps(base: ScanSource, edges: int) -> ScanSource:
     """A scan whose counts near the end of their range, which lay below a dark taken off them, are 0."""
     least = 2**16 - 2**16 // _NEAR
     fact = (
-        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as whole numbers "
-        f"of 16 bits do where the dark taken off them is above them. Those from {least} on are taken as 0. Take darks "
-        "off in reals or signed numbers, so that the noise about 0 is kept."
+        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as 16-bit "
+        f"whole numbers do where the dark subtracted from them was larger. Those from {least} on are taken as 0. "
+        "Subtract darks in real or signed numbers, so that the noise about 0 is kept."
     )
     return Frames(
         base,

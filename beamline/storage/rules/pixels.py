@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beamline.monitor.digest import LARGEST
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.readers.transforms import WRAPPED, wrapped
+from beamline.storage.readers.transforms import WRAPPED, wrapped_edges
 from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
@@ -46,15 +46,15 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
         return
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
     frames = [images for kind in kinds if (images := sample(source, kind)) is not None]
-    if edges := sum(wrapped(images, source.dtype)[0] for images in frames):
+    if edges := sum(wrapped_edges(images, source.dtype)[0] for images in frames):
         least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
         yield Finding(
             "error",
             WRAPPED,
             f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {edges} pixels near {most} lie beside ones "
-            f"near {least}, as whole numbers of 16 bits do that were brighter than {most} and began again at {least}, "
+            f"near {least}, as 16-bit whole numbers do that went beyond {most} and began again at {least}, "
             "such as sums of pixels or frames. How bright these pixels were is lost, and other references do not help. "
-            "Make the frames again from those of the camera, in 32 bits or as reals.",
+            "Make the frames again from those of the camera, as 32-bit or real numbers.",
         )
 
 

@@ -21,7 +21,7 @@ from recon.base.arrays import F32, F64, I64
 from recon.base.noise import deviation_between_neighbours
 from recon.base.views import spread
 from recon.prep.references import dark_at
-from recon.prep.unmeasured import without_borders
+from recon.prep.unmeasured import with_borders_filled
 
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
 CELLS = 32  # across the frame, about, by which flats are compared with views
@@ -168,7 +168,7 @@ def _as_it_is(source: ScanSource, row: int) -> FrameStatistics:
     if row not in seen:
         image = read_known(source, [row])[0]
         counted = source.quantity == "counts" and source.image_key[row] != FrameKind.DARK
-        seen[row] = look_at(without_borders(image) if counted else image, row)
+        seen[row] = look_at(with_borders_filled(image) if counted else image, row)
     kind = FrameKind(int(source.image_key[row]))
     return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
 

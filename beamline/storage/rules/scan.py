@@ -108,7 +108,7 @@ def stated_used(source: ScanSource) -> Iterator[Finding]:
 def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = None) -> Iterator[Finding]:
     """The central ray of a cone, which the file states or the caller, meets the middle of the rows, and the axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
-    for (side, taken, option), at, n in zip(ways, source.central or (), source.shape, strict=False):
+    for (side, taken, option), at, n in zip(ways, source.central_ray or (), source.shape, strict=False):
         if (cone or source.cone) is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
             yield Finding(
                 "warning",

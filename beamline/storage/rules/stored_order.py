@@ -13,7 +13,7 @@ from beamline.storage.rules import Finding
 from beamline.storage.rules.pixels import SHAPES, sample
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
-from recon.prep.unmeasured import without_borders
+from recon.prep.unmeasured import with_borders_filled
 
 _TURNED = 12  # views by which the direction of the axis is found
 _LEAST = 8  # views, rows and columns: fewer tell nothing of it
@@ -151,7 +151,7 @@ def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]
         image = read_known(source, [view])[0].astype(np.float64)
         if view in source.unreadable or not np.isfinite(image).all():
             continue
-        image = image if source.quantity == "line_integrals" else without_borders(image) - dark
+        image = image if source.quantity == "line_integrals" else with_borders_filled(image) - dark
         coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
         bits.append(coarse)
     depths = np.array(bits).reshape(-1, rows, cols)

@@ -33,7 +33,7 @@ CASES = {
         ("camera:\n  driver simulated\n  exposure_s: 0.1\n", 3, "a colon is missing"),
         ("# mine\ncamera\n  driver: simulated\n", 3, "a colon is missing"),
         ("# mine\nperiod_s: 1: 2\n", 2, "a colon is missing"),
-        ("views: 3\n  period_s: 1\n", 2, "this line is indented deeper than the one above, which has its value"),
+        ("views: 3\n  period_s: 1\n", 2, "this line is indented deeper than the one above, which already has a value"),
     ],
 )
 def test_the_line_without_a_colon_is_named(folder: Path, text: str, line: int, what: str) -> None:

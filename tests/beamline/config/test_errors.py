@@ -11,7 +11,7 @@ from tests.beamline.config_file import GOOD, faults, load
 FAULTS = {
     "former key": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {stop_when: null}"),
-        "my.yaml:2: recon.stop_when is no key any more; leave it out. scan.decide: do with scan.wish: {quality_db",
+        "my.yaml:2: recon.stop_when is no longer a key; leave it out. scan.decide: do with scan.wish: {quality_db",
     ),
     "decision": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: perhaps"),

@@ -133,5 +133,5 @@ def test_a_chunk_that_the_memory_cannot_unpack_is_refused_before(
             open_scan(path)
     else:
         with open_scan(path) as scan:
-            assert scan.unpacking == (2 * frames.nbytes if packed else 0)
+            assert scan.unpack_bytes == (2 * frames.nbytes if packed else 0)
             np.testing.assert_array_equal(scan.read([2])[0], frames[0])

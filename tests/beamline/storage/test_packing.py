@@ -116,4 +116,4 @@ def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
         np.testing.assert_allclose(source.read(slice(None)), values, atol=1 / scale)
         np.testing.assert_allclose(np.degrees(source.angles), np.arange(9) * 40.0)
         assert (source.cone, source.pixel_size_mm) == ((20, 40), 0.2)
-        assert source.central == pytest.approx((3.5 - 0.4 / 0.2, 5.5))
+        assert source.central_ray == pytest.approx((3.5 - 0.4 / 0.2, 5.5))

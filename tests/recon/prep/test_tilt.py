@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recon.prep.resample import Resampling
-from recon.prep.tilt import TiltEstimate, find_tilt, roll_of_turn
+from recon.prep.tilt import TiltEstimate, find_tilt, roll_of_mean_view
 from tests.recon.prep.balls import Balls
 
 HALF = Balls(np.radians(np.arange(0, 180, 2.0)))
@@ -90,6 +90,6 @@ def test_the_mean_of_a_turn_tells_a_lean(roll: float, off: float) -> None:
         mu * np.sqrt(np.clip(r**2 - across**2 - (down - z) ** 2, 0, None))
         for z, r, mu in ((0, 20, 0.01), (22, 12, 0.02), (-20, 10, 0.03))
     )
-    found, sigma = roll_of_turn(mean + np.random.default_rng(2).normal(0, 1e-3, mean.shape), 31.5 + off)
+    found, sigma = roll_of_mean_view(mean + np.random.default_rng(2).normal(0, 1e-3, mean.shape), 31.5 + off)
     assert np.degrees(found) == pytest.approx(roll, abs=0.1 + 0.15 * abs(roll))
     assert sigma > 0 and (abs(found) > 4 * sigma) == (roll != 0)

@@ -7,7 +7,7 @@ import pytest
 
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, CorrectionSettings, References
-from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, without_borders
+from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, with_borders_filled
 
 SHAPE, VIEWS = (20, 64), 32
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -39,7 +39,7 @@ def test_a_border_of_one_value_is_found_with_its_blurred_rim(width: int, found: 
     mask = unmeasured(counts, light, NOTHING, None)
     assert mask is not None and mask[:, :found].all() and not mask[:, found:].any()
     assert runs_of(mask, 7).tolist() == [[7, row, 0, found] for row in range(SHAPE[0])]
-    assert without_borders(counts)[:, :width].min() > 9000
+    assert with_borders_filled(counts)[:, :width].min() > 9000
 
 
 def test_a_turn_of_the_image_leaves_corners() -> None:

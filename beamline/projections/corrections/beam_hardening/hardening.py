@@ -139,7 +139,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
         curve, how = curve_of_spectrum(*step.spectrum, highest), f"of {step.model}"
     else:
         try:
-            curve, explained, _ = fitted(views, geometry)
+            curve, explained, _ = fit_curve(views, geometry)
         except NoCurveError as error:
             return None, f"Hardening: not determined by the views ({error}); none corrected."
         how = f"fitted on the views; one material explains {explained:.1%} of them"
@@ -162,7 +162,7 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 
 def _clearly_seen(views: PreparedProjections) -> str:
-    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else nothing."""
+    """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else ""."""
     from recon.voxels.field_edges import FieldEdges, busiest_rows
 
     data, geometry = views.ordinary.projections.data, views.ordinary.geometry
@@ -175,7 +175,7 @@ def _clearly_seen(views: PreparedProjections) -> str:
     from recon.features.beam_hardening import NoCurveError  # here, because it loads scipy.optimize
 
     try:
-        curve, _, evened = fitted(data[:, rows], geometry.rows(rows.start, rows.stop))
+        curve, _, evened = fit_curve(data[:, rows], geometry.rows(rows.start, rows.stop))
     except (NoCurveError, ValueError):
         return ""
     corrected = float(np.interp(highest := float(data[:, rows].max()), curve.measured, curve.corrected))
@@ -188,7 +188,7 @@ def _clearly_seen(views: PreparedProjections) -> str:
     )
 
 
-def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
+def fit_curve(views: F32, geometry: Geometry) -> tuple[Curve, float, float]:
     """Fit the curve to path lengths from a first reconstruction, assuming one material.
 
     The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of

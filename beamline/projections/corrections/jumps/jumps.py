@@ -128,7 +128,7 @@ def find_jumps(
             f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
             "not moved. Choose those of one side with --views.",
         )
-    look, runs, most = _Look(source, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
+    coarse, runs, most = _CoarseViews(source, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
     real, at, n = list[int](), 0, 0
@@ -138,7 +138,7 @@ def find_jumps(
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
                 progress(n, most)
-                if (clear := look.clearness(run, (run >= row).astype(np.int64))) > clearest:
+                if (clear := coarse.clearness(run, (run >= row).astype(np.int64))) > clearest:
                     clearest, best = clear, row
         if best:
             real.append(best)
@@ -149,11 +149,11 @@ def find_jumps(
     if real:  # nor are they known to belong to one side
         inner = np.intersect1d(kept, steady)
         kept = kept[(kept >= inner[0]) & (kept <= inner[-1])]
-    return SampleJumps(kept, _in_words(np.array(sorted(real), np.int64), jumps, frames.size - kept.size))
+    return SampleJumps(kept, _sentence_on_jumps(np.array(sorted(real), np.int64), jumps, frames.size - kept.size))
 
 
-def _in_words(real: I64, jumps: I64, lost: int) -> str:
-    """What was done at the jumps, and where views show nothing."""
+def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
+    """What was done at the jumps, and at which alarms the views show none."""
     text = list[str]()
     if lost:
         verb = "is" if lost == 1 else "are"
@@ -163,14 +163,14 @@ def _in_words(real: I64, jumps: I64, lost: int) -> str:
         )
     if (none := np.setdiff1d(jumps, real)).size:
         text.append(
-            f"After the alarm of motion at {frames_text(none)} the other views show nothing: views on both sides are "
+            f"At the alarm of motion at {frames_text(none)} the other views show no jump: the views on both sides are "
             "used as they are."
         )
     return " ".join(text)
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _CoarseViews:
     """Coarse pixels of some rows, in which parts of a scan are compared."""
 
     source: ScanSource
@@ -221,10 +221,10 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
     jumps = usable_views(source, asked.uses_flags).jumps
     if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
         return 0
-    look = _Look(source, selection, (source.shape[1] - 1) / 2)
+    coarse = _CoarseViews(source, selection, (source.shape[1] - 1) / 2)
     n = min(int((source.image_key == FrameKind.PROJECTION).sum()), _VIEWS + 2 * _SHORT)
-    band = look.band(_LEVELS[-1][0])
-    views = geometry_of(source, band, look.axis_col, np.linspace(0, math.pi, n, endpoint=False))
+    band = coarse.band(_LEVELS[-1][0])
+    views = geometry_of(source, band, coarse.axis_col, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
     return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)

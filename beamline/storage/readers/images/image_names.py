@@ -20,7 +20,7 @@ _SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc)(?![a-z])")  # of neutron imaging: o
 _PLAIN = re.compile(  # words of references, and those that go with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
-_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken behind the views
+_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the views
 _DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # of a folder
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
@@ -95,7 +95,7 @@ def _without_common_folder(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class NamedImages:
-    """The images of a scan ordered by their names: darks, flats, then the projections by number, and behind them the
+    """The images of a scan ordered by their names: darks, flats, then the projections by number, and after them the
     darks and flats that are named so (after, post), and images of no use.
 
     Attributes:
@@ -106,7 +106,7 @@ class NamedImages:
         of_series: int64 [projection], the numbers of the series; None where they count no images.
         plain: the names of the projections without their angles.
         doubt: why the angles in the names are not used; empty if they are used or the names have none.
-        beside: images in a folder of their own that is named after half a turn, which are invalid frames.
+        half_turn: images in a folder of their own that is named after half a turn, which are invalid frames.
     """
 
     names: list[str]
@@ -116,7 +116,7 @@ class NamedImages:
     of_series: NDArray[np.int64] | None
     plain: list[str]
     doubt: str
-    beside: list[str]
+    half_turn: list[str]
 
     @property
     def references(self) -> list[str]:
@@ -144,26 +144,26 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
     images = natural_sorted(images)
     kinds = dict.fromkeys(images, FrameKind.PROJECTION) if one_series else kinds_of(path, images)
     series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
-    beside = [] if one_series else _half_a_turn_on(series)
-    series = [name for name in series if name not in {*beside}]
+    half_turn = [] if one_series else _half_a_turn_on(series)
+    series = [name for name in series if name not in {*half_turn}]
     stated = angles_in(series)
     places = _places(path, stated, one_series=one_series)
     taken = np.argsort(places, kind="stable") if stated.radians is None else np.lexsort((stated.radians, places))
     references = [name for kind in _REFERENCES for name in images if kinds[name] is kind]
     within = dict(zip(images, _without_common_folder(images), strict=True))
     before = [name for name in references if not _AFTER.search(within[name].lower())]
-    behind = [name for name in references if name not in {*before}] + beside
+    behind = [name for name in references if name not in {*before}] + half_turn
     names, plain = [*before, *(series[i] for i in taken), *behind], [stated.plain[i] for i in taken]
-    kinds |= dict.fromkeys(beside, FrameKind.INVALID)
+    kinds |= dict.fromkeys(half_turn, FrameKind.INVALID)
     of_kinds = np.array([kinds[name] for name in names], np.int32)
     views, of_angles = of_kinds == FrameKind.PROJECTION, np.full(len(names), np.nan)
     if stated.radians is not None:
         of_angles[views] = stated.radians[taken]
     together, of_series = _frame_numbers(names), _frame_numbers(plain)
-    if (together is None or beside) and of_series is not None:
+    if (together is None or half_turn) and of_series is not None:
         together = np.full(len(names), -1)
         together[views] = of_series
-    return NamedImages(names, of_kinds, of_angles, together, of_series, plain, stated.doubt, beside)
+    return NamedImages(names, of_kinds, of_angles, together, of_series, plain, stated.doubt, half_turn)
 
 
 def _half_a_turn_on(series: list[str]) -> list[str]:

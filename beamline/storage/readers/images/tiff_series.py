@@ -45,7 +45,7 @@ from beamline.storage.readers.tiff import (
     is_hidden,
     is_untyped,
     no_image,
-    opened,
+    open_tiff,
     refuse_volume,
     stated,
 )
@@ -97,8 +97,8 @@ class TiffSeriesSource(ScanSource):
             self.packing = next((self._text(name) for name in names if name.rpartition("/")[2] == _SCALES), "")
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
-        if images.beside:
-            self.not_used += (NotUsed(images.beside[0], count(len(images.beside), "image"), _BESIDE, False),)
+        if images.half_turn:
+            self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
@@ -164,7 +164,7 @@ class TiffSeriesSource(ScanSource):
     def _tiff(self, name: str) -> Iterator[TiffFile]:
         """The head of an image, whose pixels are not read."""
         try:
-            with self._opened(name, LARGEST_IMAGE) as file, opened(file) as tif:
+            with self._opened(name, LARGEST_IMAGE) as file, open_tiff(file) as tif:
                 yield tif
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
@@ -296,13 +296,17 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
     scene = _scene_of(path)
-    return _unpacked(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
+    return _with_values(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
 
 
-def _unpacked(source: TiffSeriesSource) -> ScanSource:
+def _with_values(source: TiffSeriesSource) -> ScanSource:
     """The values of a series that CIL packed, by the scale and the offset in the file that it writes beside images."""
-    said = json.loads(source.packing) if source.packing else {}
-    values = packing(said, source.dtype, f"{_SCALES} in {source.path}", by_cil=True) if isinstance(said, dict) else None
+    attributes = json.loads(source.packing) if source.packing else {}
+    values = (
+        packing(attributes, source.dtype, f"{_SCALES} in {source.path}", by_cil=True)
+        if isinstance(attributes, dict)
+        else None
+    )
     if values is None:
         return source
     real = np.result_type(source.dtype, np.float32)

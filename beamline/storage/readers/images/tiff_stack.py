@@ -20,7 +20,7 @@ from beamline.storage.readers.tiff import (
     Complaints,
     images_of,
     is_untyped,
-    opened,
+    open_tiff,
     orientation,
     refuse_packed,
     refuse_volume,
@@ -41,7 +41,7 @@ class TiffStackSource(ScanSource):
         complaints = Complaints()
         with complaints:
             try:
-                self._tif = opened(path)
+                self._tif = open_tiff(path)
             except UNREADABLE as error:
                 raise DataError(f"{path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
             try:

@@ -113,8 +113,8 @@ def test_a_result_without_a_row_is_kept_a_row_without_its_result_is_made_again_a
     [
         ([], 0, 0, ""),
         ([Warned("A."), StateEntered("rings", "Take --rings auto."), Warned("B.")], 0, 2, "A. B."),
-        ([Warned("Give --cone.")], 0, 1, "Give --cone. These options are those of `beamline recon "),
-        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. These options are those of "),
+        ([Warned("Give --cone.")], 0, 1, "Give --cone. Give these options to `beamline recon "),
+        ([Warned("A."), Failed("Over --max-residual.")], 6, 1, "Over --max-residual. A. Give these options to "),
         ([Warned("A (-log)."), Failed("`beamline scan --resume R`.")], 5, 1, "`beamline scan --resume R`. A (-log)."),
     ],
 )
@@ -134,7 +134,7 @@ def test_a_row_has_what_its_reconstruction_warned_of_and_whose_the_options_are(
     passed_on: list[Event] = []
     (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), passed_on.append, SystemClock())
     assert (row.warnings, row.message[: len(said)]) == (warnings, said)
-    assert ("`beamline recon" in row.message) == ("These options" in said)
+    assert ("`beamline recon" in row.message) == ("Give these options" in said)
     assert _table(Path("out"))["scan"]["warnings"] == str(warnings)
     for event in passed_on:
         assert "--" not in event.data.get("message", "") or "`beamline " in event.data["message"]

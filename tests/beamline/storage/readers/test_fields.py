@@ -276,11 +276,11 @@ def test_a_central_ray_beside_the_middle_row_is_told_in_pixels(tmp_path: Path, v
 def test_a_central_ray_is_counted_as_frames_are_read(tmp_path: Path) -> None:
     flipped = ("detector/y_flipped", True, None), ("detector/beam_center_y", 1.0, None)
     path = nxtomo(tmp_path / "s.nx", *CONE, ("detector/beam_center_x", 4.0, "um"), *flipped)
-    assert opened(path).central == (ROWS - 2, pytest.approx(4))
+    assert opened(path).central_ray == (ROWS - 2, pytest.approx(4))
     with open_scan(SourceOptions(path, cols=(1, 6))) as source:
-        assert source.central == (ROWS - 2, pytest.approx(3))
+        assert source.central_ray == (ROWS - 2, pytest.approx(3))
     with open_scan(SourceOptions(path, horizontal_axis=True)) as source:
-        assert source.central == (pytest.approx(COLS - 1 - 4), ROWS - 2)
+        assert source.central_ray == (pytest.approx(COLS - 1 - 4), ROWS - 2)
 
 
 @pytest.mark.parametrize("side", "xy")

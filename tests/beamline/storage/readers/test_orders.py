@@ -83,7 +83,12 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "order", "n", "message"),
     [
-        ((4, 4), None, 4, "4 angles: which side the views are is not known. Say --order view,col or --order col,view"),
+        (
+            (4, 4),
+            None,
+            4,
+            "4 angles: whether its rows or its columns are the views is not known. Give --order view,col",
+        ),
         ((3, 5, 4), None, 5, "If each image is a sinogram of 5 views, say --order row,view,col"),
         ((3, 4, 5), None, 5, "If each image is a sinogram of 5 views, say --order row,col,view"),
         ((3, 5, 4), "view,col", 5, "--order view,col does not fit .* 3 images of 5 x 4 pixels"),

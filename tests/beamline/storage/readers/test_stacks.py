@@ -82,7 +82,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"data_path": "/raw/before/one"}, r"expected frames \[frame, row, col\] of one shape"),
         ({"data_path": "/note"}, r"expected frames .* found .*/note \(\)"),
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
-        ({"angles_path": "/raw/before/one"}, r"is \(4, 6\); expected a list of angles"),
+        ({"angles_path": "/raw/before/one"}, r"has the shape \(4, 6\); expected a list of angles"),
         ({"angles_path": "/note"}, "expected a list of angles"),
         ({"angles_path": "/motors/plain"}, "has no units attribute; .* --angles-unit deg or rad"),
         ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.storage.readers.transforms import wrapped
+from beamline.storage.readers.transforms import wrapped_edges
 
 COLS = np.arange(256) - 127.5
 SAMPLE = 1.3 * np.cos(np.pi / 2 * np.minimum(np.abs(COLS) / 80, 1)) ** 2
@@ -18,14 +18,14 @@ def counts(light: float, profile: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize(("light", "profile"), [(66_000, 0), (80_000, 0), (150_000, 0), (72_000, 0.25)])
 def test_what_is_brighter_than_the_type_begins_again(light: float, profile: float) -> None:
-    edges, below = wrapped((counts(light, profile) % 2**16).astype(np.uint16), np.dtype(np.uint16))
+    edges, below = wrapped_edges((counts(light, profile) % 2**16).astype(np.uint16), np.dtype(np.uint16))
     assert edges > 0 and not below
 
 
 def test_what_is_below_the_dark_goes_on_at_the_end_and_is_told_from_it() -> None:
     images = counts(3e4).astype(np.int64) - 400
     images[:, :, 120:140] = np.random.default_rng(1).normal(0, 8, (2, 32, 20)).round()  # behind metal
-    edges, below = wrapped((images % 2**16).astype(np.uint16), np.dtype(np.uint16))
+    edges, below = wrapped_edges((images % 2**16).astype(np.uint16), np.dtype(np.uint16))
     assert edges > 0 and below
 
 
@@ -39,4 +39,4 @@ def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None
     dim = counts(500)
     dim[:, ::5, ::13] = 65_000
     for some in (cut, slit, images, dim):
-        assert wrapped(some.astype(np.uint16), np.dtype(np.uint16)) == (0, False)
+        assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == (0, False)

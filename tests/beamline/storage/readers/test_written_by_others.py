@@ -18,7 +18,7 @@ from beamline.projections.replayed_frames import growing
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import NotReadyError, open_scan
-from beamline.storage.superblock import marked
+from beamline.storage.superblock import marked_as_being_written
 from drivers.base.frame import FrameKind
 from tests.beamline.storage.readers.foreign_scans import FRAMES, KEY, VIEWS
 from tests.clock import SteppedClock
@@ -130,7 +130,7 @@ def test_who_does_not_follow_is_told_that_it_is_written_or_that_its_writer_has_d
     facts = describe(path)
     assert found in facts["findings"] and not facts["finished"] and facts["attributes"]["status"] == "running"
     os.utime(path, (0, 0))
-    assert marked(path) and f"h5clear -s {path}" in next_step(path)
+    assert marked_as_being_written(path) and f"h5clear -s {path}" in next_step(path)
     assert describe(path)["attributes"]["status"] == "died"
     writer.file.close()
     assert next_step(path) == "" and describe(path)["finished"]

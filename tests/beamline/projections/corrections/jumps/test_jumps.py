@@ -65,14 +65,14 @@ def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> N
     views[15:20] += np.random.default_rng(1).normal(0, 0.5, (5, *SHAPE)).astype(np.float32)
     found, told = prepared(scan(tmp_path, views, 15, 20, JUMP), replace(SELECTION, binning=2))
     assert told.startswith("The sample jumped at frame 45. 19 views are left out")
-    assert "After the alarm of motion at frames 19, 24 the other views show nothing" in told
+    assert "At the alarm of motion at frames 19, 24 the other views show no jump" in told
     assert found.geometry.n_views == JUMP
 
 
 def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(0.0, 0.0), 20, 22))
     assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
-    assert told.startswith("After the alarm of motion at frames 24, 26 the other views show nothing")
+    assert told.startswith("At the alarm of motion at frames 24, 26 the other views show no jump")
 
 
 @pytest.mark.parametrize(
