@@ -55,7 +55,7 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             found |= labels == label
     if foreign is not None:
         found |= (labels > 0) & foreign[:, None]
-    found = (ndimage.binary_dilation(found, _RIM) | areas(unknown)) & ~hidden
+    found = (ndimage.binary_dilation(found & ~hidden, _RIM) | areas(unknown)) & ~hidden
     return found if found.any() and not (found | hidden).all() else None
 
 
