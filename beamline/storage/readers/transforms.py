@@ -293,8 +293,9 @@ def wrapped(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | Non
     all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
 
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
-    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col] is
-    near the top on both sides, something opaque has such an edge, unless the step across the end is as those beside it.
+    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
+    is near the top on both sides, something opaque has such an edge, unless the step across the end is as those beside
+    it.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0, False
