@@ -314,7 +314,10 @@ class ScanCorrection:
             return
         read, some = self._filters.read(None), spread(views, SHADOW_VIEWS)
         if self._beam is not None:
-            self._shadow = self._beam.shadow(self._source, views, read.start, self.binning)
+            try:
+                self._shadow = self._beam.shadow(self._source, views, read.start, self.binning)
+            except ValueError as error:
+                raise self._refusal(error) from error
         elif views.size >= SHADOW_VIEWS:
             given = read_binned(self._source, some, read, self.binning)
             lines = LineIntegralCorrection(np.inf).transmission(given, some.astype(np.float64), some).data

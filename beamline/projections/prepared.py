@@ -158,9 +158,11 @@ class PreparedProjections:
         """Rows of the detector, binned, that no ray measured; and those of them that lie between others that were, as
         a line that is not read, and are interpolated."""
         runs, (height, width) = self.projections.unmeasured, self.geometry.detector_shape
-        whole = runs[(runs[:, 2] == 0) & (runs[:, 3] == width), 1]
-        unseen = np.bincount(whole, minlength=height)[:height] >= self.geometry.n_views
-        unseen |= False if self.measured is None else ~self.measured.any(axis=1)
+        known = np.ones((height, width), np.bool_) if self.measured is None else self.measured
+        before = np.pad(np.cumsum(known, axis=1), ((0, 0), (1, 0)))  # [row, col + 1], pixels known to the left
+        _, row, left, right = runs[np.isin(runs[:, 0], self.projections.view_ids)].T  # of these views
+        lengths = before[row, right] - before[row, left]  # runs end at masked areas
+        unseen = np.bincount(row, lengths, height) >= before[:, -1] * self.projections.view_ids.size
         lost = unseen | self.projections.masked.all(axis=1)
         return np.flatnonzero(lost), np.flatnonzero(lost & ~unseen)
 

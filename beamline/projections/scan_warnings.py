@@ -126,7 +126,8 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
     unseen, runs = areas(projections.masked), projections.unmeasured
     runs = runs[~np.asarray(projections.masked.all(axis=1))[runs[:, 1]]]
     if runs.size:
-        frames, rows = np.unique(runs[:, 0]), spans(np.unique(first_row + binning * runs[:, 1]).tolist(), 4)
+        frames, within = np.unique(runs[:, 0]), first_row + np.arange(binning)
+        rows = spans((binning * np.unique(runs[:, 1])[:, None] + within).ravel().tolist(), 4)
         ends = np.unique(runs[:, 2:], axis=0) * binning
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(

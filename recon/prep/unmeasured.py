@@ -55,7 +55,7 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             nothing_seen |= labels == label
     if foreign is not None:
         nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = (ndimage.binary_dilation(nothing_seen, _RIM) | areas(unknown)) & ~hidden
+    nothing_seen = (ndimage.binary_dilation(nothing_seen & ~hidden, _RIM) | areas(unknown)) & ~hidden
     return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
 
 

@@ -216,7 +216,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
         base = as_unsigned(base, dtype)
     counted = base.finished and not base.plan and base.dtype == np.uint16
-    wraps = [wrapped_edges(images, images.dtype) for images in _some_of_each_kind(base)] if counted else []
+    looked = [*_some_of_each_kind(base)] if counted else []
+    flat = np.median(looked[1], axis=0) if len(looked) > 1 else None  # of darks alone it is dim
+    wraps = [wrapped_edges(images, images.dtype, flat) for images in looked]
     if any(below for _, below in wraps) and all(below for edges, below in wraps if edges):
         base = without_wraps(base, sum(edges for edges, _ in wraps))
     base = _with_references(base, options, side, replaced=angles is not None)

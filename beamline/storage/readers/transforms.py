@@ -287,14 +287,17 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
+_SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
 
 
-def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool]:
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, bool]:
     """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
     all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
 
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
-    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has.
+    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
+    is near the top on both sides, something opaque has such an edge, unless the step across the end is as those beside
+    it.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0, False
@@ -303,7 +306,12 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any]) -> tuple[int, bool
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
     steps = (ends[..., 1:-2] * ends[..., 2:-1] < 0) & (upper[..., :-3] == upper[..., 1:-2])
     steps &= upper[..., 2:-1] == upper[..., 3:]
-    edges, change, above = int(steps.sum()), np.abs(np.diff(counts)), upper[..., 1:-2]
+    change, above = np.abs(np.diff(counts)), upper[..., 1:-2]
+    if flat is not None:
+        lit = flat - np.iinfo(dtype).min >= whole - whole // _NEAR
+        beside = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
+        steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * beside)
+    edges = int(steps.sum())
     of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
     most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
     if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():

@@ -45,8 +45,10 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
         yield Finding("warning", WRAPPED, str(source.attributes[WRAPPED]))
         return
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
-    frames = [images for kind in kinds if (images := sample(source, kind)) is not None]
-    if edges := sum(wrapped_edges(images, source.dtype)[0] for images in frames):
+    samples = {kind: images for kind in kinds if (images := sample(source, kind)) is not None}
+    frames, flats = samples.values(), samples.get(FrameKind.FLAT)
+    flat = None if flats is None else np.median(flats, axis=0)
+    if edges := sum(wrapped_edges(images, source.dtype, flat)[0] for images in frames):
         least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
         yield Finding(
             "error",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,3 +66,16 @@ def test_one_set_for_the_reconstructor() -> None:
     assert (geometry.axis_col, geometry.pixel_pitch) == (prepared.geometry.axis_col, prepared.geometry.pixel_pitch)
     same = with_held_out(prepared.projections.data, prepared.geometry, None)
     assert same[1] is prepared.geometry and same[2] == []
+
+
+def test_rows_that_no_ray_measured_are_told_by_these_views_and_beside_masked_areas() -> None:
+    everything = _prepared("all")
+    ids, measured = everything.projections.view_ids, np.ones((2, 40), np.bool_)
+    measured[:, 10:20] = False  # dead, so that runs end there
+    runs = [[view, 0, *ends] for view in ids for ends in ((0, 10), (20, 40))]
+    runs += [[view, 1, 0, 40] for view in ids[::2]]
+    dark = replace(everything.projections, unmeasured=np.array(runs, np.int64))
+    everything = replace(everything, projections=dark, measured=measured)
+    even, odd = (everything.of_views(np.arange(first, ids.size, 2)) for first in (0, 1))
+    for views, lost in (everything, [0]), (even, [0, 1]), (odd, [0]):
+        assert [found.tolist() for found in views.unmeasured_rows] == [lost, []]

@@ -40,3 +40,14 @@ def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None
     dim[:, ::5, ::13] = 65_000
     for some in (cut, slit, images, dim):
         assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == (0, False)
+
+
+@pytest.mark.parametrize("light", [62_000, 64_500])
+def test_opaque_matter_with_sharp_edges_in_bright_light_has_not_wrapped(light: float) -> None:
+    """A detector without blur goes from open beam to a few per cent in a pixel; flats are as bright on both sides."""
+    chord = 2 * np.sqrt(np.maximum(80.0**2 - COLS**2, 0))
+    draw = np.random.default_rng(3).poisson
+    images, flat = draw(light * np.exp(np.broadcast_to(-0.3 * chord, (2, 32, 256)))), draw(light, (32, 256))
+    assert wrapped_edges(images.astype(np.uint16), np.dtype(np.uint16), flat) == (0, False)
+    bright = (counts(80_000) % 2**16).astype(np.uint16), np.dtype(np.uint16)
+    assert wrapped_edges(*bright, np.full((32, 256), 80_400 % 2**16)) == wrapped_edges(*bright)
