@@ -138,9 +138,10 @@ def _launch_threads() -> None:
     loop = llvm.parse_assembly(_LOOP.format(process=process, threaded=llvm.address_of_symbol("numba_parallel_for")))
     _loops.append(llvm.create_mcjit_compiler(loop, llvm.Target.from_default_triple().create_target_machine()))
     llvm.add_symbol("numba_parallel_for", _loops[0].get_function_address("run"))
-    # A kernel that another thread compiles is finished before the fork: its lock would stay locked in the child.
-    lock = global_compiler_lock
-    os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=_forked)
+    if sys.platform != "win32":  # which has no forks
+        # A kernel that another thread compiles is finished before the fork: its lock would stay locked in the child.
+        lock = global_compiler_lock
+        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=_forked)
 
 
 def _forked() -> None:
