@@ -33,6 +33,7 @@ from recon.prep.correct import (
     Transmission,
     UnlitViewsError,
     merge_and_empty,
+    provisional,
 )
 from recon.prep.counts import Photons
 from recon.prep.unmeasured import foreign_rows
@@ -151,7 +152,7 @@ class ScanCorrection:
         for done, part in enumerate(parts):
             last = done == len(parts) - 1
             data, usable = self._read(part, None)
-            if not usable.size and not (last and stream.waiting):
+            if not usable.size and not (last and stream.spots.waiting):
                 continue
             corrected = self._corrected(stream, data, usable, last)
             out[np.searchsorted(in_time, corrected.view_ids)] = corrected.data
@@ -183,7 +184,7 @@ class ScanCorrection:
         self._tell_unlit(asked, frames)
         if self._stream is None:
             self._stream = self._correction(None)
-        if not frames.size and not (last and self._stream is not None and self._stream.waiting):
+        if not frames.size and not (last and self._stream is not None and self._stream.spots.waiting):
             return None
         part = self._corrected(self._stream, data, frames, last)
         if not part.view_ids.size:
@@ -193,7 +194,7 @@ class ScanCorrection:
 
     def newest(self) -> Projections | None:
         """Line integrals of the newest view, which still waits for its successor, as if none followed."""
-        part = None if self._stream is None else self._stream.provisional()
+        part = None if self._stream is None else provisional(self._stream)
         return None if part is None else self._filters.apply(part, None)
 
     def open_beam(self, most: int) -> NDArray[np.float32]:

@@ -146,22 +146,7 @@ class Correction:
         self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
         self._surveyed: list[NDArray[np.int64]] = []
-        self._spots = SpotFilter(self._settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
-
-    @property
-    def waiting(self) -> bool:
-        """Whether the newest view waits for the one after it."""
-        return self._spots.waiting
-
-    def provisional(self) -> Projections | None:
-        """Line integrals of the waiting view, as if no view followed; None if no view waits.
-
-        It keeps waiting, because all its spots show only beside both neighbours."""
-        if not self.waiting:
-            return None
-        spots, lines = copy(self._spots), self.line_integrals(None)
-        self._spots = spots
-        return lines
+        self.spots = SpotFilter(self._settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
 
     @property
     def air_columns(self) -> tuple[int, int]:
@@ -272,7 +257,7 @@ class Correction:
             )
         views.data[...] /= light[:, None]
         beam = None if views.beam is None else views.beam * light[:, None]
-        views = self._spots.feed(replace(views, air=air, beam=beam), last, progress, order)
+        views = self.spots.feed(replace(views, air=air, beam=beam), last, progress, order)
         floored = 0
         for v, view in enumerate(views.data):
             if views.beam is not None:
@@ -321,20 +306,7 @@ class LineIntegralCorrection:
         """`foreign`: as of a `Correction`."""
         self.masked: Mask = np.ones((1, 1), np.bool_)
         self._foreign = foreign
-        self._spots = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
-
-    @property
-    def waiting(self) -> bool:
-        """As of a `Correction`."""
-        return self._spots.waiting
-
-    def provisional(self) -> Projections | None:
-        """As of a `Correction`."""
-        if not self.waiting:
-            return None
-        spots, lines = copy(self._spots), self.line_integrals(None)
-        self._spots = spots
-        return lines
+        self.spots = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
 
     def transmission(
         self,
@@ -375,11 +347,23 @@ class LineIntegralCorrection:
         if views is None:
             none, empty = np.empty((0, *self.masked.shape), np.float32), np.empty(0, np.int64)
             views = Transmission(none, empty, empty, np.empty(0, np.float32))
-        views = self._spots.feed(views, last, progress, order)
+        views = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(
             views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured
         )
+
+
+def provisional(correction: Correction | LineIntegralCorrection) -> Projections | None:
+    """Line integrals of the view that waits for the next one, as if none followed; None if no view waits.
+
+    It keeps waiting, because all its spots show only beside both neighbours.
+    """
+    if not correction.spots.waiting:
+        return None
+    spots, lines = copy(correction.spots), correction.line_integrals(None)
+    correction.spots = spots
+    return lines
 
 
 def correct(

@@ -12,7 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.prep.correct import Correction, CorrectionSettings, Projections, References, correct, merge_and_empty
+from recon.prep.correct import (
+    Correction,
+    CorrectionSettings,
+    Projections,
+    References,
+    correct,
+    merge_and_empty,
+    provisional,
+)
 from recon.prep.references import air_columns, dead_pixels, edge_profiles
 
 PLAIN = CorrectionSettings(hot_threshold=np.inf, zinger_threshold=np.inf, air="none")
@@ -290,8 +298,8 @@ def in_batches(
         batch = slice(first, end)
         views = correction.transmission(counts[batch], at[batch], np.arange(first, end))
         parts.append(correction.line_integrals(views, last=end == len(counts)))
-        correction.provisional()  # which changes nothing
-    assert not correction.waiting and correction.provisional() is None
+        provisional(correction)  # which changes nothing
+    assert not correction.spots.waiting and provisional(correction) is None
     return merge_and_empty(parts)
 
 
@@ -329,7 +337,7 @@ def test_a_scan_may_end_after_its_last_view_was_fed(rng: np.random.Generator, ai
     views = correction.transmission(counts, positions(counts))
     correction.survey(views)
     parts = [correction.line_integrals(views, last=False)]
-    early = correction.provisional()
+    early = provisional(correction)
     parts.append(correction.line_integrals(None))
     assert early is not None
     np.testing.assert_array_equal(early.data, parts[1].data)
