@@ -121,8 +121,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
-    at = decided.get("candidate", [-1])[-1]
-    return {0: smooth, 1: patches}.get(at, patches if by_patches else smooth)
+    return patches if by_patches else smooth
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:

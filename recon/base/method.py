@@ -59,11 +59,6 @@ SWEEPS_OF_TRIALS = "sweeps of trials"
 """How `Progress.unit` of trials begins: a search goes on as long as it must, so that few scans take the most."""
 
 
-def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
-    """The planned number of trial sweeps once `trial` are done, and their unit."""
-    return (usual, f"{SWEEPS_OF_TRIALS} as a rule") if trial <= usual else (most, f"{SWEEPS_OF_TRIALS} at most")
-
-
 SAMPLE = "sample_radius"
 """Name of the decision on the radius, and how the settings begin that state it."""
 

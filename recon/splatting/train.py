@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.time_model import MODEL_STEPS, MOST_STEPS
+from recon.assess.time_model import MOST_STEPS
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -23,8 +23,8 @@ from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
-from recon.splatting.checkpoint import HeldOutTracker, arrays_of, decisions_from, decisions_of, state_from
-from recon.splatting.finish import Candidates, finish, judged
+from recon.splatting.checkpoint import HeldOutTracker, arrays_of, state_from
+from recon.splatting.finish import finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
@@ -43,13 +43,8 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.held_out import LEAST_GAIN, cheapest_not_led, unseen_residuals
-from recon.voxels.iterative import UNITS
-from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector, projection_lines
-
-_ON_VOXELS = FistaTv, PnpDct  # candidates that a fit is compared with, the simpler one first
-_DECIDED = "candidate", UNITS, "weight", "strength"  # decisions that a checkpoint keeps
 
 _TIMED = 3  # steps after which a fit's seconds are planned
 _LOOK = 50  # steps between two measurements of the views held out
@@ -207,67 +202,33 @@ class _Run:
         self.control.tell(self.history[-1])
 
     def checkpoint(self, state: FitState) -> dict[str, NDArray[Any]]:
-        return arrays_of(state, self.fitting.backend) | self.tracker.arrays() | decisions_of(self.decide.made, _DECIDED)
+        return arrays_of(state, self.fitting.backend) | self.tracker.arrays()
 
 
 def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Fit the line integrals of a problem; see `R2`.
-
-    Where the length of the fit is not given, views held out tell whether it predicts better than voxels do. If not, it
-    is a short one, and its volume is that of the better prior on voxels, see `finish.judged`.
 
     Raises:
         ValueError: for a problem that the method cannot be fitted to.
     """
     begin, decide = control.now(), control.decide or Decisions(problem.seed)
     views = _Views.of(method, problem)
-    decide.preset(decisions_from(control.resume or {}))
-    fit_at = len(_ON_VOXELS)
-    at = int(decide("candidate", lambda: _candidate(method, views, control, decide))) if method.by_content else fit_at
     run = _started(method, problem, control, decide, views, begin)
-    if at < fit_at:
-        run.length.steps = MODEL_STEPS
     n_start = run.state.n
     _steps(run)
     last = run.state
     if run.tracker.kept:
         run.state = state_from(run.tracker.kept, run.fitting.backend)
     volume, model = run.model()
-    made_by, sweeps = method.name, 0
-    if at < fit_at and not run.stopped:
-        on_voxels = _ON_VOXELS[at](allow_negative=method.allow_negative)
-        volume = on_voxels.run(views.fitted, replace(control, decide=decide)).volume
-        made_by = on_voxels.name
-    elif at == fit_at:
-        volume, sweeps = _finished(run, volume, model)
+    volume, sweeps = _finished(run, volume, model)
     settings, state = run.settings, run.state
     record = {
         **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": tuple(problem.use.held_out),
-        "device": problem.device, "finish": sweeps, "volume_by": made_by, "joined_pixels": views.joined,
+        "device": problem.device, "finish": sweeps, "joined_pixels": views.joined,
         "tv_weight": tv_weight(settings, run.fitting, state.limit), "tv_size": tv_size(settings, views.field),
     }  # fmt: skip
     return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last), started_from=n_start)
-
-
-def trials_of(
-    method: FitMethod, problem: ReconProblem, control: RunControl, least_gain: float = LEAST_GAIN
-) -> Candidates:
-    """Residuals of held-out views for a fit and for methods on voxels."""
-
-    def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
-        share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]
-        return run_fit(method.for_trial(share, of_steps), part, watched)
-
-    return judged(problem, method.fit, control, short, least_gain)
-
-
-def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: Decisions) -> int:
-    """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
-    tried = trials_of(method, views.fitted, control)
-    decide.preset(tried.prior)
-    at = cheapest_not_led((tried.smooth, tried.patches, tried.fit))
-    return len(_ON_VOXELS) if at is None else at
 
 
 def _started(

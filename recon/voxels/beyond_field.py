@@ -22,6 +22,7 @@ from recon.base.masks import RayWeights, masked
 from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
+from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.field_edges import (
     busiest_rows,
     middle_of_cone,
@@ -30,7 +31,7 @@ from recon.voxels.field_edges import (
     taller_than_field,
     wider_than_field,
 )
-from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
+from recon.voxels.held_out import LEAST_VIEWS, split_views, unseen_residuals
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines
 
@@ -175,10 +176,12 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
         trial = _Trial.of(views, geometry, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
-    if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
+    if not exceeds_standard_error(tried[1.0][0] - tried[least][0], _ERRORS):
         return None
     alike = [
-        ratio for ratio, (residuals, _) in tried.items() if not beyond_chance(residuals - tried[least][0], _ERRORS)
+        ratio
+        for ratio, (residuals, _) in tried.items()
+        if not exceeds_standard_error(residuals - tried[least][0], _ERRORS)
     ]
     radius = min(alike) * _FINE
     alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]

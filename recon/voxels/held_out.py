@@ -1,33 +1,33 @@
-"""Views held out: how strengths, priors and methods are chosen, and the trials that judge them.
+"""Trial: volumes of seven of eight views on some rows, judged by the views held out, and the priors found so.
 
-One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
-view held out is measured. Of strengths the one of the least mean residual is taken, of methods the cheapest
-that the best does not lead. Two candidates are compared view by view
-where a search, or a trial fit, may end before all has been tried: views differ more than candidates do.
+A trial makes each candidate's volume from the views that are not held out, measures its residual of each one that is,
+and compares candidates by the rule of `recon.voxels.choice`.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions
-from recon.base.empirical import FEWEST_SUBSETS, ONE_IN
+from recon.base.decisions import Decisions, Prior
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, ReconProblem, RunControl
-from recon.base.volume import Grid
+from recon.base.method import Clock, DataUse, Method, ReconProblem, RunControl
+from recon.base.volume import Grid, Volume
+from recon.voxels.choice import LEAST_GAIN, TRIALS, BestStrength, Choice, Prediction, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, subsets_of
-from recon.voxels.projector import Projector
+from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.projector import Projector, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
-from recon.voxels.voxel_problem import VoxelProblem, whitened
+from recon.voxels.voxel_problem import VoxelProblem, times_power, whitened
 
 TRIAL_SWEEPS = 20
 """Sweeps of total variation in a trial, and by default of `FistaTv`: a trial that gets less far than its volume prefers
@@ -35,53 +35,21 @@ a heavier weight, one that gets further a lighter one."""
 
 LEAST_VIEWS = 2 * ONE_IN
 
-LEAST_GAIN = 0.02
-"""Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
-time."""
-
-_ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
 _WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
 SUBSETS, TV_STEPS = 9, 3  # of a trial
-_OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
-TRIALS = 4
-"""Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
+PATCH_STEPS = 35
+"""Steps with sparse patches of a trial, and by default of `PnpDct`."""
 CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
-MOST_TRIALS = (2 + _OCTAVES) / TRIALS
-"""The most sweeps of trials, over those as a rule."""
 
 
 def _trial_rows(geometry: Geometry, grid: Grid) -> int:
     """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
     share = 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
     return TRIAL_ROWS if share > _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
-
-
-def beyond_chance(gains: F64, errors: float) -> bool:
-    """Whether the mean gain [view held out] exceeds so many of its standard errors."""
-    scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
-    return float(gains.mean()) > errors * scatter
-
-
-def leads(residuals: F64, other: F64, least_gain: float) -> bool:
-    """Whether residuals [view held out] are less than another candidate's beyond chance, and by so much of them."""
-    by_more = float(residuals.mean()) < (1 - least_gain) * float(other.mean())
-    return by_more and beyond_chance(other - residuals, _ERRORS)
-
-
-def cheapest_not_led(residuals: Sequence[F64 | None], least_gain: float = LEAST_GAIN) -> int | None:
-    """Number of the first candidate, and so the cheapest, that the best one does not lead; None: none was tried.
-
-    One with a residual that is not finite was ended, or diverged, and counts as not tried.
-    """
-    tried = {at: each for at, each in enumerate(residuals) if each is not None and np.isfinite(each).all()}
-    if not tried:
-        return None
-    best = min(tried.values(), key=lambda each: float(each.mean()))
-    return next(at for at, each in tried.items() if not leads(best, each, least_gain))
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
@@ -138,53 +106,8 @@ def predicted_views(
     return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)
 
 
-@dataclass(frozen=True, eq=False)
-class BestStrength:
-    """The best strength of a prior by held-out views, and the least residual [view] in its search."""
-
-    strength: float
-    residuals: F64
-
-
-def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> BestStrength | None:
-    """The strength of a prior whose residual is least, searched in octaves from `first`.
-
-    No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
-    standard error of the least is an octave or two above it: a teapot refined from a fit loses 1.1 dB by one.) The
-    search goes to stronger priors as long as they predict no worse beyond chance, else to weaker ones, as long as these
-    predict better. The vertex of the parabola through the least and its neighbours is taken (whole octaves lose 0.5 dB
-    on fibres with texture).
-
-    Returns:
-        None: a residual is infinite, since the trials were ended.
-    """
-    tried: dict[int, F64] = {}
-
-    def mean(octave: int) -> float:
-        if octave not in tried:
-            tried[octave] = residuals_of(first * 2.0**octave)
-        return float(tried[octave].mean())
-
-    if math.isinf(mean(1)) or math.isinf(mean(0)):
-        return None
-    up = not beyond_chance(tried[1] - tried[0], _ERRORS)
-    at, towards = (1, 1) if up else (0, -1)
-    while abs(at + towards) <= _OCTAVES:
-        if math.isinf(mean(at + towards)):
-            return None
-        if beyond_chance(tried[at + towards] - tried[at], _ERRORS if up else 0.0):
-            break
-        at += towards
-    octave = min(tried, key=mean)
-    vertex = float(octave)
-    if octave - 1 in tried and octave + 1 in tried:
-        weaker, stronger = mean(octave - 1) - mean(octave), mean(octave + 1) - mean(octave)
-        vertex += (weaker - stronger) / (2 * (weaker + stronger)) if weaker + stronger > 0 else 0.0
-    return BestStrength(first * 2.0**vertex, tried[octave])
-
-
 def choose_weight(
-    problem: VoxelProblem, start: F32, sweeps: int, trial: Callable[[], HeldOutTrial | None] | None = None
+    problem: VoxelProblem, start: F32 | None, sweeps: int, trial: Callable[[], Trial | None] | None = None
 ) -> NoiseBalance | float:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by held-out views, if there are any, else by the noise.
 
@@ -194,21 +117,86 @@ def choose_weight(
 
     Args:
         start, sweeps: as of `NoiseBalance.of`.
-        trial: gives that of this problem; None: `HeldOutTrial.of`.
+        trial: gives that of this problem; None: `Trial.of`.
     """
 
     def chosen() -> list[float]:
+        if problem.prior is not None:
+            return [problem.prior.weight]
         balance = NoiseBalance.of(problem, start, sweeps)
-        judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
-        preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first)
-        if judge is None or preferred is None:
-            return [balance.first, balance.noise]
-        of_all = replace(preferred, strength=preferred.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
-        judge.remember("weight", of_all)
-        return [of_all.strength]
+        judge = (trial() if trial else Trial.of(problem)) if balance.first > 0 else None
+        best = None if judge is None else judge.best_weight(balance.first)
+        return [balance.first, balance.noise] if best is None else [best.strength]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], sweeps) if noise else first
+
+
+class Patches(NamedTuple):
+    """The settings of sparse patches chosen by held-out views.
+
+    Attributes:
+        strength: of `pnp_dct`.
+        better: patches predict these views better than total variation alone.
+    """
+
+    strength: float
+    better: bool
+
+
+def choose_patches(
+    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None], steps: int
+) -> Patches:
+    """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
+
+    Trials take as many steps as the volume will: noise enters with each, so that few steps prefer a weaker prior.
+
+    The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
+    views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
+    matter beside metal keeps its detail.
+    """
+
+    def chosen() -> list[float]:
+        if problem.prior is not None and problem.prior.strength:
+            return [problem.prior.strength, problem.prior.patches]
+        judge = None if isinstance(weight, NoiseBalance) else trial()
+        first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
+        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
+            return [first, 0]
+        best = judge.best_patches(weight, first, steps)
+        if best is None:
+            return [first, 0]
+        return [best.strength, bool(best.residuals.mean() < judge.of_weight(weight).mean())]
+
+    strength, better = problem.decide("strength", chosen)
+    return Patches(strength, bool(better))
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """The run that a trial belongs to.
+
+    Attributes:
+        wide: the grid holds a sample beyond the field.
+        all_rows: of a cone whose middle shows little matter, all rows are tried, with pixels joined: priors found so
+            are not those of the volume.
+        now: the clock.
+    """
+
+    wide: bool = False
+    all_rows: bool = False
+    now: Clock = time.perf_counter
+
+
+_USUAL = TrialSettings()
+
+
+@runtime_checkable
+class Predicting(Method, Protocol):
+    """A method that tells by a part of its work how well its volume predicts views held out."""
+
+    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+        """The prediction of its volume; `so_far` has those of simpler candidates."""
 
 
 class AllColumns(NamedTuple):
@@ -225,31 +213,33 @@ class AllColumns(NamedTuple):
     unseen: Geometry
 
 
-class HeldOutTrial:
-    """Volumes of a slab from seven of eight views, assessed with the others.
+class Trial:
+    """Volumes of a slab from seven of eight views, judged by the others: which candidate predicts them.
 
     Attributes:
         problem: of the slab.
+        scan: of all rows.
         start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
         unseen: the views held out.
         all_columns: both with all columns.
-        direct: the first volume is FBP.
         smooth: the volume of total variation that predicts these best, of those made so far.
+        settings: of the run that the trial belongs to.
     """
 
     def __init__(
-        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns, direct: bool,
-        subsets: int,
+        self, scan: VoxelProblem, slab: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns,
+        settings: TrialSettings,
     ) -> None:  # fmt: skip
-        self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
-        self.all_columns, self.direct = all_columns, direct
-        self._subsets = Subsets.of(problem, subsets, subsets)
+        self.scan, self.problem, self.start = scan, replace(slab, go_on=self._go_on), start
+        self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
+        subsets = subsets_of(scan.projector.geometry, SUBSETS, FEWEST_SUBSETS)
+        self._subsets = Subsets.of(slab, subsets, subsets)
         self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
         self.smooth: F32 | None = None
 
     @classmethod
-    def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
+    def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL) -> Trial | None:
         """The trial of the rows with most matter; for a cone beam of those in the middle.
 
         Columns of air far beside the sample are left out.
@@ -264,18 +254,18 @@ class HeldOutTrial:
         if not geometry.is_cone:
             rows = busiest_rows(images, _trial_rows(geometry, grid))
             views, box = slab_of(geometry, grid, rows.start, rows.stop)
-            return cls._of_rows(problem, rows, views, box, columns_of_matter(views, box, images[:, rows]))
+            return cls._of_rows(problem, settings, rows, views, box, columns_of_matter(views, box, images[:, rows]))
         height = _trial_rows(geometry, grid)
-        if geometry.detector_shape[0] <= height:
-            return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)
+        if settings.all_rows or geometry.detector_shape[0] <= height:
+            return cls._of_rows(problem, settings, slice(0, geometry.detector_shape[0]), geometry, grid)
         middle = middle_of_cone(geometry, grid, images, height)
-        return None if middle is None else cls._of_rows(problem, *middle)
+        return None if middle is None else cls._of_rows(problem, settings, *middle)
 
     @classmethod
     def _of_rows(
-        cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid,
+        cls, problem: VoxelProblem, settings: TrialSettings, rows: slice, views: Geometry, box: Grid,
         matter: tuple[slice, Geometry, Grid] | None = None,
-    ) -> HeldOutTrial | None:  # fmt: skip
+    ) -> Trial | None:  # fmt: skip
         def of_views(chosen: NDArray[np.intp], cols: slice, views: Geometry, box: Grid) -> VoxelProblem:
             def cut(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, cols, rows])
@@ -296,15 +286,13 @@ class HeldOutTrial:
         if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
             return None
         first = seen.filtered("hann")
-        direct = first is not None
         if first is None:  # no direct method takes these views
             depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
         others, judges = split_views(views)
         all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
         part = replace(seen, with_all_columns=all_columns.seen if matter else None)
-        return cls(part, np.maximum(first, 0, out=first) if direct else first, unseen, all_columns, direct,
-                   subsets_of(problem.projector.geometry, SUBSETS, FEWEST_SUBSETS))  # fmt: skip
+        return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings)
 
     def _go_on(self, sweep: int, residual: float) -> bool:
         self._ended = self._ended or not self.problem.trial_goes_on()
@@ -324,13 +312,97 @@ class HeldOutTrial:
                 self.smooth, self._least = x, float(residuals.mean())
         return self._known[prior, strength]
 
-    def remember(self, prior: str, preferred: BestStrength) -> None:
-        """Record the least residual of a search for the strength that it prefers."""
-        self._known[prior, preferred.strength] = preferred.residuals
+    def best_weight(self, first: float) -> BestStrength | None:
+        """The weight μ of total variation for all views, searched from `first`; None: the trials were ended."""
+        best = preferred_strength(self.of_weight, first)
+        if best is None:
+            return None
+        of_all = replace(best, strength=best.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
+        self._known["weight", of_all.strength] = best.residuals
+        return of_all
+
+    def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
+        """The strength of so many steps with patches after total variation, searched from `first`; None: as above."""
+        smooth = self.with_weight(weight) if self.smooth is None else self.smooth
+
+        def made(strength: float) -> F32:
+            return self.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), smooth)
+
+        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, made), first)
+        if best is not None:
+            self._known["patches", best.strength] = best.residuals
+        return best
+
+    @cached_property
+    def prior(self) -> Prior | None:
+        """The prior of all views, in the units of the problem; None: views held out choose no weight."""
+        weight = choose_weight(self.scan, None, 0, lambda: self)
+        if isinstance(weight, NoiseBalance):
+            return None
+        return Prior(weight, *choose_patches(self.scan, weight, lambda: self, PATCH_STEPS))
+
+    def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> Choice:
+        """Which candidate predicts the views held out; one that does not take them is not tried.
+
+        A candidate is run as it is, on the views that are not held out, unless it has a method `predict`, which tells
+        its residuals by a part of the work.
+
+        Args:
+            candidates: the simplest and cheapest first.
+        """
+        rows = self.unseen.projector.geometry.detector_shape[0]
+        choice = Choice("all rows, binned 2 x 2" if self.settings.all_rows else f"{rows} rows", least_gain)
+        for each in candidates:
+            try:
+                prediction = each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
+            except ValueError as error:
+                prediction = Prediction(each.name, remark=f"{each.name}: {error}")
+            choice = choice.after(prediction)
+        return choice
+
+    def predicted(self, method: Method) -> Prediction:
+        """The prediction of a method's own volume of the views that are not held out."""
+        views = self.views_of(method)
+        made = method.run(views, self.control)
+        return self.prediction(method.name, self.residuals(self.lines_of(made.volume)))
+
+    def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
+        """A prediction in the units of the scan; `prior` in those of the problem."""
+        units, weighed = self.problem.units, self.problem.weight is not None
+        of_scan = None if prior is None or self.settings.all_rows else units.prior(prior, weighed, 1)
+        left = None if residuals is None else self.in_line_integrals(residuals).tolist()
+        return Prediction(name, left, of_scan, remark)
+
+    def in_line_integrals(self, residuals: F64) -> F64:
+        """Residuals in the units of the scan, the root of weights included."""
+        units, weighed = self.problem.units, self.problem.weight is not None
+        return np.asarray(residuals * 2.0 ** (units.integral + weighed * units.weight / 2))
+
+    @property
+    def control(self) -> RunControl:
+        """The control of a run that counts as one of the trials."""
+        return RunControl(lambda: not self._go_on(0, 0.0), now=self.settings.now)
+
+    def views_of(self, method: Method) -> ReconProblem:
+        """The views that are not held out as a method gets them, with all columns and in the units of the scan."""
+        problem = self.all_columns.seen().of_scan
+        device = problem.device if method.traits.device else "cpu"
+        return replace(problem, device=device, wide=self.settings.wide)
+
+    def lines_of(self, volume: Volume) -> F32:
+        """A volume made of `views_of` as one of the trial, [y, x, z]."""
+        shape = self.problem.projector.grid.shape
+        y, x = ((many - few) // 2 for many, few in zip(volume.data.shape[1:], shape[1:], strict=True))
+        part = np.maximum(volume.data[:, y : y + shape[1], x : x + shape[2]], 0)
+        return times_power(volume_lines(part), -self.problem.units.density)
 
     def of_weight(self, weight: float) -> F64:
         """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
         return self.residuals_of("weight", weight, self.with_weight)
+
+    def of_patches(self, strength: float) -> F64 | None:
+        """Residuals for patches of this strength; None: it was not tried."""
+        return self._known.get(("patches", strength))
 
     def with_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""

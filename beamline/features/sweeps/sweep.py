@@ -27,7 +27,7 @@ from recon.base.empirical import ONE_IN
 from recon.base.greys import matter_window
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance
+from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
 
@@ -98,7 +98,7 @@ class Scores:
         if self.best is None:
             return [""] * len(self.residuals)
         more = self.residuals - self.residuals[self.best]
-        words = ["" if beyond_chance(each, 1.0) else "alike" for each in more]
+        words = ["" if exceeds_standard_error(each, 1.0) else "alike" for each in more]
         return [*words[: self.best], "best", *words[self.best + 1 :]]
 
 
