@@ -318,7 +318,7 @@ class Fbp(Checked):
         def progress(done: int, slices: int) -> None:
             control.tell_part(done, slices, begin, views, "slices")
 
-        data = direct(filled, problem.geometry, problem.grid, self.filter, progress)
+        data = direct(filled, problem.geometry, problem.grid, self.filter, progress, device=problem.device)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def toy(self) -> Self:
