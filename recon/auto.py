@@ -7,13 +7,12 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from recon.base.arrays import bin_views
 from recon.base.choices import AUTO, Quality
 from recon.base.decisions import Decisions
 from recon.base.declared_types import NonNegative, check_settings
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
-from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.voxels.choice import LEAST_GAIN, Choice
@@ -114,9 +113,9 @@ def _trial(
     told = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(getattr(each, "trial_sweeps", 0) or getattr(each, "iterations", 0) for each in candidates)
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
-    data, weights = masked(problem.projections, problem.use.weights)
+    given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = entered(projector, data, weights, None, True, watch, decide)
+    scan, _ = entered(projector, given.data, given.weights, None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 
@@ -124,5 +123,5 @@ def _coarse(problem: ReconProblem) -> ReconProblem:
     """The problem with 2 x 2 pixels joined; itself where these are few."""
     if min(problem.geometry.detector_shape) < _SMALLEST:
         return problem
-    filled, views = masked(problem.projections, problem.use.weights)[0], problem.geometry.binned(2)
-    return replace(problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse())
+    views = Views(problem.views.masked().data, problem.geometry).binned(2)
+    return replace(problem, views=views, grid=Grid.matching(views.geometry))

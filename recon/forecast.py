@@ -11,7 +11,8 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.method import Clock, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.fit_method import FitMethod
@@ -216,7 +217,7 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
     lines = np.sqrt(np.maximum((0.35 * width) ** 2 - across**2, 0)) / width
     noise = np.random.default_rng(0).standard_normal((views.n_views, height, width), np.float32)
     data: F32 = lines.astype(np.float32) + _NOISE * noise
-    return ReconProblem(data, views, box, DataUse(), 0, "cpu")
+    return ReconProblem(Views(data, views), box)
 
 
 def _work(geometry: Geometry, grid: Grid) -> float:

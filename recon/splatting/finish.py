@@ -16,9 +16,9 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions, GoesOn
 from recon.base.empirical import FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, RunControl
 from recon.base.noise import ring_offsets
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
@@ -158,39 +158,37 @@ def finish(
     prepared = _prepared(gaussians, problem, fit)
     if prepared is None:
         return Finished(volume, 0)
-    data, weights = prepared
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     projector = Projector(problem.geometry, volume.grid, device=problem.device)
     decide = control.decide or Decisions(problem.seed)
     beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
-    if beyond is not None:
-        data -= beyond
+    data = prepared.data if beyond is None else prepared.data - beyond
     watch, count = _Watch(control, problem.geometry.n_views), sweeps or FINISH_SWEEPS
     method = _Finish(count, sweeps is None)
     refined = solve(
-        method, projector, data, weight=weights, start=start, nonnegative=nonnegative,
+        method, projector, data, weight=prepared.weights, start=start, nonnegative=nonnegative,
         watch=Watch(lambda sweep, _: watch.refined(sweep, method.planned), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, min(count, watch.made))
 
 
-def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> tuple[F32, F32 | None] | None:
-    """Views without outliers and rings, and their weights; None: these or those of the model are empty."""
-    data, weights = masked(problem.projections, problem.use.weights)
-    model = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
-    if not (data.any() and model.any()):
+def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> Views | None:
+    """Views without outliers and rings; None: these or those of the model are empty."""
+    views = problem.views.masked()
+    model = project(gaussians, views.geometry, truncation=fit.truncation, model=fit.rays).numpy()
+    if not (views.data.any() and model.any()):
         return None
-    data, weights = _without_outliers(data, weights, model)
-    return data - ring_offsets(data - model, problem.geometry), weights
+    views = _without_outliers(views, model)
+    return replace(views, data=views.data - ring_offsets(views.data - model, views.geometry))
 
 
-def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:
-    """Data and weights, with weight zero for single rays that differ from the model by as much as its matter.
+def _without_outliers(views: Views, model: F32) -> Views:
+    """The views, with weight zero for single rays that differ from the model by as much as its matter.
 
     The fit, which counts absolute differences, is not led astray by them; squares would be.
     """
-    wild = np.abs(data - model) > WILD_RAY * float(model.max())
+    wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
-        return data, weights
-    kept = np.where(wild, np.float32(0), np.float32(1) if weights is None else weights)
-    return masked(data, kept)
+        return views
+    kept = np.where(wild, np.float32(0), np.float32(1) if views.weights is None else views.weights)
+    return replace(views, weights=kept).masked()

@@ -14,7 +14,8 @@ from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
-from recon.base.method import DataUse, Method, ReconProblem, RunControl
+from recon.base.method import Method, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.slopes import slopes_at, windowed
@@ -139,7 +140,7 @@ def first_volume(
     swept = _swept(geometry, start)
     sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
     quick: Method = sweeps if swept else Fbp("ram-lak" if start == "published" else "hann")
-    problem = ReconProblem(without_wild_pixels(projections), geometry, grid, DataUse(), 0, device)
+    problem = ReconProblem(Views(without_wild_pixels(projections), geometry), grid, device=device)
     volume = quick.run(problem, RunControl()).volume
     if swept or geometry.is_cone:
         return volume

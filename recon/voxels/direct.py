@@ -17,7 +17,6 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry, require_views
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
@@ -312,7 +311,7 @@ class Fbp(Checked):
     filter: Filter = "hann"
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        filled = masked(problem.projections, problem.use.weights)[0]
+        filled = problem.views.masked().data
         begin, views = control.now(), problem.geometry.n_views
 
         def progress(done: int, slices: int) -> None:

@@ -20,12 +20,13 @@ from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions, Prior
 from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, DataUse, Method, ReconProblem, RunControl
+from recon.base.method import Clock, Method, ReconProblem, RunControl
+from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import LEAST_GAIN, TRIALS, BestStrength, Choice, Prediction, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
-from recon.voxels.projector import Projector, volume_lines
+from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem, times_power, whitened
 
@@ -73,11 +74,11 @@ def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: Vie
     return np.sqrt(np.array([np.mean(np.square(view, dtype=np.float64)) for view in counting]))
 
 
-def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in so many held out, evenly spread in angle."""
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    unseen = np.sort(order[one_in // 2 :: one_in])
-    return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
+def residuals_of(volume: Volume, views: Views) -> F64:
+    """`unseen_residuals` of a volume in views without weights."""
+    projector = Projector(views.geometry, volume.grid)
+    model = projection_lines(projector.forward(volume.data))
+    return unseen_residuals(model, projection_lines(views.data), None, projector.resolution)
 
 
 def choice_sweeps(geometry: Geometry) -> float:
@@ -101,8 +102,8 @@ def predicted_views(
     unseen = order[1::one_in]
     seen = np.setdiff1d(order, unseen)
     weights = None if known is None else np.broadcast_to(known, data[seen].shape).astype(np.float32)
-    part = ReconProblem(data[seen], geometry.select(seen), grid, DataUse(weights), 0, "cpu")
-    volume = method.run(part, RunControl()).volume
+    views = Views(data[seen], geometry.select(seen), weights)
+    volume = method.run(ReconProblem(views, grid), RunControl()).volume
     return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)
 
 

@@ -21,7 +21,6 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.declared_types import Checked, Count
 from recon.base.geometry import Geometry, require_views
-from recon.base.masks import masked
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import MOST_TRIALS
@@ -192,11 +191,11 @@ class VoxelMethod(Checked, ABC):
             control.tell(history[-1])
             return control.stop()
 
-        filled, known = masked(problem.projections, problem.use.weights)
+        given = problem.views.masked()
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         volume = solve(
-            self, Projector(problem.geometry, problem.grid, device=problem.device), filled, weight=known,
+            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
             nonnegative=not settings["allow_negative"], watch=watch, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}

@@ -14,7 +14,8 @@ from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions, Prior
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, ReconProblem
+from recon.base.method import ReconProblem
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import Weights
 from recon.kernels.cpu.vectors import replace_by_residual
@@ -210,7 +211,8 @@ class VoxelProblem:
         projector, rays = self.units.projector(self.projector, 1), self.weight
         data = times_power(projection_images(self.views).copy(), self.units.integral)
         weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
-        return ReconProblem(data, projector.geometry, projector.grid, DataUse(weights), 0, projector.device)
+        views = Views(data, projector.geometry, weights)
+        return ReconProblem(views, projector.grid, device=projector.device)
 
     @property
     def views(self) -> F32:

@@ -13,6 +13,7 @@ import recon
 from recon.auto import Auto
 from recon.base.decisions import Decisions
 from recon.base.method import SWEEPS_OF_TRIALS, ReconProblem, Reconstruction, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Volume
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
@@ -71,7 +72,7 @@ def test_the_volume_has_the_prior_of_its_trial_in_any_units(data: F32, monkeypat
     """Also of other rays, whose units differ by powers of two; and no other trial is made for it."""
     auto = Auto((Fbp(), FistaTv()))
     decide = Decisions()
-    problem = ReconProblem(data, VIEWS, GRID, recon.DataUse(), 0, "cpu")
+    problem = ReconProblem(Views(data, VIEWS), GRID)
     choice = auto.choose(problem, recon.RunControl())
     assert choice.prior is not None and choice.at == 1
     found = recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide)).volume.data

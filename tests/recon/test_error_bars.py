@@ -11,7 +11,8 @@ import pytest
 import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
+from recon.base.method import Method, Progress, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.error_bars import alternating, error_bars, method_on_voxels
 from recon.voxels.direct import direct
@@ -31,7 +32,7 @@ def ball() -> np.ndarray:
 def problem(noise: float = NOISE, seed: int = 0) -> ReconProblem:
     clean = Projector(VIEWS, GRID).forward(ball())
     data = clean + noise * np.random.default_rng(seed).normal(size=clean.shape).astype(np.float32)
-    return ReconProblem(data.astype(np.float32), VIEWS, GRID, DataUse(), 0, "cpu")
+    return ReconProblem(Views(data.astype(np.float32), VIEWS), GRID)
 
 
 def made(method: Method, given: ReconProblem, control: RunControl | None = None) -> tuple[Volume, np.ndarray]:

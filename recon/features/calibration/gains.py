@@ -19,10 +19,10 @@ from recon.base.arrays import F32, F64, Mask
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import AT_AXIS, NARROWEST, ring_offsets, steadiness
+from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.field_edges import busiest_rows
-from recon.voxels.held_out import split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.base.method import SWEEPS_OF_TRIALS, DataUse, Progress, ReconProblem, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
@@ -45,7 +46,7 @@ def _of(g: Gaussians, grid: Grid = GRID) -> Volume:
 
 
 def _problem(data: F32, weights: F32 | None = None, grid: Grid = GRID) -> ReconProblem:
-    return ReconProblem(data, VIEWS, grid, DataUse(weights), 0, "cpu")
+    return ReconProblem(Views(data, VIEWS, weights), grid)
 
 
 def test_a_model_that_explains_all_is_only_smoothed() -> None:
@@ -150,7 +151,7 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     data = Projector(views, tall).forward(body.astype(np.float32))
     data += np.random.default_rng(0).normal(0, 0.003, data.shape).astype(np.float32)
     fitted, found = (reconstruct(data, views, R2(finish=n), grid=grid).volume.data for n in (0, None))
-    raw = FistaTv().run(ReconProblem(data, views, grid, DataUse(), 0, "cpu"), RunControl()).volume.data  # its own box
+    raw = FistaTv().run(ReconProblem(Views(data, views), grid), RunControl()).volume.data  # its own box
     truth = body[12:23]
     assert psnr(truth[2:9], found[2:9]) > psnr(truth[2:9], fitted[2:9]) + 1  # the end slices have few rays to refine
     assert min(psnr(truth, found), psnr(truth, fitted)) > psnr(truth, raw) + 10

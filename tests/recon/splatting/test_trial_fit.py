@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from recon.auto import Auto
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
+from recon.base.method import ReconProblem, Reconstruction, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
@@ -42,7 +43,7 @@ def problem(rng: np.random.Generator) -> ReconProblem:
     z, y, x = np.meshgrid(*GRID.coordinates(), indexing="ij")
     box = (0.3 * ((abs(x + 4) < 5) & (abs(y) < 8) & (abs(z) < 3))).astype(np.float32)
     data = Projector(VIEWS, GRID).forward(box) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
-    return ReconProblem(data, VIEWS, GRID, DataUse(), 0, "cpu")
+    return ReconProblem(Views(data, VIEWS), GRID)
 
 
 def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: ReconProblem) -> None:
@@ -57,7 +58,7 @@ def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: Recon
 
 
 def test_few_views_and_a_stop_choose_nothing(problem: ReconProblem) -> None:
-    few = replace(problem, projections=problem.projections[:12], geometry=VIEWS.select(range(12)))
+    few = replace(problem, views=problem.views.select(np.arange(12)))
     none = Auto().choose(few, RunControl())
     assert none.at is None and none.prior is None and "12 views are too few" in none.reason
     looks = iter([False] * 30)

@@ -15,6 +15,7 @@ from recon import FistaTv, OsSirtTv
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_level
+from recon.base.view_data import split_views
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.voxels import held_out
@@ -24,7 +25,6 @@ from recon.voxels.held_out import (
     BestStrength,
     Trial,
     choose_weight,
-    split_views,
     unseen_residuals,
 )
 from recon.voxels.iterative import solve
