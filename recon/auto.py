@@ -14,12 +14,10 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.splatting.r2 import R2
+from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, Choice
-from recon.voxels.direct import Fbp
 from recon.voxels.held_out import LEAST_VIEWS, Trial, TrialSettings
 from recon.voxels.iterative import TrialWatch, Watch, entered
-from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
@@ -41,10 +39,11 @@ class Auto:
     name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
     traits: ClassVar[Traits] = Traits(
-        device=True, budget=True, presets=True, needs_matter=True, halo=max(R2.traits.halo, FistaTv.traits.halo)
-    )
+        device=True, budget=True, presets=True, needs_matter=True,
+        halo=max(by_name(name).traits.halo for name in CANDIDATES),
+    )  # fmt: skip
 
-    candidates: tuple[Method, ...] = field(default_factory=lambda: (Fbp(), FistaTv(), PnpDct(), R2()))
+    candidates: tuple[Method, ...] = field(default_factory=lambda: tuple(by_name(name)() for name in CANDIDATES))
     least_gain: NonNegative = LEAST_GAIN
 
     def __post_init__(self) -> None:

@@ -23,7 +23,7 @@ from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunC
 from recon.base.view_data import Views
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.choice import exceeds_standard_error
+from recon.voxels.choice import predicts_as_well
 from recon.voxels.field_edges import (
     busiest_rows,
     middle_of_cone,
@@ -39,7 +39,6 @@ from recon.voxels.projector import Projector
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
 _LOOKS = 8  # views by which rows are chosen
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
-_ERRORS = 1.0  # standard errors by which radii predict alike
 
 
 def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -177,13 +176,9 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
         trial = _Trial.of(views, geometry, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
-    if not exceeds_standard_error(tried[1.0][0] - tried[least][0], _ERRORS):
+    if predicts_as_well(tried[1.0][0], tried[least][0]):
         return None
-    alike = [
-        ratio
-        for ratio, (residuals, _) in tried.items()
-        if not exceeds_standard_error(residuals - tried[least][0], _ERRORS)
-    ]
+    alike = [ratio for ratio, (residuals, _) in tried.items() if predicts_as_well(residuals, tried[least][0])]
     radius = min(alike) * _FINE
     alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]
     densities = [tried[ratio][1] for ratio in alike]

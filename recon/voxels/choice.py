@@ -37,6 +37,11 @@ def exceeds_standard_error(gains: F64, errors: float) -> bool:
     return float(gains.mean()) > errors * scatter
 
 
+def predicts_as_well(residuals: F64, best: F64) -> bool:
+    """Whether residuals [view held out] are more than those of the best by chance alone, if at all."""
+    return not exceeds_standard_error(residuals - best, _ERRORS)
+
+
 def significantly_better(residuals: F64, other: F64, least_gain: float) -> bool:
     """Whether residuals [view held out] are less than another candidate's beyond chance, and by so much of them."""
     by_more = float(residuals.mean()) < (1 - least_gain) * float(other.mean())

@@ -27,7 +27,7 @@ from recon.base.empirical import ONE_IN
 from recon.base.greys import matter_window
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.choice import exceeds_standard_error
+from recon.voxels.choice import predicts_as_well
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
 
@@ -97,8 +97,7 @@ class Scores:
         """Verdict [slice]: "best"; "alike", not significantly different from the best; or empty."""
         if self.best is None:
             return [""] * len(self.residuals)
-        more = self.residuals - self.residuals[self.best]
-        words = ["" if exceeds_standard_error(each, 1.0) else "alike" for each in more]
+        words = ["alike" if predicts_as_well(each, self.residuals[self.best]) else "" for each in self.residuals]
         return [*words[: self.best], "best", *words[self.best + 1 :]]
 
 
