@@ -113,5 +113,7 @@ def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -
 @pytest.mark.bench
 def test_most_runs_were_near() -> None:
     """Of the runs before, in one call."""
+    if not SHARES:
+        pytest.skip("none ran before in this call")
     near = sum(abs(share - 1) <= _WITHIN for share in SHARES)
     assert near >= _MOST * len(SHARES)
