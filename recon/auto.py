@@ -16,9 +16,10 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, Choice
-from recon.voxels.held_out import LEAST_VIEWS, Trial, TrialSettings
-from recon.voxels.iterative import TrialWatch, Watch, entered
+from recon.voxels.held_out import LEAST_VIEWS
+from recon.voxels.iterative import TrialWatch, Watch, entered, threads_for
 from recon.voxels.projector import Projector
+from recon.voxels.trial import Trial, TrialSettings
 
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 
@@ -58,7 +59,7 @@ class Auto:
             ValueError: no candidate takes these views or data.
         """
         decide = control.decide or Decisions(problem.seed)
-        choice = Choice.of(decide("method", lambda: self.choose(problem, control).plain))
+        choice = Choice.of(decide("method", lambda: self.choose(problem, control)))
         chosen = self.candidates[-1 if choice.at is None else choice.at]
         device = problem.device if chosen.traits.device else "cpu"
         decide.prior = choice.prior
@@ -76,17 +77,18 @@ class Auto:
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
-            return Choice.of_none(f"{problem.geometry.n_views} views are too few to hold any out")
+            return Choice(f"{problem.geometry.n_views} views are too few to hold any out")
         trial = _trial(problem, control, self.candidates)
         if trial is None and problem.geometry.is_cone:
             trial = _trial(_coarse(problem), control, self.candidates, all_rows=True)
         if control.stop():
-            return Choice.of_none("stopped before the choice")
+            return Choice("stopped before the choice")
         if trial is None:
-            return Choice.of_none("views held out show nothing of the rows with most matter")
-        choice = trial.compare(self.candidates, self.least_gain)
+            return Choice("views held out show nothing of the rows with most matter")
+        with threads_for(problem.grid):
+            choice = trial.compare(self.candidates, self.least_gain)
         if trial.ended:
-            return Choice.of_none("stopped before the choice")
+            return Choice("stopped before the choice")
         if choice.at is None:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
         return choice
@@ -114,7 +116,7 @@ def _trial(
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
     given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = entered(projector, given.data, given.weights, None, True, watch, decide)
+    scan, _ = entered(projector, given.data, given.rays, None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 

@@ -23,11 +23,11 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
-from recon.voxels.held_out import Trial, choose_patches, choose_weight
 from recon.voxels.iterative import TrialWatch, Watch, solve
 from recon.voxels.methods import PnpDct
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector
+from recon.voxels.trial import Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
@@ -35,23 +35,6 @@ FINISH_SWEEPS = 8
 
 SUBSETS, TV_STEPS = 9, 3
 _REACH = 1.5  # standard deviations of a Gaussian's longest axis
-
-
-class _Watch:
-    """Reports sweeps of the refinement, and asks whether to stop.
-
-    Attributes:
-        made: sweeps and steps on voxels so far, without those of trials.
-    """
-
-    def __init__(self, control: RunControl, n_views: int) -> None:
-        self._control, self._n_views, self._begin, self.made = control, n_views, control.now(), 0
-        self.trial = TrialWatch(control, n_views, PnpDct().trial_sweeps)
-
-    def refined(self, number: int, of: int) -> bool:
-        self.made = number
-        self._control.tell_part(number, of, self._begin, self._n_views, "sweeps on voxels")
-        return self._control.stop()
 
 
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
@@ -163,13 +146,20 @@ def finish(
     decide = control.decide or Decisions(problem.seed)
     beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     data = prepared.data if beyond is None else prepared.data - beyond
-    watch, count = _Watch(control, problem.geometry.n_views), sweeps or FINISH_SWEEPS
+    n_views, count, made, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()
     method = _Finish(count, sweeps is None)
+
+    def on_sweep(number: int, residual: float) -> bool:
+        nonlocal made
+        made = number
+        control.tell_part(number, method.planned, begin, n_views, "sweeps on voxels")
+        return control.stop()
+
     refined = solve(
-        method, projector, data, weight=prepared.weights, start=start, nonnegative=nonnegative,
-        watch=Watch(lambda sweep, _: watch.refined(sweep, method.planned), watch.trial), decide=decide,
+        method, projector, data, weight=prepared.rays, start=start, nonnegative=nonnegative,
+        watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
     )  # fmt: skip
-    return Finished(refined, min(count, watch.made))
+    return Finished(refined, min(count, made))
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> Views | None:
@@ -190,5 +180,5 @@ def _without_outliers(views: Views, model: F32) -> Views:
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return views
-    kept = np.where(wild, np.float32(0), np.float32(1) if views.weights is None else views.weights)
+    kept = np.where(wild, np.float32(0), np.float32(1) if views.weights is None else views.rays)
     return replace(views, weights=kept).masked()

@@ -23,8 +23,8 @@ from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.splatting.trial_fit import FIRST_SHARE, predict
 from recon.voxels.choice import Choice, Prediction
-from recon.voxels.held_out import Trial
 from recon.voxels.methods import PnpDct
+from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, bytes_of
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50

@@ -82,8 +82,8 @@ class _FitViews:
             )
         used, apart = used_and_kept_back(problem.geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         views = problem.views.masked()
-        if views.weights is not None:  # only ratios mean something: total variation has a weight of its own
-            views = replace(views, weights=views.weights / np.float32(usual_weight(views.weights, views.data)))
+        if (rays := views.rays) is not None:  # only ratios mean something: total variation has a weight of its own
+            views = replace(views, weights=rays / np.float32(usual_weight(rays, views.data)))
         blank = apart[~views.data[apart].any(axis=(1, 2))]
         if blank.size:
             raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere; choose other held-out views")
@@ -108,7 +108,7 @@ class _FitViews:
             return None
         geometry = self.kept_back.geometry.at_row(0).seen_with(self.seen.geometry.width)
         views = join_pixels(replace(self.kept_back, geometry=geometry), self.joined)
-        return fit.problem_of(views.data, views.geometry, self.field, unit, settings, problem.backend, views.weights)
+        return fit.problem_of(views.data, views.geometry, self.field, unit, settings, problem.backend, views.rays)
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
@@ -244,7 +244,7 @@ def _started(
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
     fitting = fit.problem_of(
-        views.seen.data, views.seen.geometry, views.field, state.unit, settings, backend, views.seen.weights
+        views.seen.data, views.seen.geometry, views.field, state.unit, settings, backend, views.seen.rays
     )
     if settings.tv_weight is None:
         change = decide(

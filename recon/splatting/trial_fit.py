@@ -14,8 +14,8 @@ from recon.splatting.finish import FINISH_SWEEPS, beyond_voxels, level_of, refin
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.choice import Choice, Prediction, significantly_better
-from recon.voxels.held_out import Trial
 from recon.voxels.projector import projection_lines
+from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 FAR_BEHIND = 0.25

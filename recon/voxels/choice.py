@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,12 +76,11 @@ class Prediction(NamedTuple):
     remark: str = ""
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """Which candidate predicts views held out, of those tried so far.
 
     Attributes:
-        where: the part of the scan that was tried.
+        where: the part of the scan that was tried; where no candidate was, the reason.
         least_gain: share by which a costlier candidate must lower the residual.
         predictions: of the candidates, the simplest first.
     """
@@ -91,24 +90,15 @@ class Choice:
     predictions: tuple[Prediction, ...] = ()
 
     @classmethod
-    def of_none(cls, reason: str) -> Self:
-        """No candidate was tried, for this reason."""
-        return cls(reason)
-
-    @classmethod
-    def of(cls, plain: Sequence[Any]) -> Self:
-        """The choice of these values of `plain`, or of the same from a file."""
-        where, least_gain, predictions = plain
-        return cls(where, least_gain, tuple(Prediction(*each) for each in predictions))
-
-    @property
-    def plain(self) -> tuple[Any, ...]:
-        """The choice as plain values, as `Decisions` keeps it."""
-        return self.where, self.least_gain, self.predictions
+    def of(cls, values: Sequence[Any]) -> Choice:
+        """A choice, or its values from a file, as `Decisions` keeps it."""
+        where, least_gain, predictions = values
+        named = ((name, left, prior and Prior(*prior), remark) for name, left, prior, remark in predictions)
+        return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> Choice:
         """The choice with one candidate more."""
-        return Choice(self.where, self.least_gain, (*self.predictions, prediction))
+        return self._replace(predictions=(*self.predictions, prediction))
 
     @property
     def residuals(self) -> list[F64 | None]:

@@ -9,8 +9,10 @@ in other units sums of their squares could exceed the range of float32.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar, Protocol, Self, runtime_checkable
 
@@ -116,14 +118,21 @@ def solve(
             that are zero everywhere.
     """
     problem, lines = entered(projector, projections, weight, start, nonnegative, watch, decide or Decisions())
+    with threads_for(projector.grid):
+        found = method.iterate(problem, lines)
+    return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
+
+
+@contextmanager
+def threads_for(grid: Grid) -> Iterator[None]:
+    """A context of as many threads as have work enough, of a single slice few."""
     threads = get_num_threads()
     try:
-        if projector.grid.shape[0] == 1:
-            set_num_threads(max(1, min(threads, lines.size // _SHARE)))
-        found = method.iterate(problem, lines)
+        if grid.shape[0] == 1:
+            set_num_threads(max(1, min(threads, math.prod(grid.shape) // _SHARE)))
+        yield
     finally:
         set_num_threads(threads)
-    return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
 
 
 def entered(
@@ -195,7 +204,7 @@ class VoxelMethod(Checked, ABC):
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         volume = solve(
-            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
+            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.rays,
             nonnegative=not settings["allow_negative"], watch=watch, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}

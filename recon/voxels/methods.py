@@ -17,16 +17,10 @@ from recon.base.method import Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Choice, Prediction
-from recon.voxels.held_out import (
-    CHOICE_SWEEPS,
-    PATCH_STEPS,
-    TRIAL_SWEEPS,
-    Trial,
-    choose_patches,
-    choose_weight,
-)
+from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
+from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     Buffers,
     Momentum,

@@ -77,7 +77,7 @@ def test_the_volume_has_the_prior_of_its_trial_in_any_units(data: F32, monkeypat
     assert choice.prior is not None and choice.at == 1
     found = recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide)).volume.data
     np.testing.assert_array_equal(found, recon.reconstruct(data, VIEWS, FistaTv()).volume.data)
-    monkeypatch.setattr("recon.voxels.held_out.Trial.of", lambda *_: pytest.fail("a second trial"))
+    monkeypatch.setattr("recon.voxels.trial.Trial.of", lambda *_: pytest.fail("a second trial"))
     other = Decisions()
     other.prior = choice.prior._replace(weight=64.0 * choice.prior.weight)
     scaled = recon.reconstruct(64.0 * data, VIEWS, FistaTv(), control=recon.RunControl(decide=other)).volume.data

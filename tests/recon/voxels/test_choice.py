@@ -99,7 +99,8 @@ def test_a_choice_is_the_same_from_a_file() -> None:
     assert (choice.at, choice.prior) == (2, None)
     assert choice.reason.startswith("trials on 16 rows, root mean square left of views held out")
     assert choice.reason.endswith("fista-tv 2; r2 1; fbp: not these; r2 stopped")
-    again = Choice.of(json.loads(json.dumps(choice.plain)))
+    again = Choice.of(json.loads(json.dumps(choice)))
     assert (again.at, again.reason) == (choice.at, choice.reason)
+    assert again.predictions[1].prior == Prior(0.1)
     assert again.least is not None and again.least.mean() == pytest.approx(1.0)
-    assert Choice.of_none("no views").at is None and Choice.of_none("no views").reason == "no views"
+    assert Choice("no views").at is None and Choice("no views").reason == "no views"

@@ -18,19 +18,14 @@ from recon.base.noise import noise_level
 from recon.base.view_data import split_views
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels import held_out
+from recon.voxels.choice import BestStrength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, slab_of
-from recon.voxels.held_out import (
-    LEAST_VIEWS,
-    BestStrength,
-    Trial,
-    choose_weight,
-    unseen_residuals,
-)
+from recon.voxels.held_out import LEAST_VIEWS, unseen_residuals
 from recon.voxels.iterative import solve
 from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
+from recon.voxels.trial import Trial, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
@@ -59,7 +54,7 @@ def test_a_texture_survives(
     data, geometry, grid, truth = foam
     peak = float(truth.max())
     found = recon.reconstruct(data, geometry, method, grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, method, grid=grid).volume.data
     monkeypatch.setattr("recon.voxels.priors.noise_beside_structure", lambda lines, _: noise_level(lines))
     by_texture = recon.reconstruct(data, geometry, method, grid=grid).volume.data  # the texture counts as noise
@@ -76,7 +71,7 @@ def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
     data = Projector(geometry, Grid.matching(geometry)).forward(truth)
     data += rng.normal(0, 1, data.shape).astype(np.float32)
     found = recon.reconstruct(data, geometry, FistaTv()).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, FistaTv()).volume.data
     assert psnr(truth, found) > psnr(truth, by_noise) - 1
 
@@ -115,7 +110,7 @@ def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
     cracked: tuple[F32, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
     fbp = _depth(recon.reconstruct(*cracked, "fbp").volume.data)
     assert by_noise < 0.8 * fbp
@@ -146,7 +141,7 @@ def test_coarse_voxels_of_a_cone_get_the_weight_that_views_held_out_allow(
 ) -> None:
     data, geometry, grid, truth = coarse_cone
     found = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
     assert psnr(truth, found) > psnr(truth, by_noise) + 0.5
 
@@ -248,7 +243,7 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     data = lines + rng.normal(0, 0.3, lines.shape).astype(np.float32)
     weights = np.where(lines > 0, 0.2, 1).astype(np.float32) if weighted else None
     narrow = _trial_of(data, geometry, weights)
-    monkeypatch.setattr(held_out, "columns_of_matter", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.columns_of_matter", lambda *_: None)
     wide = _trial_of(data, geometry, weights)
     off = (wide.start.shape[0] - narrow.start.shape[0]) // 2
     assert off > 5
@@ -266,6 +261,6 @@ def test_all_views_get_the_weight_of_seven_eighths_by_the_root_of_their_number(
 ) -> None:
     """As much noise of a volume: without, -0.2 to -0.4 dB on bone and cement of 1000 photons."""
     problem = _problem_of(foam[0], foam[1])
-    monkeypatch.setattr(held_out, "preferred_strength", lambda *_: BestStrength(3.0, np.ones(5)))
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: BestStrength(3.0, np.ones(5)))
     start = problem.filtered("hann")
     assert start is not None and choose_weight(problem, start, 20) == pytest.approx(3 * math.sqrt(8 / 7))
