@@ -180,5 +180,5 @@ def _without_outliers(views: Views, model: F32) -> Views:
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return views
-    kept = np.where(wild, np.float32(0), np.float32(1) if views.weights is None else views.rays)
+    kept = np.where(wild, np.float32(0), np.float32(1) if (rays := views.rays) is None else rays)
     return replace(views, weights=kept).masked()
