@@ -78,9 +78,9 @@ class Auto:
             raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
             return Choice(f"{problem.geometry.n_views} views are too few to hold any out")
-        trial = _trial(problem, control, self.candidates)
+        trial = _trial(problem, "", control, self.candidates)
         if trial is None and problem.geometry.is_cone:
-            trial = _trial(_coarse(problem), control, self.candidates, all_rows=True)
+            trial = _trial(*_coarse(problem), control, self.candidates)
         if control.stop():
             return Choice("stopped before the choice")
         if trial is None:
@@ -106,10 +106,8 @@ class Auto:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)
 
 
-def _trial(
-    problem: ReconProblem, control: RunControl, candidates: tuple[Method, ...], all_rows: bool = False
-) -> Trial | None:
-    """The trial of some rows of a problem; None: nothing can be held out there."""
+def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates: tuple[Method, ...]) -> Trial | None:
+    """The trial of a problem; None: nothing can be held out there."""
     # In a slab only slices are counted.
     told = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(getattr(each, "trial_sweeps", 0) or getattr(each, "iterations", 0) for each in candidates)
@@ -120,9 +118,9 @@ def _trial(
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 
-def _coarse(problem: ReconProblem) -> ReconProblem:
-    """The problem with 2 x 2 pixels joined; itself where these are few."""
+def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:
+    """The problem with 2 x 2 pixels joined, or itself where these are few; and in words which."""
     if min(problem.geometry.detector_shape) < _SMALLEST:
-        return problem
+        return problem, "all rows"
     views = Views(problem.views.masked().data, problem.geometry).binned(2)
-    return replace(problem, views=views, grid=Grid.matching(views.geometry))
+    return replace(problem, views=views, grid=Grid.matching(views.geometry)), "all rows, binned 2 x 2"

@@ -9,7 +9,7 @@ from functools import cache, partial
 from typing import ClassVar
 
 from recon.base.arrays import F32
-from recon.base.decisions import GoesOn
+from recon.base.decisions import GoesOn, Prior
 from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.geometry import Geometry
@@ -65,9 +65,9 @@ class FistaTv(VoxelMethod):
 
     def predict(self, trial: Trial, so_far: Choice) -> Prediction:
         """The prediction with the best weight; with one of its own that of the method's volume."""
-        if self.tv_weight is not None or trial.prior is None:
+        if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
-        return trial.prediction(self.name, trial.of_weight(trial.prior.weight), trial.prior)
+        return trial.prediction(self.name, trial.of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         return self.with_weight(problem, x)[0]

@@ -114,13 +114,13 @@ class TrialSettings:
 
     Attributes:
         wide: the grid holds a sample beyond the field.
-        all_rows: of a cone whose middle shows little matter, all rows are tried, with pixels joined: priors found so
-            are not those of the volume.
+        all_rows: of a cone whose middle shows little matter all rows are tried, here in words, and pixels may be joined
+            for that: priors found so are not those of the volume. Empty: some rows.
         now: the clock.
     """
 
     wide: bool = False
-    all_rows: bool = False
+    all_rows: str = ""
     now: Clock = time.perf_counter
 
 
@@ -270,12 +270,17 @@ class Trial:
         return best
 
     @cached_property
-    def prior(self) -> Prior | None:
-        """The prior of all views, in the units of the problem; None: views held out choose no weight."""
+    def weight(self) -> float | None:
+        """The weight of total variation of all views, in the units of the problem; None: by the noise."""
         weight = choose_weight(self.scan, None, 0, lambda: self)
-        if isinstance(weight, NoiseBalance):
+        return None if isinstance(weight, NoiseBalance) else weight
+
+    @cached_property
+    def prior(self) -> Prior | None:
+        """The weight of all views, and patches after it; None: as of `weight`."""
+        if self.weight is None:
             return None
-        return Prior(weight, *choose_patches(self.scan, weight, lambda: self, PATCH_STEPS))
+        return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
 
     def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> Choice:
         """Which candidate predicts the views held out; one that does not take them is not tried.
@@ -287,7 +292,7 @@ class Trial:
             candidates: the simplest and cheapest first.
         """
         rows = self.unseen.projector.geometry.detector_shape[0]
-        choice = Choice("all rows, binned 2 x 2" if self.settings.all_rows else f"{rows} rows", least_gain)
+        choice = Choice(self.settings.all_rows or f"{rows} rows", least_gain)
         for each in candidates:
             try:
                 prediction = each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
