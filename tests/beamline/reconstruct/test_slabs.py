@@ -38,8 +38,8 @@ def volume(*options: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("memory", "more"),
     [
-        ("3M", []),
         ("2M", ["--bin", "2"]),
+        pytest.param("3M", [], marks=pytest.mark.slow),
         pytest.param("3M", ["--rows", "33:181"], marks=pytest.mark.slow),
         pytest.param("3M", ["--air", "none"], marks=pytest.mark.slow),
     ],
