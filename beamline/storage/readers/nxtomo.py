@@ -16,6 +16,7 @@ from beamline.monitor.digest import has_checksum
 from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.parts import decisions_in, gaps_in, pass_ends_in, require_joined
 from beamline.storage.readers.base import WHOLE, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import Places, find
@@ -30,11 +31,11 @@ class OwnScan(NexusSource):
 
     def _read_stated(self, found: list[Places]) -> None:
         self._damaged: set[int] = set()
-        self._altered: set[int] = set()
+        self._altered = np.zeros(0, np.bool_)
         self.pixel_size_mm = datasets.scalar(self._places.detector, "x_pixel_size", datasets.LENGTH_UNITS)
         self.cone = self._cone()
-        self.refresh()
         self.plan = json_object(datasets.text_at(self._file, "/entry/record/plan")) or {}
+        self.refresh()
         devices = (self._file.get("/entry/instrument/devices") or {}).values()
         periods = (float(device["row_period"][()]) for device in devices if "row_period" in device)
         self.row_period = next(periods, None)
@@ -59,11 +60,12 @@ class OwnScan(NexusSource):
     def refresh(self) -> int:
         kinds = datasets.dataset(self._places.entry, "frame_log/kind")
         key = self._places.image_key if kinds is None else kinds
-        n = self._committed(key)
-        self._read_rows(key, n, np.inf)
-        self.pass_ends, self.decisions = pass_ends_in(self._file), decisions_in(self._file)
-        self._checksums = self._column("digest/checksum", np.empty(0))[:n]
-        return n
+        if (n := self._committed(key)) > self.n or not n or self.finished:
+            self.table = self._read_table(key, n, np.inf)
+        else:  # of frames that were there nothing else is used before the end
+            self.table = replace(self.table, pass_ends=pass_ends_in(self._file))
+        self.decisions, self._checksums = decisions_in(self._file), self._column("digest/checksum")
+        return self.n
 
     def _committed(self, key: h5py.Dataset) -> int:
         """The frames that the writer of our file counts; where they are more than before, their datasets are read
@@ -78,15 +80,44 @@ class OwnScan(NexusSource):
                 hdf5.look_again(item)
         return n
 
-    def _judge_rows(self, n: int) -> None:
-        """Alignment frames aside are wide views, and frames whose record is altered are invalid."""
-        if n > self.n:
-            rows = altered_rows(self._file, self.n, n)
-            self._altered |= {self.n + row for row in rows.tolist()}
+    def _read_table(self, key: h5py.Dataset, n: int, most: float) -> FrameTable:
+        """With what our log says: alignment frames aside are wide views, frames whose record is altered are invalid."""
+        known, table = self._altered.size, super()._read_table(key, n, most)
+        if n > known:
+            self._altered = np.pad(self._altered, (0, n - known))
+            self._altered[known + altered_rows(self._file, known, n)] = True
+        kinds, aside, replaces = table.kinds, None, self._column("frame_log/replaces")
         if (moved := self._item(self._places.entry, "sample/x_translation")) is not None:
-            self.aside_mm = datasets.values_of(moved)[:n]
-            self.image_key[(self.image_key == FrameKind.ALIGNMENT) & (self.aside_mm != 0)] = FrameKind.WIDE_VIEW
-        self.image_key[[*self._altered]] = FrameKind.INVALID
+            aside = datasets.values_of(moved)[:n]
+            kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.WIDE_VIEW
+        kinds[self._altered[:n]] = FrameKind.INVALID
+        for column in (table.triggers, table.framestamps, replaces):
+            if column is not None:
+                column[self._altered[:n]] = -1
+        if replaces is not None:
+            require_earlier(replaces)
+        if table.times is not None:
+            table.times[self._altered[:n]] = np.nan
+        return replace(
+            table,
+            altered=self._altered[:n],
+            aside=aside,
+            replaces=replaces if replaces is not None and (replaces >= 0).any() else None,
+            part_starts=self._part_starts(),
+            pass_ends=pass_ends_in(self._file),
+            flags=self._flags(),
+        )
+
+    def _flags(self) -> FrameFlags | None:
+        flags = read_flags(self._file, self.n)
+        return flags if self.plan or flags.flagged.any() else None  # a copy has none to say
+
+    def _part_starts(self) -> NDArray[np.int64]:
+        item = datasets.dataset(self._file, layout.PART_STARTS)
+        starts = np.zeros(1, np.int64) if item is None else np.ravel(datasets.values_of(item))
+        if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
+            raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
+        return starts.astype(np.int64)
 
     @property
     @guarded
@@ -110,28 +141,6 @@ class OwnScan(NexusSource):
         own = {"reason": ending.reason or ended_by(self.decisions)}
         return replace(ending, **({"missing": gaps_in(self.path, self._file)} if ending.status == RUNNING else own))
 
-    @property
-    @guarded
-    def flags(self) -> FrameFlags | None:
-        flags = read_flags(self._file, self.n)
-        return flags if flags is not None and (self.plan or flags.flagged.any()) else None  # a copy has none to say
-
-    @property
-    @guarded
-    def replaces(self) -> NDArray[np.int64] | None:
-        rows = self._logged("replaces", np.full(self.n, -1))
-        require_earlier(rows)
-        return rows if (rows >= 0).any() else None
-
-    @property
-    @guarded
-    def part_starts(self) -> NDArray[np.int64]:
-        item = datasets.dataset(self._file, layout.PART_STARTS)
-        starts = np.zeros(1, np.int64) if item is None else np.ravel(datasets.values_of(item))
-        if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
-            raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
-        return starts.astype(np.int64)
-
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         if 2 * height < self.shape[0] or not self.checksummed:
@@ -143,21 +152,17 @@ class OwnScan(NexusSource):
 
     def _compared(self, row: int) -> NDArray[Any]:
         whole = super().read([row])
-        if not has_checksum(whole[0], int(self._checksums[row])):
+        if self._checksums is not None and not has_checksum(whole[0], int(self._checksums[row])):
             self._damaged.add(int(row))
         return whole[0]
 
     @property
     def checksummed(self) -> bool:
-        return self._checksums.size == self.n > 0
+        return self._checksums is not None and self.n > 0
 
     @property
     def damaged(self) -> frozenset[int]:
         return frozenset(self._damaged)
-
-    @property
-    def altered(self) -> frozenset[int]:
-        return frozenset(self._altered)
 
     def _item(self, group: h5py.Group, path: str) -> h5py.Dataset | None:
         item = datasets.dataset(group, path)

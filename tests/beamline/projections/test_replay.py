@@ -37,7 +37,7 @@ def test_a_file_gets_the_flags_that_the_scan_gave_it(tmp_path: Path, passes: int
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10}, lost={12})), angles, "scan.period_s=1.5")
     path = ran.of("scan_done")[0].data["path"]
     with open_scan(path) as source:
-        written = source.flags
+        written = source.table.flags
         assert written is not None and written.flagged.sum() == 2  # the repeats; a lost frame marks no other
         np.testing.assert_array_equal(judged_flags(source).bits, written.bits)
         assert context_of(source).period == pytest.approx(1.5, rel=0.01)
@@ -51,7 +51,7 @@ def test_a_foreign_file_is_judged(tmp_path: Path) -> None:
     counts[20] = rng.poisson(np.full(SCAN.shape, DARK))
     path = write_exchange(tmp_path / "s.h5", SCAN, {"data": counts})
     with open_scan(path) as source:
-        assert source.flags is None
+        assert source.table.flags is None
         found = judged_flags(source)
     assert np.flatnonzero(found.alarmed).tolist() == [24]  # two darks and two flats come before the views
 

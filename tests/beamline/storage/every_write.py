@@ -163,10 +163,10 @@ class Rig:
         with h5py.File(self.scan) as file:
             views = len(file["exchange/data"]) if "exchange/data" in file else 0
         with open_scan(self.scan) as source:
-            n = int(source.image_key.size)
+            n = len(source.table)
             assert source.finished
             assert all((source.read([i])[0] == FRAMES[i].counts).all() for i in range(n))
-            assert views in (0, np.sum(source.image_key == FrameKind.PROJECTION))
+            assert views in (0, np.sum(source.table.kinds == FrameKind.PROJECTION))
         assert views < 2 or not [found for found in validate(self.scan) if found.severity == "error"]
         return [n, views]
 

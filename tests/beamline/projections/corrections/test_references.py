@@ -94,5 +94,5 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     fine = source(exposure=0.05)
     found, warnings = prepare(fine, SELECTION)
     assert (found.geometry.n_views, warnings) == (45, [])
-    fine.exposures[np.array(fine.image_key) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
+    fine.table.exposures[np.array(fine.table.kinds) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
     assert list(references_usable(fine)) == []  # type: ignore[arg-type]

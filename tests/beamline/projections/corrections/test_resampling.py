@@ -114,6 +114,6 @@ def test_what_cannot_be_levelled_is_refused() -> None:
         prepare(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion"):
         prepare(source, SELECTION.with_steps(TiltAndLens(1.0), Preparation(noise="counts")))
-    few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
+    few = ArraySource(source._data[:22], source.table.kinds[:22].tolist(), source.table.angles[:22])
     with pytest.raises(DataError, match="was not found"):
         prepare(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

@@ -60,7 +60,7 @@ def counts(seed: int, light: float, dtype: type) -> ArraySource:
 def test_counts_with_their_bytes_in_the_other_order(light: float, dtype: type) -> None:
     source = counts(1, light, dtype)
     assert list(pixels_as_labelled(source)) == []  # type: ignore[arg-type]
-    swapped = ArraySource(source._data.byteswap(), [0] * N, source.angles)
+    swapped = ArraySource(source._data.byteswap(), [0] * N, source.table.angles)
     (finding,) = pixels_as_labelled(swapped)  # type: ignore[arg-type]
     assert finding.severity == "error"
     assert "byteswap" in finding.message
@@ -106,7 +106,7 @@ def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantit
     upright = replace(stated, horizontal_axis=True)
     assert not [f for f in validate(upright) if f.rule == "axis"]
     with open_scan(upright) as source:
-        views = np.flatnonzero(source.image_key == 0)
+        views = np.flatnonzero(source.table.kinds == 0)
         assert source.shape == (20, 40)
         np.testing.assert_array_equal(source.read(views, slice(3, 9)), frames[:, 3:9])
         if quantity == "counts":

@@ -64,7 +64,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
     with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev"):
         Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
-    source.attributes, source.energy_kev = {"distance_mm": 50.0}, 20.0
+    source.facts, source.energy_kev = {"distance_mm": 50.0}, 20.0
     found, said = Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
     assert found == PHASE.filter_of(source, SELECTION)[0]  # type: ignore[arg-type]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
