@@ -131,26 +131,18 @@ def _saturation(source: ScanSource) -> float:
 
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on. An angle that no stage reaches becomes NaN. An unknown exposure becomes 1 s, so that
-    views and flats agree."""
-    for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
-        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
-        yield replace(frame, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
-
-
-def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
-    for row in range(first, len(source.table)):
-        pixels: NDArray[Any] = read_known(source, [row])[0]
+    """Frames from `first` on: counts as they are, line integrals as counts of a beam. An angle that no stage reaches
+    becomes NaN. An unknown exposure becomes 1 s, so that views and flats agree."""
+    for frame in source.frames(first):
+        pixels: NDArray[Any] = frame.counts
         if source.quantity == "line_integrals":
             with np.errstate(over="ignore"):
                 pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
             pixels = pixels.round().astype(np.uint16)
         elif (kernel := _type_of_kernels(pixels.dtype)) != pixels.dtype:
             pixels = pixels.astype(kernel)
-        kind, angle = source.table.kind(row), float(source.table.angles[row])
-        kind = FrameKind.INVALID if row in source.unreadable else kind
-        yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.table.exposures[row]))
+        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
+        yield replace(frame, counts=pixels, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
 
 
 def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -8,13 +8,11 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import json_of
@@ -27,7 +25,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.scan import altered_sentence, parts_joined, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Record, Rows, ScanEnding, complete
+from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Rows, ScanEnding, complete
 
 
 @dataclass(frozen=True)
@@ -138,11 +136,12 @@ def _copy(
             file[path][...] = np.array(column, file[path].dtype)
     rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
-    n, invalid = len(source.table), 0
-    for i, (given, record) in enumerate(_frames(source)):
-        image = given.astype(dtype, copy=False)
-        if i in source.unreadable:
-            raise DataError(f"{source.unreadable[i]} Nothing is left of {out}.")
+    table, invalid = source.table, 0
+    for i in range(len(table)):
+        try:
+            image = source.read([i])[0].astype(dtype, copy=False)
+        except hdf5.UnreadableError as error:
+            raise DataError(f"{error} Nothing is left of {out}.") from error
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
@@ -150,10 +149,11 @@ def _copy(
             )
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
-        rows.write(i, image, statistics, record)
+        frame = replace(table.frame(i, image), replaces=-1)
+        rows.write(frame, statistics, UNMARKED if table.flags is None else table.flags.mark(i))
         file.require_taken()
         if progress is not None:
-            progress(i + 1, n)
+            progress(i + 1, len(table))
         if (i + 1) % PER_FLUSH == 0:
             rows.flush()
     rows.flush()
@@ -170,15 +170,3 @@ def _ending_of(source: ScanSource) -> ScanEnding:
             "Nothing was written."
         )
     return replace(source.ending, status="failed", reason=DIED)
-
-
-def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
-    """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
-    flags = source.table.flags
-    if source.dtype == np.uint16:
-        for i, frame in enumerate(source.frames()):
-            known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i), aside=frame.aside)
-    else:
-        for i in range(len(table := source.table)):
-            yield source.read([i])[0], Record(table.kind(i), float(table.angles[i]), float(table.exposures[i]))

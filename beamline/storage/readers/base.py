@@ -150,22 +150,10 @@ class ScanSource(ABC):
         return len(self.table)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, each with all that is known of it.
-
-        Raises:
-            DataError: the pixels are not the uint16 that a Frame holds.
-        """
-        self.require_counts()
+        """The frames from `first` on, each with all that is known of it; pixels are of the file's type."""
         for row in range(first, len(table := self.table)):
             counts = read_known(self, [row])[0]
             yield table.frame(row, counts, FrameKind.INVALID if row in self.unreadable else None)
-
-    def require_counts(self) -> None:
-        """Raise DataError if the pixels are not uint16, as a Frame requires."""
-        if self.dtype != np.uint16:
-            raise DataError(
-                f"{self.path} holds {self.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
-            )
 
     def __enter__(self) -> Self:
         return self

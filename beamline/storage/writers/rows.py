@@ -27,28 +27,13 @@ from beamline.monitor.digest import FrameDigest
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark
 from beamline.storage.writers import layout
-from drivers.base.frame import FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 ROOM = 2**24  # bytes on the disk, far more than the /exchange view takes
 PER_FLUSH = 64  # rows that are written before a flush where nobody reads yet
 
 _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED])
 """56 bytes, little-endian, without gaps."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """Metadata of a frame in its row; units as in drivers.base.frame.Frame (radians, s)."""
-
-    kind: FrameKind
-    angle: float
-    exposure: float = np.nan
-    trigger: int = -1
-    framestamp: int = -1
-    time: float = np.nan
-    mark: Mark = UNMARKED
-    replaces: int = -1
-    aside: float = 0.0
 
 
 def image_key_of(kind: FrameKind) -> int:
@@ -117,38 +102,39 @@ class Rows:
         self._types = {path: column.dtype for path, column in self._columns.items()}
         self._first, self._said = 0, list[dict[str, Any]]()
 
-    def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Write row `row`, an existing one or the next: pixels at once, metadata at the next `flush`.
+    def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
+        """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
 
         A view that it replaces becomes an invalid frame, so that no program takes both.
         """
+        row = frame.index
         if row != self._first + len(self._said):
             self.flush()
             self._first = row
         values = {
-            layout.IMAGE_KEY: image_key_of(record.kind),
-            layout.KIND: max(int(record.kind), int(FrameKind.ALIGNMENT)),
-            layout.X_TRANSLATION: record.aside,
-            layout.COUNT_TIME: record.exposure,
-            layout.ANGLE: math.degrees(record.angle),
-            layout.TRIGGER: record.trigger,
-            layout.FRAMESTAMP: record.framestamp,
-            layout.TIME: record.time,
-            layout.REPLACES: record.replaces,
-            FLAGS: record.mark.bits,
-            VALID: record.mark.valid,
-            SCORES: record.mark.scores,
-            REGIONS: record.mark.regions,
+            layout.IMAGE_KEY: image_key_of(frame.kind),
+            layout.KIND: max(int(frame.kind), int(FrameKind.ALIGNMENT)),
+            layout.X_TRANSLATION: frame.aside,
+            layout.COUNT_TIME: frame.exposure,
+            layout.ANGLE: math.degrees(frame.angle),
+            layout.TRIGGER: frame.trigger,
+            layout.FRAMESTAMP: frame.framestamp,
+            layout.TIME: frame.time,
+            layout.REPLACES: frame.replaces,
+            FLAGS: mark.bits,
+            VALID: mark.valid,
+            SCORES: mark.scores,
+            REGIONS: mark.regions,
             layout.RECORD_CHECKSUM: 0,  # worked out where the rows are written
         } | {f"/entry/digest/{name}": value for name, value in vars(digest).items()}
-        for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
+        for dataset, pixels in ((self._data, frame.counts), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
         self._said.append({path: values[path] for path in self._columns})
-        if record.replaces >= 0:
+        if frame.replaces >= 0:
             self.flush()
             for path in (layout.IMAGE_KEY, layout.KIND):
-                self._columns[path][record.replaces] = int(FrameKind.INVALID)
+                self._columns[path][frame.replaces] = int(FrameKind.INVALID)
 
     def flush(self) -> None:
         """Write the metadata of the rows since the last call. The caller then flushes the file."""
