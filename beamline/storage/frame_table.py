@@ -126,6 +126,20 @@ class FrameTable:
         """Rows of the projections within a range of rows, such as those of a part."""
         return self.views[slice(*np.searchsorted(self.views, (first, end)))]
 
+    def numbers_taken(self, first: int = 0, kind: int = FrameKind.PROJECTION) -> frozenset[int]:
+        """Numbers of the planned views that are there, from 0: a view that was taken again has that of the first.
+
+        Args:
+            first: the row from which on frames count.
+            kind: of these frames.
+        """
+        rows, numbers = self.of_kind(kind), set[int]()
+        for row in rows[rows >= first].tolist():
+            while self.replaces is not None and self.replaces[row] >= 0:
+                row = int(self.replaces[row])
+            numbers.add(int(self.triggers[row]))
+        return frozenset(numbers)
+
     def kind(self, row: int) -> FrameKind:
         """Of one frame."""
         return FrameKind(int(self.kinds[row]))

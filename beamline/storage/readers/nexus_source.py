@@ -6,7 +6,6 @@ What counts is the structure, an NXdetector with `data` [frame, row, col] and `i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
@@ -128,28 +127,31 @@ class NexusSource(ScanSource):
         angle = places.angle if self._own_angles else None
         there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
         n = len(places.data) if ended else min(*there, len(key))
-        table = self._read_table(key, n, n if ended else np.inf)
-        self.table = replace(table, energies=read_energies(places.entry, n), currents=self._currents())
-        return n
-
-    def _read_table(self, key: h5py.Dataset, n: int, most: float) -> FrameTable:
-        """What is stated of the first n frames. DataError: there are fewer of one column, or more than `most`."""
-        places = self._places
-        known = places.angle is not None and self._own_angles
-        angles = places.sense * datasets.radians(places.angle) + 0.0 if known else np.full(n, np.nan)  # no -0
+        angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # no -0
         keys = np.ravel(datasets.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
-        if min(sizes) < n or max(sizes) > most:
+        if min(sizes) < n or (ended and max(sizes) > n):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        known = np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW)  # which is never written
-        self.n, kinds = n, np.where(known, keys[:n], FrameKind.INVALID)
+        self.n, known = (
+            n,
+            np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW),
+        )  # which is never written
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
         exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
         logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}
         own = {name: column for name, column in logged.items() if column is not None}
-        return FrameTable.of(kinds, angles[:n], exposures, times=times if np.isfinite(times).any() else None, **own)
+        self.table = FrameTable.of(
+            np.where(known, keys[:n], FrameKind.INVALID),
+            angles[:n],
+            exposures,
+            times=times if np.isfinite(times).any() else None,
+            energies=read_energies(places.entry, n),
+            currents=self._currents(),
+            **own,
+        )
+        return n
 
     @property
     def frame_bytes(self) -> int:

@@ -15,15 +15,14 @@ from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5
-from beamline.storage.flag_legend import FrameFlags, read_flags
-from beamline.storage.frame_table import FrameTable
-from beamline.storage.parts import decisions_in, gaps_in, pass_ends_in, require_joined
+from beamline.storage.flag_legend import read_flags
+from beamline.storage.parts import gaps_in, require_joined
 from beamline.storage.readers.base import WHOLE, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import Places, find
 from beamline.storage.readers.nexus_source import NexusSource, guarded
+from beamline.storage.recorded_frames import decisions_in, frames_in, pass_ends_in
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
-from drivers.base.frame import FrameKind
+from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(NexusSource):
@@ -31,7 +30,6 @@ class OwnScan(NexusSource):
 
     def _read_stated(self, found: list[Places]) -> None:
         self._damaged: set[int] = set()
-        self._altered = np.zeros(0, np.bool_)
         self.pixel_size_mm = datasets.scalar(self._places.detector, "x_pixel_size", datasets.LENGTH_UNITS)
         self.cone = self._cone()
         self.plan = json_object(datasets.text_at(self._file, "/entry/record/plan")) or {}
@@ -58,66 +56,28 @@ class OwnScan(NexusSource):
 
     @guarded
     def refresh(self) -> int:
-        kinds = datasets.dataset(self._places.entry, "frame_log/kind")
-        key = self._places.image_key if kinds is None else kinds
-        if (n := self._committed(key)) > self.n or not n or self.finished:
-            self.table = self._read_table(key, n, np.inf)
+        if (n := self._committed()) > self.n or not n or self.finished:
+            self.n, flags = n, read_flags(self._file, n)
+            known = self.plan or flags.flagged.any()  # a copy has none to say
+            self.table = replace(frames_in(self._file, n), flags=flags if known else None)
         else:  # of frames that were there nothing else is used before the end
             self.table = replace(self.table, pass_ends=pass_ends_in(self._file))
         self.decisions, self._checksums = decisions_in(self._file), self._column("digest/checksum")
-        return self.n
+        return n
 
-    def _committed(self, key: h5py.Dataset) -> int:
-        """The frames that the writer of our file counts; where they are more than before, their datasets are read
+    def _committed(self) -> int:
+        """The frames that the writer of our file counts; where they are more than before, their pixels are read
         anew."""
-        places, committed = self._places, self._file[layout.COMMITTED]
+        committed = self._file[layout.COMMITTED]
         hdf5.look_again(committed)
         n = int(committed[()])
         if n < 0:
             raise ValueError(f"{n} frames are committed")
         if n > self.n:
-            for item in {places.data, key, places.angle, places.image_key} - {None}:
-                hdf5.look_again(item)
+            hdf5.look_again(self._places.data)
+        if len(self._places.data) < n:
+            raise DataError(f"{self.path} has {len(self._places.data)} frames; expected {n}.")
         return n
-
-    def _read_table(self, key: h5py.Dataset, n: int, most: float) -> FrameTable:
-        """With what our log says: alignment frames aside are wide views, frames whose record is altered are invalid."""
-        known, table = self._altered.size, super()._read_table(key, n, most)
-        if n > known:
-            self._altered = np.pad(self._altered, (0, n - known))
-            self._altered[known + altered_rows(self._file, known, n)] = True
-        kinds, aside, replaces = table.kinds, None, self._column("frame_log/replaces")
-        if (moved := self._item(self._places.entry, "sample/x_translation")) is not None:
-            aside = datasets.values_of(moved)[:n]
-            kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.WIDE_VIEW
-        kinds[self._altered[:n]] = FrameKind.INVALID
-        for column in (table.triggers, table.framestamps, replaces):
-            if column is not None:
-                column[self._altered[:n]] = -1
-        if replaces is not None:
-            require_earlier(replaces)
-        if table.times is not None:
-            table.times[self._altered[:n]] = np.nan
-        return replace(
-            table,
-            altered=self._altered[:n],
-            aside=aside,
-            replaces=replaces if replaces is not None and (replaces >= 0).any() else None,
-            part_starts=self._part_starts(),
-            pass_ends=pass_ends_in(self._file),
-            flags=self._flags(),
-        )
-
-    def _flags(self) -> FrameFlags | None:
-        flags = read_flags(self._file, self.n)
-        return flags if self.plan or flags.flagged.any() else None  # a copy has none to say
-
-    def _part_starts(self) -> NDArray[np.int64]:
-        item = datasets.dataset(self._file, layout.PART_STARTS)
-        starts = np.zeros(1, np.int64) if item is None else np.ravel(datasets.values_of(item))
-        if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
-            raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
-        return starts.astype(np.int64)
 
     @property
     @guarded

@@ -26,8 +26,8 @@ from beamline.plan.passes import Choice
 from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
-from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recorded_frames import decisions_in, pass_ends_in
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
 from tests.beamline.chosen import Chooser, Scripted, choosing

@@ -29,8 +29,8 @@ from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, rec
 from beamline.scan.run import run_scan
 from beamline.scan.supervision import Supervision
 from beamline.storage.interrupted import next_step
-from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recorded_frames import decisions_in, pass_ends_in
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind

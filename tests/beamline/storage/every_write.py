@@ -30,8 +30,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
-from beamline.storage.parts import views_in
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import recover
 from beamline.storage.volumes.images import tiff
 from beamline.storage.volumes.zarr import ome_zarr
@@ -155,7 +155,7 @@ class Rig:
 
     def resume(self) -> int:
         with hdf5.open_hdf5(self.scan) as file:
-            views_in(file)
+            frames_in(file).numbers_taken()
             return int(file[layout.COMMITTED][()])
 
     def after(self) -> list[int]:

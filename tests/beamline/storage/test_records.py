@@ -14,8 +14,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import replay
-from beamline.storage.parts import views_in
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import recover
 from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
@@ -41,7 +41,7 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: 
     assert [f.severity for f in validate(path) if f.rule == "records"] == ["error"]
     assert any("Look for a good copy" in said for said in describe(path)["findings"])
     with h5py.File(path) as file:
-        assert len(views_in(file)) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
+        assert len(frames_in(file).numbers_taken()) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
     with pytest.raises(DataError, match=rf"it: {ROW}\..* Nothing was written"):
         ingest(path, path.with_name("copy.h5"))
 
