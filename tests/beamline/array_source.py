@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.frame_table import FrameTable
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.writers.rows import ScanEnding
 
 
@@ -32,7 +32,8 @@ def counted(views: NDArray[Any], angles: NDArray[np.float64], dtype: Any = np.ui
 class ArraySource(ScanSource):
     """A scan of counts in arrays that notes what is read of it."""
 
-    path, format, quantity = Path("array"), "array", "counts"
+    path, format = Path("array"), "array"
+    quantity: Quantity = "counts"
     finished, checksummed, ending = True, False, ScanEnding()
     damaged: frozenset[int] = frozenset()
     frame_bytes = 0

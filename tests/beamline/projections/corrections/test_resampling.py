@@ -98,11 +98,11 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
     plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
-    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    correction = ScanCorrection(source, selection, pytest.fail)
     whole = correction.at_once(frames).data
     np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
     rows = replace(selection, rows=(8 * binning, 14 * binning))
-    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data  # type: ignore[arg-type]
+    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data
     np.testing.assert_array_equal(band, whole[:, 8:14])
     out = np.empty(whole.shape, np.float32)
     np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)

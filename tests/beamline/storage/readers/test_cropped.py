@@ -20,7 +20,7 @@ from tests.beamline.array_source import ArraySource
 from tests.beamline.storage.readers.test_conformance import FRAMES, SCANS
 
 
-@pytest.fixture(params=SCANS.values(), ids=SCANS.keys())
+@pytest.fixture(params=list(SCANS.values()), ids=list(SCANS))
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     name, write = request.param
     found: Path = write(tmp_path / name)
@@ -61,7 +61,7 @@ class _Flagged(ArraySource):
 def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int, right: int) -> None:
     from beamline.projections.usable_views import regions_of
 
-    source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
+    source: Any = cropped(_Flagged(), cols)
     assert source.axis_col == 52.5 - cols[0]
     treated = treatment_of(source.table.flags, np.ones(3, np.bool_), source.shape)
     (box,) = regions_of(treated.flags, source.shape).boxes
@@ -72,7 +72,7 @@ def test_the_lens_keeps_its_centre() -> None:
     lens = Distortion(48.0, 5.0, (1.0, 0.0, 1e-4))
     places = []
     for cols in ((0, 100), (30, 90)):
-        source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
+        source: Any = cropped(_Flagged(), cols)
         found = TiltAndLens(distortion=lens).of(source, Selection())
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])
