@@ -102,7 +102,7 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
             ("instrument/name", "instrument"),
         )
     },
-    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: np.asarray(s.table.currents).max(), 7),
+    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: np.asarray(s.table.currents)[6], 7),
     **{
         f"{where}/incident_energy": ([(f"{where}/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25)
         for where in ("instrument/beam", "beam", "sample/beam")

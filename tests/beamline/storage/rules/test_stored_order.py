@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -14,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from beamline.features.files.validate import validate
+from beamline.storage.readers.base import Quantity
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules import Finding
 from beamline.storage.rules.stored_order import change_of_rows, pixels_as_labelled, views_first
@@ -32,19 +32,21 @@ def line_integrals(seed: int, turn: float) -> tuple[NDArray[np.float64], NDArray
     return lines + 0.02 * rng.standard_normal(lines.shape), angles
 
 
-def told(data: NDArray[np.float64], angles: NDArray[np.float64], quantity: Any = "line_integrals") -> list[Finding]:
+def told(
+    data: NDArray[np.float64], angles: NDArray[np.float64], quantity: Quantity = "line_integrals"
+) -> list[Finding]:
     source = ArraySource(data, [0] * len(data), angles)
     source.quantity = quantity
     return list(views_first(source))
 
 
 @pytest.mark.parametrize("turn", [np.pi, 2 * np.pi])
-@pytest.mark.parametrize("quantity", ["line_integrals", "transmission"])
-def test_sinograms_are_told_from_views(turn: float, quantity: str) -> None:
+@pytest.mark.parametrize("quantity", ["line_integrals", "unknown"])  # unknown: transmission
+def test_sinograms_are_told_from_views(turn: float, quantity: Quantity) -> None:
     missed = 0
     for seed in range(12):
         lines, angles = line_integrals(seed, turn)
-        data = np.exp(-lines) if quantity == "transmission" else lines
+        data = np.exp(-lines) if quantity == "unknown" else lines
         assert told(data, angles, quantity) == []
         missed += not told(data.swapaxes(0, 1), angles, quantity)
     assert missed == 0
