@@ -320,7 +320,7 @@ class LineIntegralCorrection:
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
-            light = DARK * (2 + view / np.float32(np.log(DARK)))  # above DARK where transmission is
+            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
             light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
             if (unseen := unmeasured(view, light, hidden, self._foreign)) is not None:

@@ -17,6 +17,7 @@ from recon.base.declared_types import check_settings
 from recon.base.masks import Image
 from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.unmeasured import with_rim
 
 Kept = TypeVar("Kept", F32, F64)
 
@@ -162,7 +163,7 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     found = left | right[:, ::-1]
-    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))) | whole[:, None])
+    return with_rim(found, middle) | whole[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # views next to flats; columns

@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, I64, Mask
+from recon.base.arrays import F32, F64, I64, MEDIAN, Mask
 from recon.base.masks import areas, fill, plan_fill
 
 NO_RUNS = np.zeros((0, 4), np.int64)
 NO_RUNS.flags.writeable = False
 DARK = 0.01  # transmission, below which a pixel has no light that counts
-_BLOCK, _RIM = np.ones((3, 3), np.bool_), np.ones((5, 5), np.bool_)  # two pixels: interpolation, blur of an edge
+_BLOCK = np.ones((3, 3), np.bool_)
+_RIM, _BEYOND = 2, 5  # pixels beside an area that interpolation or blur reach at most, and those that tell whether
+_ALTERED, _SURE = 0.02, 3.0  # of the light, and standard errors, by which a rim differs from what lies beyond it
 _FEWEST = 3  # dark pixels, at a border and in an area
 _ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
 _BELOW = 3.0  # standard deviations below the dark, as no camera reads
@@ -55,8 +57,37 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             nothing_seen |= labels == label
     if foreign is not None:
         nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = (ndimage.binary_dilation(nothing_seen & ~hidden, _RIM) | areas(unknown)) & ~hidden
+    nothing_seen = (with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), light)) | areas(unknown)) & ~hidden
     return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
+
+
+def with_rim(dark: Mask, light: F32) -> Mask:
+    """Dark areas [row, col], and on each of their four sides the pixels beside them whose light is not their own.
+
+    Blur, or interpolation by a shift, mixes the light of an edge: the pixels so far from it on this side differ, in the
+    median, from a straight line through the logarithms of those beyond. Rows that are not read, or a shift by whole
+    pixels, leave the next pixel as it was. Where none are beyond, the rim is as wide as it may be.
+
+    Args:
+        light: transmission [row, col]; NaN: unknown.
+    """
+    found, at = dark.copy(), np.arange(1, _BEYOND + 1)
+    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(light, DARK))), _BEYOND, constant_values=np.nan)
+    for turn in range(4):
+        area, known, out = (np.rot90(image, turn) for image in (dark, lines, found))
+        row, col = np.nonzero(area[:, :-1] & ~area[:, 1:])
+        beside = known[_BEYOND + row[:, None], _BEYOND + col[:, None] + at]
+        beside, reach = beside[np.isfinite(beside).all(axis=1)], _RIM
+        if len(beside):
+            far = beside[:, _RIM:]
+            slope = (far[:, -1] - far[:, 0]) / (far.shape[1] - 1)
+            away = beside[:, :_RIM] - far.mean(axis=1)[:, None] - slope[:, None] * (at[:_RIM] - at[_RIM:].mean())
+            middle = np.median(away, axis=0)
+            errors = np.median(np.abs(away - middle), axis=0) / MEDIAN / np.sqrt(len(away))
+            reach = int((at[:_RIM] * (np.abs(middle) > np.maximum(_ALTERED, _SURE * errors))).max())
+        for step in at[:reach]:
+            out[row, np.minimum(col + step, area.shape[1] - 1)] = True
+    return found
 
 
 def foreign_rows(light: F32, angles: F64) -> Mask:
@@ -79,7 +110,7 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
     lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
     mass = lines.sum(axis=(1, 2), dtype=np.float64)
     for view in np.flatnonzero(with_dark):
-        hidden = ndimage.binary_dilation(dark[view], _RIM)[rows]
+        hidden = with_rim(dark[view], light[view])[rows]
         if hidden.all():
             lines[view] = 0
         else:
@@ -95,7 +126,7 @@ def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
     if (_corners(image) != 0).all():
         return image
     labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
-    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _RIM)
+    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _BLOCK, _RIM)
     nearest = ndimage.distance_transform_edt(blank, return_distances=False, return_indices=True)
     return image if blank.all() else image[tuple(nearest)]
 
