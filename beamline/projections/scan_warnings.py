@@ -112,7 +112,8 @@ def warn_of_unmeasured(prepared: PreparedProjections, first_row: int, binning: i
     """
     what = "slice" if prepared.geometry.rows_show_slices else "row"
     projections, (lost, between) = prepared.projections, prepared.unmeasured_rows
-    masked, runs = projections.masked & ~np.isin(np.arange(len(projections.masked)), lost)[:, None], projections.unmeasured
+    masked, runs = projections.masked.copy(), projections.unmeasured
+    masked[lost] = False
     unseen, runs = areas(projections.masked) & masked, runs[~np.isin(runs[:, 1], lost)]
     if runs.size:
         frames, within = np.unique(runs[:, 0]), first_row + np.arange(binning)

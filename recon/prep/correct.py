@@ -27,7 +27,7 @@ from recon.prep.references import (
 )
 from recon.prep.spots import SpotFilter
 from recon.prep.spots import Transmission as Transmission
-from recon.prep.unmeasured import DARK, NO_RUNS, runs_of, unmeasured
+from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 _NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
 _DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers

@@ -57,7 +57,8 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             nothing_seen |= labels == label
     if foreign is not None:
         nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = (with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), light)) | areas(unknown)) & ~hidden
+    nothing_seen = with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), light)) | areas(unknown)
+    nothing_seen &= ~hidden
     return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
 
 
