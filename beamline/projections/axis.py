@@ -175,7 +175,8 @@ def locate_axis(
             estimate = find_axis(band.data, angles)
     except ValueError as error:
         raise _not_found(source, error) from error
-    if all_there and not estimate.confident and source.axis_col is None and estimate.method != ENDS:
+    unsure = not estimate.confident and source.axis_col is None and estimate.method != ENDS
+    if all_there and (unsure or band.unmeasured.size):
         estimate = _by_unseen_views(band, angles) or estimate
     axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
@@ -197,11 +198,11 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
         return None  # columns would stay fine, and volumes take minutes
-    dark, some = areas(band.masked), spread(np.arange(angles.size), VIEWS)
+    dark, some, lit = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
     data = np.ascontiguousarray(band.data[some])
     with suppress(ValueError):
         estimate = axis_by_views(
-            data, Geometry.parallel(angles[some], data.shape[1:]), lit=~dark if dark.any() else None
+            data, Geometry.parallel(angles[some], data.shape[1:]), lit=None if lit is None else lit[some]
         )  # fmt: skip
         if estimate.confident or dark.any():
             return replace(estimate, confident=not dark.any())

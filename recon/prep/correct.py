@@ -97,6 +97,18 @@ class Projections:
     weights: NDArray[np.float32] | None = None
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
 
+    @property
+    def lit(self) -> Mask | None:
+        """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
+        dark = areas(self.masked)
+        if not (dark.any() or self.unmeasured.size):
+            return None
+        lit, at = np.repeat(~dark[None], len(self.data), axis=0), dict(zip(self.view_ids.tolist(), range(len(self.data)), strict=True))
+        for view, row, first, end in self.unmeasured.tolist():
+            if view in at:
+                lit[at[view], row, first:end] = False
+        return lit
+
 
 class Correction:
     """Correction of one scan's views, which come in the order they were taken, in batches of any size.
