@@ -30,6 +30,7 @@ _AXIS_ROWS = 64
 _COMPARED, _FEWEST = 90, 20  # views that are enough for an axis that is given; fewer may be sure and wrong
 _CONFIRMED = 0.5  # columns, of binned views, up to which those held out confirm an axis
 _CANDIDATES = 14  # of the axis of a cone, usually
+_GUESSED = 0.01  # of the mass, in pixels that were filled, from which they draw the axis away
 
 
 def rotation_axis(
@@ -100,7 +101,7 @@ def _axis_by_views(
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
-        estimate = axis_by_views(views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)))
+        estimate = axis_by_views(views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), lit=views.lit)
     except ValueError as error:
         if stated is None:
             raise _not_found(source, error) from error
@@ -176,7 +177,7 @@ def locate_axis(
     except ValueError as error:
         raise _not_found(source, error) from error
     unsure = not estimate.confident and source.axis_col is None and estimate.method != ENDS
-    if all_there and (unsure or band.unmeasured.size):
+    if all_there and (unsure or _hides_matter(band)):
         estimate = _by_unseen_views(band, angles) or estimate
     axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
@@ -189,6 +190,12 @@ def locate_axis(
         "used. Check the slices, or give --axis COLUMN."
     )
     return source.axis_col, estimate
+
+
+def _hides_matter(band: Projections) -> bool:
+    """Whether pixels that measured nothing in a view were filled with matter, whose place is a guess."""
+    lit = band.lit if band.unmeasured.size else None
+    return lit is not None and band.data[~lit].sum() > _GUESSED * band.data.sum()
 
 
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:

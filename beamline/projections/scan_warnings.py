@@ -64,7 +64,8 @@ def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float
 def warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
-    edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
+    edges = FieldEdges.of(projections.data, geometry, prepared.shares)
+    unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""
         if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
@@ -153,5 +154,5 @@ def warn_of_unmeasured(prepared: PreparedProjections, first_row: int, binning: i
             warn(
                 f"No ray measured {count(some.size, what)} of {len(masked)} (from 0: {spans(some.tolist())}): in all "
                 "views these rows have no beam, zeros, no finite values, or dead pixels. "
-                f"They are {so if what == 'slice' else 'not used'}."
+                f"They are {so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
             )

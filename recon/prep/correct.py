@@ -100,14 +100,11 @@ class Projections:
     @property
     def lit(self) -> Mask | None:
         """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
-        dark = areas(self.masked)
-        if not (dark.any() or self.unmeasured.size):
-            return None
-        lit, at = np.repeat(~dark[None], len(self.data), axis=0), dict(zip(self.view_ids.tolist(), range(len(self.data)), strict=True))
-        for view, row, first, end in self.unmeasured.tolist():
-            if view in at:
-                lit[at[view], row, first:end] = False
-        return lit
+        lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
+        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
+            lit[at[view], row, first:end] = False
+        return None if lit.all() else lit
 
 
 class Correction:
