@@ -193,9 +193,10 @@ def locate_axis(
 
 
 def _hides_matter(band: Projections) -> bool:
-    """Whether pixels that measured nothing in a view were filled with matter, whose place is a guess."""
-    lit = band.lit if band.unmeasured.size else None
-    return lit is not None and band.data[~lit].sum() > _GUESSED * band.data.sum()
+    """Whether parts of rows that measured nothing in a view were filled with matter, whose place is a guess."""
+    if not band.unmeasured.size or (lit := band.lit) is None:
+        return False
+    return bool(band.data[~lit & lit.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
 
 
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:

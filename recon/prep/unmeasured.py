@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, I64, MEDIAN, Mask
+from recon.base.arrays import F32, F64, I64, Mask, median_deviation
 from recon.base.masks import areas, fill, plan_fill
 
 NO_RUNS = np.zeros((0, 4), np.int64)
 NO_RUNS.flags.writeable = False
 DARK = 0.01  # transmission, below which a pixel has no light that counts
 _BLOCK = np.ones((3, 3), np.bool_)
-_RIM, _BEYOND = 2, 5  # pixels beside an area that interpolation or blur reach at most, and those that tell whether
+_RIM, _BEYOND = 4, 3  # pixels beside an area that interpolation or blur reach at most, and those that tell whether
 _ALTERED, _SURE = 0.02, 3.0  # of the light, and standard errors, by which a rim differs from what lies beyond it
 _FEWEST = 3  # dark pixels, at a border and in an area
 _ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
@@ -65,30 +65,35 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
 def with_rim(dark: Mask, light: F32) -> Mask:
     """Dark areas [row, col], and on each of their four sides the pixels beside them whose light is not their own.
 
-    Blur, or interpolation by a shift, mixes the light of an edge: the pixels so far from it on this side differ, in the
-    median, from a straight line through the logarithms of those beyond. Rows that are not read, or a shift by whole
-    pixels, leave the next pixel as it was. Where none are beyond, the rim is as wide as it may be.
+    Blur, or interpolation by a shift, mixes the light of an edge: the pixels next to it on this side differ, in the
+    median, from a straight line through the logarithms of the next three, and so on outwards. Rows that are not read,
+    or a shift by whole pixels, leave the next pixel as it was.
 
     Args:
         light: transmission [row, col]; NaN: unknown.
     """
-    found, at = dark.copy(), np.arange(1, _BEYOND + 1)
-    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(light, DARK))), _BEYOND, constant_values=np.nan)
+    found, at = dark.copy(), np.arange(1, _RIM + _BEYOND + 1)
+    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(light, DARK))), at[-1], mode="edge")
     for turn in range(4):
-        area, known, out = (np.rot90(image, turn) for image in (dark, lines, found))
+        area, known = np.rot90(found, turn), np.rot90(lines, turn)
         row, col = np.nonzero(area[:, :-1] & ~area[:, 1:])
-        beside = known[_BEYOND + row[:, None], _BEYOND + col[:, None] + at]
-        beside, reach = beside[np.isfinite(beside).all(axis=1)], _RIM
-        if len(beside):
-            far = beside[:, _RIM:]
-            slope = (far[:, -1] - far[:, 0]) / (far.shape[1] - 1)
-            away = beside[:, :_RIM] - far.mean(axis=1)[:, None] - slope[:, None] * (at[:_RIM] - at[_RIM:].mean())
-            middle = np.median(away, axis=0)
-            errors = np.median(np.abs(away - middle), axis=0) / MEDIAN / np.sqrt(len(away))
-            reach = int((at[:_RIM] * (np.abs(middle) > np.maximum(_ALTERED, _SURE * errors))).max())
-        for step in at[:reach]:
-            out[row, np.minimum(col + step, area.shape[1] - 1)] = True
+        beside, reach = known[at[-1] + row[:, None], at[-1] + col[:, None] + at], 0
+        while row.size and reach < _RIM and _mixed(beside[:, reach : reach + 1 + _BEYOND]):
+            reach += 1
+            area[row, np.minimum(col + reach, area.shape[1] - 1)] = True
     return found
+
+
+def _mixed(lines: F64) -> bool:
+    """Whether the first of pixels side by side [edge, pixel] has not the light that the others lead to; logarithms."""
+    lines = lines[np.isfinite(lines).all(axis=1)]
+    if not len(lines):
+        return True
+    others = lines[:, 1:]
+    steps = (others[:, -1] - others[:, 0]) / (_BEYOND - 1)
+    away = lines[:, 0] - others.mean(axis=1) + steps * (_BEYOND + 1) / 2
+    middle = np.median(away)
+    return bool(abs(middle) > max(_ALTERED, _SURE * median_deviation(away - middle) / np.sqrt(len(away))))
 
 
 def foreign_rows(light: F32, angles: F64) -> Mask:
@@ -127,7 +132,7 @@ def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
     if (_corners(image) != 0).all():
         return image
     labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
-    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _BLOCK, _RIM)
+    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _BLOCK, 2)
     nearest = ndimage.distance_transform_edt(blank, return_distances=False, return_indices=True)
     return image if blank.all() else image[tuple(nearest)]
 
