@@ -232,7 +232,9 @@ class ScanCorrection:
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
         self._look_for_shadow(views)
-        return self._shadow is not self._fed_by and self._shadow is not None and any(part.any() for part in self._shadow)
+        return (
+            self._shadow is not self._fed_by and self._shadow is not None and any(part.any() for part in self._shadow)
+        )
 
     def quiet(self) -> ScanCorrection:
         """A correction with the same references for a few views, without warnings."""

@@ -54,7 +54,9 @@ def test_a_rim_is_as_wide_as_the_blur_of_an_edge(photons: float, blur: float, ri
     light = np.random.default_rng(0).poisson(photons * gaussian_filter1d(light, blur, axis=0)) / photons
     dark = np.repeat(np.abs(np.arange(SHAPE[0]) - 9)[:, None] <= 2, SHAPE[1], axis=1)
     found = with_rim(dark, light.astype(np.float32))
-    np.testing.assert_array_equal(found, np.repeat(np.abs(np.arange(SHAPE[0]) - 9)[:, None] <= 2 + rim, SHAPE[1], axis=1))
+    np.testing.assert_array_equal(
+        found, np.repeat(np.abs(np.arange(SHAPE[0]) - 9)[:, None] <= 2 + rim, SHAPE[1], axis=1)
+    )
 
 
 def test_a_turn_of_the_image_leaves_corners() -> None:
