@@ -149,7 +149,8 @@ def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
     if sum(np.count_nonzero(side) for side in (low[0], low[-1], low[:, 0], low[:, -1])) < _FEWEST:
         return np.zeros(low.shape, np.int32)
     dark = np.pad(low | hidden, 3, mode="edge")  # the outer layer goes in closing
-    labels, n = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3], _BLOCK)
+    solid = ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3]
+    labels, n = ndimage.label(solid | (low & (low.mean(axis=1) > _ONE_VALUE)[:, None]), _BLOCK)  # also single rows
     at_border = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
     large = np.bincount(labels[low & ~hidden], minlength=n + 1) >= _FEWEST
     return np.where(np.isin(labels, at_border[at_border > 0]) & large[labels], labels, 0)
