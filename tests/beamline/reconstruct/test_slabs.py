@@ -17,8 +17,8 @@ from beamline.reconstruct.plan import prepare_within
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.voxels.direct import Fbp
-from tests.beamline.reconstruct.growing_scan import ScanClock
 from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.reconstruct.growing_scan import ScanClock
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 
