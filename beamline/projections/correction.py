@@ -71,6 +71,7 @@ class ScanCorrection:
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
+        self._fed_by: tuple[Mask, Mask] | None = None  # the shadow by which `feed` corrects
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
@@ -183,7 +184,7 @@ class ScanCorrection:
         data, frames = self._read(frames, None)
         self._tell_unlit(asked, frames)
         if self._stream is None:
-            self._stream = self._correction(None)
+            self._stream, self._fed_by = self._correction(None), self._shadow
         if not frames.size and not (last and self._stream is not None and self._stream.spots.waiting):
             return None
         part = self._corrected(self._stream, data, frames, last)
@@ -230,9 +231,10 @@ class ScanCorrection:
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
-        unknown = self._shadow is None
         self._look_for_shadow(views)
-        return unknown and self._shadow is not None and any(part.any() for part in self._shadow)
+        return (
+            self._shadow is not self._fed_by and self._shadow is not None and any(part.any() for part in self._shadow)
+        )
 
     def quiet(self) -> ScanCorrection:
         """A correction with the same references for a few views, without warnings."""

@@ -27,7 +27,7 @@ from recon.prep.references import (
 )
 from recon.prep.spots import SpotFilter
 from recon.prep.spots import Transmission as Transmission
-from recon.prep.unmeasured import DARK, NO_RUNS, runs_of, unmeasured
+from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 _NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
 _DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
@@ -96,6 +96,15 @@ class Projections:
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
+
+    @property
+    def lit(self) -> Mask | None:
+        """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
+        lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
+        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
+            lit[at[view], row, first:end] = False
+        return None if lit.all() else lit
 
 
 class Correction:
@@ -320,7 +329,7 @@ class LineIntegralCorrection:
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
-            light = DARK * (2 + view / np.float32(np.log(DARK)))  # above DARK where transmission is
+            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
             light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
             if (unseen := unmeasured(view, light, hidden, self._foreign)) is not None:

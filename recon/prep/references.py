@@ -17,6 +17,7 @@ from recon.base.declared_types import check_settings
 from recon.base.masks import Image
 from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.unmeasured import with_rim
 
 Kept = TypeVar("Kept", F32, F64)
 
@@ -146,7 +147,8 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
 
     Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
     rotation axis darkens the middle, which does not count. Opaque matter that covers an edge in all views counts: its
-    line integrals are not measured either way. Two pixels beside an area belong to it: its blurred edge.
+    line integrals are not measured either way. Its blurred edge belongs to it, see
+    `with_rim`.
 
     Args:
         light: float32 [view, row, col], transmission of views all around, three at least.
@@ -156,13 +158,14 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     middle = np.median(light, axis=0)
     spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    dark &= np.partition(light, n - 2, axis=0)[n - 2] < _DIM  # one view may have a zinger
+    bright = np.partition(light, n - 2, axis=0)[n - 2]  # one view may have a zinger
+    dark &= bright < _DIM
     whole = dark.mean(axis=1) > _WHOLE  # a row that is not read has no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     found = left | right[:, ::-1]
-    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))) | whole[:, None])
+    return with_rim(found, bright) | whole[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # views next to flats; columns
