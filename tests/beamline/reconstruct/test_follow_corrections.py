@@ -181,9 +181,9 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     live: list[Projections] = []
     again = ScanFollower.correct_again
 
-    def as_it_was(self: ScanFollower, usable: UsableViews, why: str) -> None:
+    def as_it_was(self: ScanFollower, *given: Any) -> None:
         live.append(self._joined())
-        again(self, usable, why)
+        again(self, *given)
 
     monkeypatch.setattr(ScanFollower, "correct_again", as_it_was)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
