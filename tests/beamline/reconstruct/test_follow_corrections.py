@@ -16,7 +16,6 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import pipeline
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
