@@ -111,8 +111,8 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
-        code = f"U+{ord(text[error.position]):04X}"
-        return text.count("\n", 0, error.position) + 1, f"the character {code} belongs to no text; take it out"
+        at = error.position
+        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} belongs to no text; take it out"
     if mark is None:
         return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]

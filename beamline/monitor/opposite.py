@@ -169,7 +169,7 @@ class OppositeCheck(Logged):
         ):
             return math.inf
         off = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth * fit.remainder**2
-        return off if off > max(self.changed, CELLS[1] * grid.cell) else 0.0
+        return off * (off > max(self.changed, CELLS[1] * grid.cell))
 
     def _mirrored(
         self, state: OppositeState, one: Kept, fit: Fit, view: CellView, context: ScanContext

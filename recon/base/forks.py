@@ -3,41 +3,32 @@
 What such a thread holds would stay half loaded and locked in the child, which would wait for it for ever.
 """
 
-from __future__ import annotations
-
 import importlib
 import logging  # noqa: F401  Its own hook is to lock after this one, as imports log.
 import os
 import sys
 import threading
 import time
-from typing import Any
 
 _PATIENCE = 60.0  # s, at most
-_held = list[Any]()  # numba's lock of compilations, during a fork
-
-
-def _others_import() -> bool:
-    """By the locks that Python's importlib keeps of modules."""
-    locks = [lock() for lock in [*vars(importlib._bootstrap).get("_module_locks", {}).values()]]
-    return any(getattr(lock, "owner", None) not in (None, threading.get_ident()) for lock in locks)
+_held = list[threading.RLock]()  # numba's lock of compilations, during a fork
 
 
 def _wait() -> None:
     end = time.monotonic() + _PATIENCE
     while time.monotonic() < end:
-        numba = sys.modules.get("numba.core.compiler_lock")
-        compiles = getattr(getattr(numba, "global_compiler_lock", None), "_lock", threading.RLock())
-        if compiles.acquire(blocking=False):
-            if not _others_import():
-                _held.append(compiles)
+        compiler = getattr(sys.modules.get("numba.core.compiler_lock"), "global_compiler_lock", None)
+        if (lock := getattr(compiler, "_lock", threading.RLock())).acquire(blocking=False):
+            _held.append(lock)
+            owners = {getattr(ref(), "owner", None) for ref in [*vars(importlib._bootstrap)["_module_locks"].values()]}
+            if owners <= {None, threading.get_ident()}:
                 return
-            compiles.release()
+            _release()
         time.sleep(0.01)
 
 
 def _release() -> None:
-    while _held:
+    if _held:
         _held.pop().release()
 
 
