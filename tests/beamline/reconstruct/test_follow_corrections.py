@@ -17,7 +17,6 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import pipeline
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
@@ -183,9 +182,9 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     live: list[Projections] = []
     again = ScanFollower.correct_again
 
-    def as_it_was(self: ScanFollower, usable: UsableViews, why: str) -> None:
+    def as_it_was(self: ScanFollower, *given: Any) -> None:
         live.append(self._joined())
-        again(self, usable, why)
+        again(self, *given)
 
     monkeypatch.setattr(ScanFollower, "correct_again", as_it_was)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
