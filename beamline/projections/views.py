@@ -27,6 +27,7 @@ from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import central_ray_taken, references_present, scan_ended, scan_findings
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -145,8 +146,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:
-        if finding.severity == "warning":
-            warn(finding.message)
+        if finding.severity == "warning" or finding.rule == SINOGRAM:
+            warn(finding.message if finding.severity == "warning" else Note(finding.message))
     return usable
 
 

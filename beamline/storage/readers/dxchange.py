@@ -29,6 +29,7 @@ from beamline.storage.readers.stacks import (
     Order,
     StacksSource,
     as_frames,
+    dimensions,
     dimensions_without_ones,
     order_of_axes,
 )
@@ -62,7 +63,8 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             for kind, where, item in items
             if item is not None
         ]
-        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
+        facts = {**_attributes(file), "dimensions": dimensions(usual)}
+        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=facts)
         source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
         if source.grows:
             source.rows = source.rows[:0]

@@ -76,6 +76,11 @@ def order_of_axes(axes: Sequence[str]) -> Order | None:
     return (*frames, None)[0], (*rows, None)[0], cols[0]
 
 
+def dimensions(order: Order) -> str:
+    """The names of an array's dimensions in their order, such as "frame,row,col"."""
+    return ",".join(("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order)
+
+
 USUAL = (0, 1, 2)
 SINOGRAM = (0, None, 1)
 """The order of one sinogram [view, col]."""
@@ -218,8 +223,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         order = order or _order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
         stacks = [FrameStack(kind, name, as_frames(item, order)) for kind, name, item in references]
         stacks.append(FrameStack(FrameKind.PROJECTION, where, as_frames(views, order)))
-        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
-        facts = {"data": where, "dimensions": ",".join(names)}
+        facts = {"data": where, "dimensions": dimensions(order)}
         stored = isinstance(file, h5py.File)
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
         config = datasets.resolve(views.parent.parent, "config") if stored and "pixel_size_h" in views.attrs else None
@@ -382,7 +386,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
             "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
         )
     order = order or ("col,view" if fits[0] else "view,col")
-    images = as_frames(_ImageStack(base), stated_order(order))
+    images = as_frames(_ImageStack(base), places := stated_order(order))
     if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
         raise DataError(
             f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
@@ -408,7 +412,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         in_order=True,
         ending=ScanEnding(),
         frame_bytes=base.frame_bytes * base.image_key.size,
-        attributes=lambda known: {**known, "dimensions": order},
+        attributes=lambda known: {**known, "dimensions": dimensions(places)},
     )
 
 

@@ -17,7 +17,7 @@ from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
 from beamline.storage.rules.pixels import darks_measured, numbers_wrapped, pixels_measured, quantity_stated
-from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, views_first
+from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, sinogram_said, views_first
 from drivers.base.frame import FrameKind
 
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
@@ -175,6 +175,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     views_scaled,
     axis_vertical,
     views_first,
+    sinogram_said,
     series_complete,
     scale_known,
     pixels_square,

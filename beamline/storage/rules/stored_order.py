@@ -132,6 +132,26 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
         )
 
 
+SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
+
+
+def sinogram_said(source: ScanSource) -> Iterator[Finding]:
+    """One array [view, col] has no rows: what is taken for its views, and how another order is said."""
+    axes = str(source.attributes.get("dimensions", "")).split(",")
+    if sorted(axes) == ["col", "frame"]:
+        n = int((source.image_key == FrameKind.PROJECTION).sum())
+        other = "col,view" if axes[1] == "col" else "view,col"
+        option = f"--order {other}"
+        if source.format == "data_exchange":
+            option = f"the attribute axes of /exchange/data ({other.replace(',', ':').replace('view', 'theta').replace('col', 'x')})"
+        yield Finding(
+            "info",
+            SINOGRAM,
+            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
+            f"Where these are exchanged, {option} says so.",
+        )
+
+
 def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
     """Share of the change of values [view, of each] that is a sine of the angles [view]."""
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])

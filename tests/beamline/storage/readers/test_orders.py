@@ -12,8 +12,12 @@ import tifffile
 import zarr
 
 from beamline.core.errors import DataError
+from beamline.core.sinks import Note
 from beamline.features.files.validate import describe, validate
+from beamline.projections.selection import Selection
+from beamline.projections.views import checked_views
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.stored_order import SINOGRAM
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")
@@ -63,6 +67,26 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
             np.testing.assert_array_equal(source.angles, ANGLES)
+
+
+@pytest.mark.parametrize(("turned", "other"), [(False, "--order col,view"), (True, "--order view,col")])
+def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) -> None:
+    rng = np.random.default_rng(0)
+    sinogram = rng.uniform(1, 2, (20, 9)).astype(np.float32)
+    np.save(tmp_path / "s.npy", sinogram.T if turned else sinogram)
+    with open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(20) * 0.1, quantity="line_integrals")) as source:
+        sentences = list[str]()
+        checked_views(source, Selection(), sentences.append)
+    (said,) = [each for each in sentences if "sinogram" in each]
+    assert isinstance(said, Note) and "20 views and 9 columns" in said and other in said
+
+
+def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"], file["exchange/theta"] = VIEWS[:, 0].T.astype(np.uint16), np.arange(5) * 30
+        file["exchange/data"].attrs["axes"] = "x:theta"
+    (said,) = [each.message for each in validate(tmp_path / "s.h5") if each.rule == SINOGRAM]
+    assert "5 views and 4 columns" in said and "(theta:x)" in said
 
 
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
