@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import open_array_file, zarr_root
+from beamline.storage.array_file import open_array_file, zarr_root
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import holds_arrays
+from beamline.storage.array_file import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
@@ -35,6 +35,7 @@ from beamline.storage.readers.replacements import (
 )
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks, with_order
+from beamline.storage.readers.tiff import FOREIGN, no_image
 from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
@@ -343,10 +344,12 @@ def _open(path: Path, opening: Opening) -> ScanSource:
                 return kind.open(path, opening)
         if holds_arrays(path):
             return open_arrays(path)
+    if path.suffix.lower() in FOREIGN:
+        raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip "
-            "of one or more images."
+            f"{path} is neither HDF5, TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a folder "
+            "or .zip of one or more images."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

@@ -21,8 +21,8 @@ from beamline.core.errors import DataError
 from beamline.core.files import text_in
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
+from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.datasets import require_real
-from beamline.storage.foreign_zarr import holds_arrays, open_array_file
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames

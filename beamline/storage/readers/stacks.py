@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
+from beamline.storage.array_file import ArrayFile, NamedArray, open_array_file
 from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.superblock import marked_as_being_written

@@ -140,10 +140,10 @@ def sinogram_said(source: ScanSource) -> Iterator[Finding]:
     axes = str(source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = int((source.image_key == FrameKind.PROJECTION).sum())
-        other = "col,view" if axes[1] == "col" else "view,col"
-        option = f"--order {other}"
+        first = axes[0] == "frame"
+        option = "--order col,view" if first else "--order view,col"
         if source.format == "data_exchange":
-            option = f"the attribute axes of /exchange/data ({other.replace(',', ':').replace('view', 'theta').replace('col', 'x')})"
+            option = f"the attribute axes of /exchange/data ({'x:theta' if first else 'theta:x'})"
         yield Finding(
             "info",
             SINOGRAM,

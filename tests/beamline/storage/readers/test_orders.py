@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from PIL import Image
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Note
@@ -60,9 +62,10 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
     np.save(tmp_path / "s.npy", sinogram)
     np.save(tmp_path / "one.npy", sinogram[None])
     tifffile.imwrite(tmp_path / "s.tif", sinogram)
+    Image.fromarray(sinogram.astype(np.uint16)).save(tmp_path / "s.png")
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"] = sinogram
-    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in ("s.npy", "one.npy", "s.tif")]
+    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in ("s.npy", "one.npy", "s.tif", "s.png")]
     for scan in (*scans, SourceOptions(tmp_path / "s.h5", data_path="d", angles=ANGLES)):
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
@@ -87,6 +90,25 @@ def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
         file["exchange/data"].attrs["axes"] = "x:theta"
     (said,) = [each.message for each in validate(tmp_path / "s.h5") if each.rule == SINOGRAM]
     assert "5 views and 4 columns" in said and "(theta:x)" in said
+
+
+@pytest.mark.parametrize("packed", [np.savez, np.savez_compressed])
+def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]) -> None:
+    """Without pickle; the only array of images needs no name."""
+    packed(tmp_path / "s.npz", projections=VIEWS, angles=ANGLES)
+    packed(tmp_path / "refs.npz", flat=VIEWS[:2] + 1, dark=VIEWS[0])
+    references = {f"{name}s": f"{tmp_path / 'refs.npz'}::{name}" for name in ("flat", "dark")}
+    for own in ({}, {"data_path": "projections"}):
+        scan = SourceOptions(tmp_path / "s.npz", angles_path="angles", angles_unit="rad", **own, **references)  # type: ignore[arg-type]
+        with open_scan(scan) as source:
+            assert source.image_key.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+            np.testing.assert_array_equal(source.read(slice(1, None)), np.concatenate([VIEWS[:2] + 1, VIEWS]))
+            np.testing.assert_allclose(source.angles[3:], ANGLES)
+    with pytest.raises(DataError, match=r"no dataset b.* It has /projections \(5 x 3 x 4\), /angles \(5\)"):
+        open_scan(SourceOptions(tmp_path / "s.npz", data_path="b"))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
+    with pytest.raises(DataError, match=r"cut.npz is damaged.*BadZipFile"):
+        open_scan(SourceOptions(tmp_path / "cut.npz", angles=ANGLES))
 
 
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
