@@ -22,17 +22,16 @@ from beamline.storage.readers.fields import (
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import (
+from beamline.storage.readers.orders import (
     SINOGRAM,
     USUAL,
-    FrameStack,
     Order,
-    StacksSource,
     as_frames,
     dimensions,
     dimensions_without_ones,
     order_of_axes,
 )
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"

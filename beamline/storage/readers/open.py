@@ -17,24 +17,17 @@ from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.readers.angle_files import Angles, angles_at, assign, load_angles, parse_angles, select_rows
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.replacements import (
-    Angles,
-    Images,
-    assign,
-    load_angles,
-    load_images,
-    overlaid,
-    parse_angles,
-    select_rows,
-)
+from beamline.storage.readers.orders import with_order
+from beamline.storage.readers.reference_files import Images, load_images, overlaid
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks, with_order
+from beamline.storage.readers.stacks import datasets_text, open_arrays, open_stacks
 from beamline.storage.readers.tiff import FOREIGN, no_image
 from beamline.storage.readers.transforms import (
     UNPACKED,
@@ -63,6 +56,7 @@ _PIXELS = 2**27  # of a frame whose rows are all looked at
 REGISTRY = (  # modules in this folder, asked in this order; the first one before those in folders, the others after
     "nxtomo",
     "dxchange",
+    "stacks",
 )
 _OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
 _MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
@@ -348,8 +342,8 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5, TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a folder "
-            "or .zip of one or more images."
+            f"{path} is neither HDF5, TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
+            "folder or .zip of one or more images."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

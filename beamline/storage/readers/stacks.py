@@ -19,94 +19,20 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import ArrayFile, NamedArray, open_array_file
-from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
-from beamline.storage.readers.frames import Frames, Read
+from beamline.storage.readers import cil
+from beamline.storage.readers.base import WHOLE, Attributes, Opening, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.orders import (
+    Order,
+    TurnedFrames,
+    as_frames,
+    dimensions,
+    dimensions_without_ones,
+    order_by_shapes,
+    order_of_axes,
+    stated_order,
+)
 from beamline.storage.superblock import marked_as_being_written
-from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
-
-Order = tuple[int | None, int | None, int | None]
-"""Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
-
-
-class TurnedFrames:
-    """An array of any dimensions, read as [frame, row, col]. Dimensions that are none of these have length one."""
-
-    def __init__(self, item: Any, order: Order) -> None:
-        self.item, self._order = item, order
-        self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(1 if axis is None else int(self.item.shape[axis]) for axis in self._order)
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes that are decompressed to read a frame."""
-        return bytes_unpacked(self.item, self._order[0])
-
-    def __len__(self) -> int:
-        return int(self.shape[0])
-
-    def __getitem__(self, wanted: tuple[slice, ...]) -> NDArray[Any]:
-        stored, parts = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
-        for axis, part in zip(self._order, parts, strict=True):
-            if axis is not None:
-                stored[axis] = part
-        values, axes = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
-        values = values.transpose([*axes, *({*range(values.ndim)} - {*axes})])
-        sizes = [1 if axis is None else values.shape[axes.index(axis)] for axis in self._order]
-        return values.reshape(sizes)[
-            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, parts, strict=True))
-        ]
-
-
-def order_of_axes(axes: Sequence[str]) -> Order | None:
-    """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
-
-    x, u or columns; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
-    """
-    names = [axis.strip().lower() for axis in axes]
-    cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith("col")]
-    rows = [i for i, name in enumerate(names) if name[:1] == "y" or (name.startswith(("v", "row")) and name != "view")]
-    frames = [i for i in range(len(names)) if i not in cols + rows]
-    if len(names) not in (2, 3) or len(cols) != 1 or len(rows) > 1 or len(frames) > 1:
-        return None
-    return (*frames, None)[0], (*rows, None)[0], cols[0]
-
-
-def dimensions(order: Order) -> str:
-    """The names of an array's dimensions in their order, such as "frame,row,col"."""
-    return ",".join(("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order)
-
-
-USUAL = (0, 1, 2)
-SINOGRAM = (0, None, 1)
-"""The order of one sinogram [view, col]."""
-
-
-def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
-    no column of pixels is, or the first of them."""
-    sizes = dict(enumerate(shape))
-    while len(sizes) > n and 1 in sizes.values():
-        last = max(sizes)
-        del sizes[last if sizes[last] == 1 else next(axis for axis, size in sizes.items() if size == 1)]
-    return sizes
-
-
-def as_frames(item: Any, order: Order = USUAL) -> Any:
-    """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
-    n = 3 - order.count(None)
-    if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
-        return item
-    places = [*dimensions_without_ones(item.shape, n)]
-    if len(places) == n - 1 and (frames := order[0]) is not None:
-        order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
-    elif len(places) != n:
-        return item
-    return TurnedFrames(item, tuple(axis if axis is None else places[axis] for axis in order))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -220,37 +146,14 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         shapes = [
             tuple(dimensions_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
         ]
-        order = order or _order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
+        order = order or order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
         stacks = [FrameStack(kind, name, as_frames(item, order)) for kind, name, item in references]
         stacks.append(FrameStack(FrameKind.PROJECTION, where, as_frames(views, order)))
         facts = {"data": where, "dimensions": dimensions(order)}
         stored = isinstance(file, h5py.File)
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
-        config = datasets.resolve(views.parent.parent, "config") if stored and "pixel_size_h" in views.attrs else None
-        if isinstance(config, h5py.Group):
-            _take_geometry(source, float(views.attrs["pixel_size_h"]), config)
+        cil.take_geometry(source, views)
         return source
-
-
-def _take_geometry(source: StacksSource, pixel_mm: float, config: h5py.Group) -> None:
-    """Take the pixel size, the distances of a cone and where its central ray falls as CIL writes them, taken as mm."""
-    source.pixel_size_mm = pixel_mm
-    places = [datasets.dataset(config, f"{name}/{what}") for name, what in _CIL]
-    if None not in places:
-        start, axis, end, across, up = (np.asarray(datasets.values_of(place), np.float64) for place in places)
-        normal = np.cross(across, up)
-        normal *= np.sign(normal @ (end - start))
-        source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
-        foot = start + source.cone[1] * normal - end  # from the middle of the detector
-        middle = (np.array(source.shape) - 1) / 2
-        source.central_ray = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
-
-
-_CIL = (
-    ("source", "position"),
-    ("rotation_axis", "position"),
-    *(("detector", of) for of in ("position", "direction_x", "direction_y")),
-)
 
 
 def open_arrays(path: Path) -> StacksSource:
@@ -268,75 +171,10 @@ def open_arrays(path: Path) -> StacksSource:
 def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
     """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
     where, colon, names = data.rpartition(":")
-    if not colon or datasets.dataset(file, data) is not None:
-        return dataset_at(file, data), data, None
-    return dataset_at(file, where), where, stated_order(names)
-
-
-def stated_order(names: str) -> Order:
-    """The order that a caller states, as in "row,view,col". DataError for another text."""
-    if (order := order_of_axes(names.split(","))) is None:
-        raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
-            "a sinogram."
-        )
-    return order
-
-
-def _order_by_shapes(
-    views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
-) -> Order:
-    """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
-
-    MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
-    views in the middle are sinograms, as ASTRA has them, with columns first.
-    """
-    if len(views) != 3:
-        lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
-        return SINOGRAM if lines else USUAL
-    images = [(*views[:axis], *views[axis + 1 :]) for axis in USUAL]
-    fitting = [
-        axis
-        for axis in USUAL
-        if all(images[axis] in (shape, (*shape[:axis], *shape[axis + 1 :])) for shape in references)
-    ]
-    frames = next((axis for axis in fitting if views[axis] == n_angles), fitting[0] if fitting else 0)
-    rows, cols = (axis for axis in USUAL if axis != frames)
-    return (frames, cols, rows) if matlab and frames != 1 else (frames, rows, cols)
-
-
-def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
-
-    Args:
-        where: "": the only list whose unit is one of angles, or the only array.
-        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
-
-    Raises:
-        DataError: it is not there, is no list, or nothing says its unit.
-    """
-    with closing(open_array_file(path)) as file, hdf5.readable(path):
-        if not where and isinstance(file, h5py.File):
-            where = _only_angles(file)
-        item = dataset_at(file, where)
-        if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
-        return datasets.radians(item, unit, default)
-
-
-def _only_angles(file: h5py.File) -> str:
-    """The path of the only list of a file whose unit is one of angles."""
-    names = [
-        str(item.name)
-        for item in _arrays_of(file)
-        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
-    ]
-    if len(names) != 1:
-        raise DataError(
-            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
-            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
-        )
-    return names[0]
+    if colon and datasets.dataset(file, data) is None:
+        return dataset_at(file, where), where, stated_order(names)
+    item = dataset_at(file, data)
+    return item, data, order_of_axes([datasets.text(item.attrs.get(f"dim{axis}", "")) for axis in range(item.ndim)])
 
 
 def dataset_at(file: Any, where: str) -> Any:
@@ -350,7 +188,7 @@ def dataset_at(file: Any, where: str) -> Any:
 
 def datasets_text(file: Any) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    arrays = sorted(_arrays_of(file), key=lambda item: (-item.ndim, -item.size))
+    arrays = sorted(arrays_of(file), key=lambda item: (-item.ndim, -item.size))
     shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
     more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."
@@ -359,7 +197,7 @@ def datasets_text(file: Any) -> str:
 _LISTED = 10  # datasets of a file that an error names
 
 
-def _arrays_of(file: Any) -> list[Any]:
+def arrays_of(file: Any) -> list[Any]:
     if isinstance(file, ArrayFile):
         return [*file.values()]
     arrays = list[h5py.Dataset]()
@@ -367,61 +205,11 @@ def _arrays_of(file: Any) -> list[Any]:
     return arrays
 
 
-def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
-    """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
-
-    Args:
-        order: None: the images are views, but for a single one that has as many rows, or columns, as there are angles:
-            it is a sinogram.
-
-    Raises:
-        DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
-    """
-    fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
-    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
-        return base
-    if order is None and len(fits) > 1:
-        raise DataError(
-            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
-        )
-    order = order or ("col,view" if fits[0] else "view,col")
-    images = as_frames(_ImageStack(base), places := stated_order(order))
-    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
-        raise DataError(
-            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
-            "flats with --darks and --flats."
-        )
-
-    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
-        indices = frame_indices(frames, len(images))
-        out = np.empty((indices.size, len(range(images.shape[1])[rows]), images.shape[2]), base.dtype)
-        datasets.read_frames(images, indices, rows, out)
-        return out
-
-    unknown = np.full(len(images), np.nan)
-    return Frames(
-        base,
-        pixels=pixels,
-        image_key=np.zeros(len(images), np.int32),
-        angles=unknown,
-        exposures=unknown,
-        shape=images.shape[1:],
-        numbers=None,
-        in_order=True,
-        ending=ScanEnding(),
-        frame_bytes=base.frame_bytes * base.image_key.size,
-        attributes=lambda known: {**known, "dimensions": dimensions(places)},
-    )
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not hdf5.is_hdf5(path, opening.follow):
+        return False
+    with closing(hdf5.open_hdf5(path, opening.follow)) as file:
+        return cil.is_scan(file)
 
 
-class _ImageStack:
-    """All images of a scan as an array [image, row, col]."""
-
-    def __init__(self, base: ScanSource) -> None:
-        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
-        self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
-
-    def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:
-        return self._read(part[0], part[1])[..., part[2]]
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, cil.DATA, None, None))

@@ -114,6 +114,6 @@ def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
     options = SourceOptions(tmp_path / "s.nxs", data_path=f"{entry}/data/data", angles_path=f"{entry}/config/angles")
     with open_scan(options) as source:
         np.testing.assert_allclose(source.read(slice(None)), values, atol=1 / scale)
-        np.testing.assert_allclose(np.degrees(source.angles), np.arange(9) * 40.0)
+        np.testing.assert_allclose(np.degrees(source.angles), np.arange(9) * -40.0)  # of the view, not of the object
         assert (source.cone, source.pixel_size_mm) == ((20, 40), 0.2)
         assert source.central_ray == pytest.approx((3.5 - 0.4 / 0.2, 5.5))

@@ -10,7 +10,7 @@ import pytest
 import zarr
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.replacements import load_angles
+from beamline.storage.readers.angle_files import load_angles
 
 DEGREES = np.array([0.0, 2.5, 90.25, 179.5])
 RADIANS = np.radians(DEGREES)

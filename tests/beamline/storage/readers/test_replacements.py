@@ -14,15 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
+from beamline.storage.readers.angle_files import assign, evenly_spaced_window, load_angles, parse_angles, select_rows
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import (
-    assign,
-    evenly_spaced_window,
-    load_angles,
-    load_images,
-    parse_angles,
-    select_rows,
-)
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.readers.stacks import StacksSource
 from drivers.base.frame import FrameKind
 

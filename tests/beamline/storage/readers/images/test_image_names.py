@@ -14,7 +14,7 @@ from PIL import Image
 from beamline.core.errors import DataError
 from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, N = (6, 8), 4

@@ -1,44 +1,24 @@
-"""Angles and references from outside the scan file: read, and laid on frames only where they fit.
-
-Darks and flats are an array, TIFFs, or an HDF5 file of their own, as httomo, i12 and Savu have.
-"""
+"""Angles from outside the scan file: read, and laid on frames only where they fit."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
-from beamline.storage.datasets import require_real
-from beamline.storage.readers.base import Quantity, ScanSource
-from beamline.storage.readers.dxchange import open_exchange
-from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.nexus import find
-from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.stacks import FrameStack, StacksSource, angles_at, as_frames, dataset_at
-from beamline.storage.readers.tiff import (
-    DECODERS,
-    UNREADABLE,
-    images_among,
-    is_untyped,
-    no_image,
-    open_tiff,
-    read_image,
-)
-from beamline.storage.readers.transforms import real_type, type_wrapped, unsigned
+from beamline.storage.readers import cil
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike
@@ -68,6 +48,40 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
         return parse_angles(text_in(path), str(path), where, unit)
     except OSError as error:
         raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
+
+
+def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
+
+    Args:
+        where: "": the only list whose unit is one of angles, or the only array.
+        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
+
+    Raises:
+        DataError: it is not there, is no list, or nothing says its unit.
+    """
+    with closing(open_array_file(path)) as file, hdf5.readable(path):
+        if not where and isinstance(file, h5py.File):
+            where = _only_angles(file)
+        item = dataset_at(file, where)
+        if item.ndim == 0 or item.size != max(item.shape):
+            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
+        return cil.turned(item, datasets.radians(item, unit, default), unit)
+
+
+def _only_angles(file: h5py.File) -> str:
+    """The path of the only list of a file whose unit is one of angles."""
+    names = [
+        str(item.name)
+        for item in arrays_of(file)
+        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
+    ]
+    if len(names) != 1:
+        raise DataError(
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
+            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
+        )
+    return names[0]
 
 
 def parse_angles(content: str, name: str, column: str = "", unit: str | None = None) -> NDArray[np.float64]:
@@ -241,170 +255,3 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
     if (np.abs(beside - medians[first]) < np.abs(medians[first]) / 2).any():
         return None
     return first, first + n - 1
-
-
-Images = Path | str | NDArray[Any]
-"""A TIFF, a folder of images, an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` where it has several), an array
-[frame, row, col], or a whole number, the counts of every pixel, unless a file has it as its name."""
-
-_EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
-_LISTED = 8  # datasets that an error names
-
-
-def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Read reference frames [frame, row, col] into memory.
-
-    In an HDF5 file they are the dataset that is named, or the frames of this kind by its image_key, or those of Data
-    Exchange, or the only images of this shape.
-
-    Args:
-        kind: DARK or FLAT.
-        shape: (rows, cols) of the scan's frames; None: any.
-
-    Raises:
-        DataError: they cannot be read, are no images, or several could be meant.
-    """
-    if not isinstance(images, Path | str):
-        return _stack(np.asarray(images), "The array of reference frames")
-    name, _, dataset = str(images).partition("::")
-    path = Path(name)
-    if name.isdecimal() and shape is not None and not path.exists():
-        return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
-    if holds_arrays(path):
-        with closing(open_array_file(path)) as arrays, hdf5.readable(path):
-            return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
-    if path.is_file() and hdf5.is_hdf5(path):
-        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-            return _in_rows(_of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape), shape)
-    if dataset:
-        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
-    return _in_rows(_of_images(path), shape)
-
-
-def _in_rows(images: NDArray[Any], shape: tuple[int, int] | None) -> NDArray[Any]:
-    """References of a detector of one row, [frame, col], as frames of one row."""
-    lines = shape is not None and len(images) == shape[0] == 1 < images.shape[1] and images.shape[2] == shape[1]
-    return images.swapaxes(0, 1) if lines else images
-
-
-def _of_images(path: Path) -> NDArray[Any]:
-    files = [path]
-    if path.is_dir():
-        names = [item.name for item in path.iterdir()]
-        files = [path / name for name in natural_sorted(images_among(names))]
-        if not files:
-            raise DataError(no_image(path, names))
-    try:
-        decoders = [DECODERS.get(file.suffix.lower(), read_image) for file in files]
-        if untyped := decoders[0] is read_image:
-            with open_tiff(files[0]) as tif:
-                untyped = is_untyped(tif)
-        parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
-        stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
-    except UNREADABLE as error:
-        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
-        raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
-    return _stack(stack, str(path), untyped)
-
-
-def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: tuple[int, int] | None) -> NDArray[Any]:
-    if dataset:
-        return _read(path, dataset_at(file, dataset))
-    for places in find(file):
-        keys = np.ravel(datasets.values_of(places.image_key))
-        if (keys == kind).any():
-            return _of_scan(open_nxtomo(path, own_angles=False, data=str(places.data.name)), kind)
-    exchange = datasets.dataset(file, _EXCHANGE[kind])
-    if exchange is not None and datasets.dataset(file, "exchange/data") is not None:
-        return _of_scan(open_exchange(path, own_angles=False), kind)
-    if exchange is not None:
-        return _read(path, exchange)
-    candidates = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
-    if len(candidates) == 1:
-        return _read(path, candidates[0])
-    listed = (candidates or [*_images(file)])[:_LISTED]
-    shapes = ", ".join(f"{item.name} ({' x '.join(map(str, item.shape))})" for item in listed)
-    wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
-    option = f"--{kind.name.lower()}s"
-    if candidates:
-        raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
-    raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
-
-
-def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
-    """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
-    with source:
-        return _stack(source.read(np.flatnonzero(source.image_key == kind)), str(source.path))
-
-
-def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Every dataset that may be images, once, also behind links."""
-    return (item for item in datasets.arrays_in(file, (2, 3, 4)) if min(item.shape[-2:]) > 1)
-
-
-def _read(path: Path, item: Any) -> NDArray[Any]:
-    if lost := datasets.missing_links(item):
-        raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
-    frames = as_frames(item)
-    if frames.ndim != 3:
-        raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
-    datasets.require_possible(frames)
-    out = np.empty(frames.shape, frames.dtype)
-    datasets.read_frames(frames, np.arange(len(frames)), slice(None), out)
-    return _stack(out, f"{item.name} in {path}")
-
-
-def _stack(images: NDArray[Any], name: str, untyped: bool = False) -> NDArray[Any]:
-    require_real(images.dtype, name)
-    if (dtype := real_type(images, False) if untyped else type_wrapped(images)) is not None:
-        images = unsigned(images, dtype)
-    return images[None] if images.ndim == 2 else images
-
-
-_REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
-
-
-def overlaid(
-    base: ScanSource,
-    *,
-    darks: NDArray[Any] | None = None,
-    flats: NDArray[Any] | None = None,
-    quantity: Quantity | None = None,
-) -> ScanSource:
-    """A scan with references in front: darks, flats, then the frames of `base`.
-
-    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
-    all parts of the scan. All frames have one dtype, as of one camera.
-
-    Args:
-        darks, flats: [frame, row, col].
-
-    Raises:
-        DataError: shapes or counts do not fit.
-    """
-    given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
-    for kind, images in given.items():
-        if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
-            raise DataError(
-                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
-                f"{base.shape} as in {base.path}."
-            )
-    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
-        quantity = quantity or "counts"
-    base = Frames(
-        base,
-        quantity=quantity or base.quantity,
-        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
-    )
-    if not given:
-        return base
-    stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
-    front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
-    n = front.image_key.size
-    return Frames(
-        front,
-        base,
-        in_order=base.in_order,
-        checksummed=base.checksummed,
-        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
-    )
