@@ -325,8 +325,8 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
     if packed:
         raise DataError(
             f"{item.name} in {item.file.filename} draws on {packed[0]}, whose attributes (scale_factor, ...) say that "
-            "its numbers are packed, and a virtual dataset passes them on as they are stored. Give it the same attributes "
-            "in a copy of the file, or store the values. Nothing was read."
+            "its numbers are packed, and a virtual dataset passes them on as they are stored. Give it the same "
+            "attributes in a copy of the file, or store the values. Nothing was read."
         )
     return sorted(lost)
 
