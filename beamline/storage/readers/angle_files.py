@@ -16,9 +16,8 @@ from beamline.core.files import text_in
 from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
-from beamline.storage.readers import cil
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text
+from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, turned
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike
@@ -66,7 +65,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
-        return cil.turned(item, datasets.radians(item, unit, default), unit)
+        return turned(item, datasets.radians(item, unit, default), unit)
 
 
 def _only_angles(file: h5py.File) -> str:
