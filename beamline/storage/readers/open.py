@@ -25,7 +25,7 @@ from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import with_order
-from beamline.storage.readers.reference_files import Images, load_images, overlaid
+from beamline.storage.readers.reference_files import Images, load_images, overlaid, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
 from beamline.storage.readers.stacks import datasets_text, open_arrays, open_stacks
 from beamline.storage.readers.tiff import FOREIGN, no_image
@@ -231,7 +231,9 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
         replaced: the caller states something else of its frames.
     """
     quantity = options.quantity
-    darks, flats = _references(base, options, None if side is None else side.white)
+    darks, flats = stated_references(
+        base, quantity, (options.darks, options.flats), None if side is None else side.white
+    )
     if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
         base, counts_photons = marked_source(base, no_data)
         darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
@@ -276,33 +278,6 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
             return open_nxtomo(path, own_angles=options.angles is None and options.angles_path is None, data=data)
     of_views = options.angles_path if options.angle_rows is None else None
     return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
-
-
-def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:
-    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
-
-    Args:
-        white: counts of the open beam by the maker's file.
-
-    Raises:
-        DataError: what is no transmission.
-    """
-    nothing = np.zeros((1, *base.shape), base.dtype)
-    if options.quantity != "transmission":
-        if white is None or base.dtype.kind not in "ui":
-            return options.darks, options.flats
-        flats = np.full_like(nothing, white) if options.flats is None else options.flats
-        return nothing if options.darks is None else options.darks, flats
-    if options.darks is not None or options.flats is not None:
-        raise DataError(
-            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
-        )
-    if base.dtype.kind != "f":
-        raise DataError(
-            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
-        )
-    return nothing, np.ones_like(nothing)
 
 
 def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | None:

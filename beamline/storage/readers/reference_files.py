@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.datasets import require_real
-from beamline.storage.readers.base import Quantity, ScanSource
+from beamline.storage.readers.base import Quantity, ScanSource, Stated
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
@@ -38,6 +38,38 @@ from drivers.base.frame import FrameKind
 Images = Path | str | NDArray[Any]
 """A TIFF, a folder of images, an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` where it has several), an array
 [frame, row, col], or a whole number, the counts of every pixel, unless a file has it as its name."""
+
+
+def stated_references(
+    base: ScanSource, quantity: Stated | None, given: tuple[Images | None, Images | None], white: float | None
+) -> tuple[Images | None, Images | None]:
+    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
+
+    Args:
+        given: by the caller.
+        white: counts of the open beam by the maker's file.
+
+    Raises:
+        DataError: what is no transmission.
+    """
+    darks, flats = given
+    nothing = np.zeros((1, *base.shape), base.dtype)
+    if quantity != "transmission":
+        if white is None or base.dtype.kind not in "ui":
+            return given
+        flats = np.full_like(nothing, white) if flats is None else flats
+        return nothing if darks is None else darks, flats
+    if darks is not None or flats is not None:
+        raise DataError(
+            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+        )
+    if base.dtype.kind != "f":
+        raise DataError(
+            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
+            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
+        )
+    return nothing, np.ones_like(nothing)
+
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
 _LISTED = 8  # datasets that an error names
