@@ -97,22 +97,22 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
         DataError: the memory does not hold them, or some are objects of Python.
         ValueError, OSError, ...: a damaged file.
     """
-    with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
-        if file.peek(1)[:1] == b"\x93":
-            require_npy(file)
-            return {"": np.load(path, mmap_mode=mapped, allow_pickle=False)}
-        with np.load(file, allow_pickle=False) as packed:
-            members = [each for each in packed.zip.infolist() if each.filename.endswith(".npy")]
-            require_room(path, sum(each.file_size for each in members))
-            try:
+    try:
+        with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
+            if file.peek(1)[:1] == b"\x93":
+                require_npy(file)
+                return {"": np.load(path, mmap_mode=mapped, allow_pickle=False)}
+            with np.load(file, allow_pickle=False) as packed:
+                members = [each for each in packed.zip.infolist() if each.filename.endswith(".npy")]
+                require_room(path, sum(each.file_size for each in members))
                 return {name: packed[name] for name in (each.filename.removesuffix(".npy") for each in members)}
-            except ValueError as error:
-                if "pickle" not in str(error):
-                    raise
-                raise DataError(
-                    f"{path} holds objects of Python among its arrays, which are pickles: these are never opened here, "
-                    "as one may run any program. Save the arrays alone (numpy.savez). Nothing was read."
-                ) from error
+    except ValueError as error:
+        if "bject" not in str(error):
+            raise
+        raise DataError(
+            f"{path} holds objects of Python among its arrays, which are pickles: these are never opened here, as one "
+            "may run any program. Save the arrays alone (numpy.save, numpy.savez). Nothing was read."
+        ) from error
 
 
 def require_room(path: Path, n: int) -> None:

@@ -196,6 +196,12 @@ def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
 def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
     key = source.image_key
     n = int((key == FrameKind.PROJECTION).sum())
+    if key.size == 1 < angles.size:
+        return (
+            f"{name} has {angles.size} angles, and {source.path} holds one image of {source.shape[0]} x "
+            f"{source.shape[1]} pixels. As a sinogram it has as many rows, or columns, as views: give so many angles, "
+            "or say with --angle-rows A:B which of these are theirs (from 0, B not included)."
+        )
     if angles.size < n:
         message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
     elif angles.size == key.size:

@@ -317,8 +317,8 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5, TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
-            "folder or .zip of one or more images."
+            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
+            f"folder or .zip of one or more images.{' Save a .mat with -v7.3.' * (path.suffix.lower() == '.mat')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

@@ -136,23 +136,25 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
 
     Args:
-        order: None: the images are views, but for a single one that has as many rows, or columns, as there are angles:
-            it is a sinogram.
+        order: None: the images are views, but for those of which one dimension counts as many as there are angles, and
+            another is one: they are a sinogram.
 
     Raises:
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
     """
-    fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
-    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
+    sizes = (base.image_key.size, *base.shape)
+    fits, unlike = [axis for axis, n in enumerate(sizes) if n == n_angles], base.image_key != FrameKind.PROJECTION
+    counted = base.numbers is not None and sizes[0] > 1  # images that are files of a series are views
+    if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or unlike.any() or counted):
         return base
     if order is None and len(fits) > 1:
         raise DataError(
             f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
             "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
         )
-    order = order or ("col,view" if fits[0] else "view,col")
+    order = order or ("col,view" if max(sizes[: fits[0]]) > 1 else "view,col")
     images = as_frames(_ImageStack(base), places := stated_order(order))
-    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
+    if not isinstance(images, TurnedFrames) or unlike.any():
         raise DataError(
             f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
             f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "

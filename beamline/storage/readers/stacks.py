@@ -153,6 +153,9 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
         facts = {"data": where, "dimensions": dimensions(order)}
         stored = isinstance(file, h5py.File)
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
+        lists = [item.name for item in arrays_of(file) if item.ndim == 1 and item.size == len(stacks[-1].frames)]
+        if lists and angles is None:
+            source.facts = {**facts, "angles": f"--angles-path {lists[0]} takes those of {', '.join(lists[:_LISTED])}"}
         _take_geometry(source, views)
         return source
 

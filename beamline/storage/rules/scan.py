@@ -65,12 +65,14 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
 
 def references_present(source: ScanSource) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    if source.quantity != "counts":
-        return
     path = Path(source.path).absolute()
     others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
     beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
     way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
+    if source.quantity != "counts":
+        if source.quantity == "unknown" and way:
+            yield Finding("error", "references", f"Darks and flats may be elsewhere.{way}")
+        return
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
         if not (source.image_key == kind).any():
             yield Finding(

@@ -66,6 +66,7 @@ def test_what_changes_nothing_leaves_the_type(tmp_path: Path, attributes: dict[s
     [
         ({"scale_factor": 0.0}, "scale_factor 0"),
         ({"scale_factor": "abc"}, "scale_factor 'abc'"),
+        ({"scale_factor": [2.0, 3.0]}, "scale_factor 2. 3."),
         ({"add_offset": NAN}, "add_offset nan"),
         ({"scale": 2.0, "offset": 1.0}, "scale 2. and offset 1."),
     ],

@@ -65,7 +65,9 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
     Image.fromarray(sinogram.astype(np.uint16)).save(tmp_path / "s.png")
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"] = sinogram
-    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in ("s.npy", "one.npy", "s.tif", "s.png")]
+    np.save(tmp_path / "columns.npy", VIEWS[:, 1].T[..., None])
+    names = ("s.npy", "one.npy", "s.tif", "s.png", "columns.npy")
+    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in names]
     for scan in (*scans, SourceOptions(tmp_path / "s.h5", data_path="d", angles=ANGLES)):
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
@@ -109,6 +111,29 @@ def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]
     (tmp_path / "cut.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
     with pytest.raises(DataError, match=r"cut.npz is damaged.*BadZipFile"):
         open_scan(SourceOptions(tmp_path / "cut.npz", angles=ANGLES))
+
+
+@pytest.mark.parametrize("name", ["s.npy", "s.npz"])
+def test_objects_of_python_are_refused_as_pickles(tmp_path: Path, name: str) -> None:
+    (np.save if name == "s.npy" else np.savez)(tmp_path / name, np.array([{}], object))
+    with pytest.raises(DataError, match=r"objects of Python among its arrays, which are pickles.*numpy.save"):
+        open_scan(SourceOptions(tmp_path / name, angles=ANGLES))
+
+
+def test_what_is_no_sinogram_of_so_many_angles_is_said(tmp_path: Path) -> None:
+    np.save(tmp_path / "s.npy", VIEWS[:, 1])
+    with pytest.raises(DataError, match=r"has 9 angles, and .* holds one image of 5 x 4 pixels. As a sinogram"):
+        open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(9.0)))
+
+
+def test_lists_of_a_file_that_may_be_its_angles_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "s.npz", projections=VIEWS, theta=ANGLES, x=np.arange(4))
+    (said,) = [
+        hit.message
+        for hit in validate(SourceOptions(tmp_path / "s.npz", data_path="projections"))
+        if hit.rule == "angles"
+    ]
+    assert "--angles-path /theta takes those of /theta" in said
 
 
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
@@ -160,6 +161,15 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(DataError, match=message):
             open_scan(tmp_path / name)
+
+
+@pytest.mark.parametrize("quantity", ["counts", None])
+def test_folders_of_references_beside_the_views_are_named(tmp_path: Path, quantity: str | None) -> None:
+    for name in ("Tomo", "Flat_Before", "Dark_After"):
+        _written(tmp_path / name, [f"IMAT_{name}_{i}.tif" for i in range(4)])
+    found = validate(SourceOptions(tmp_path / "Tomo", angles=np.arange(4.0), quantity=quantity))  # type: ignore[arg-type]
+    said = " ".join(each.message for each in found if each.rule == "references")
+    assert f"Beside it lie Dark_After, Flat_Before: {tmp_path} is read with all of them" in said
 
 
 def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
