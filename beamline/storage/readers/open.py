@@ -20,6 +20,8 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_files import Angles, angles_at, assign, load_angles, parse_angles, select_rows
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
+from beamline.storage.readers.dxchange import FORMAT as EXCHANGE
+from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
@@ -255,7 +257,8 @@ def _angle_table(
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
         origin = f"{options.angles_path} in {options.path}"
-        table = angles_at(Path(options.path), options.angles_path, options.angles_unit)
+        default = "degrees" if base.format == "data_exchange" else ""
+        table = angles_at(Path(options.path), options.angles_path, options.angles_unit, default)
     if table is None and side is not None and side.angles is not None:
         table, origin = side.angles, str(side.path)
     if table is None and base.angle_text is not None:
@@ -269,13 +272,19 @@ def _angle_table(
 
 
 def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
-    """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
-    if options.darks_path is None and options.flats_path is None and not holds_arrays(path):
+    """The detector of an NXtomo whose frames these are, the scan of Data Exchange, or a scan of these stacks."""
+    own_angles, alone = (
+        options.angles is None and options.angles_path is None,
+        not (options.darks_path or options.flats_path),
+    )
+    if alone and data.strip("/") == "exchange/data" and EXCHANGE.recognises(path, Opening()):
+        return open_exchange(path, own_angles=own_angles)
+    if alone and not holds_arrays(path):
         with hdf5.open_hdf5(path) as file:
             named = datasets.dataset(file, data)
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
-            return open_nxtomo(path, own_angles=options.angles is None and options.angles_path is None, data=data)
+            return open_nxtomo(path, own_angles=own_angles, data=data)
     of_views = options.angles_path if options.angle_rows is None else None
     return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
 
