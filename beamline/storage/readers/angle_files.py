@@ -158,27 +158,23 @@ def assign(
     Raises:
         DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
     """
-    key = source.image_key
-    projections = key == FrameKind.PROJECTION
-    n = int(projections.sum())
-    spread = np.full(key.size, np.nan)
-    if angles.size == n:
-        spread[projections] = angles
-        return spread
-    numbers = source.numbers
-    if numbers is not None and not of_views and _count_all(numbers, angles.size):
-        return np.asarray(angles[numbers - numbers.min()])
+    projections, numbers = source.image_key == FrameKind.PROJECTION, source.numbers
     series = None if numbers is None else numbers[projections]
-    all_frames = angles.size == key.size and not of_views
-    if all_frames and source.in_order:
-        return angles
-    if series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
+    spread, all_frames = np.full(projections.size, np.nan), angles.size == projections.size and not of_views
+    known = np.isfinite(angles)
+    if angles.size == projections.sum():
+        spread[projections] = angles
+    elif numbers is not None and not of_views and _count_all(numbers, angles.size):
+        spread = angles[numbers - numbers.min()]
+    elif all_frames and source.in_order:
+        spread = angles
+    elif series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
         spread[projections] = angles[series - series.min()]
-        return spread
-    if all_frames and int(np.isfinite(angles).sum()) == n:
-        spread[projections] = angles[np.isfinite(angles)]
-        return spread
-    raise DataError(_misfit(source, angles, name, series))
+    elif all_frames and known.sum() == projections.sum():
+        spread[projections] = angles[known]
+    else:
+        raise DataError(_misfit(source, angles, name, series))
+    return spread
 
 
 def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
@@ -224,20 +220,20 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     if angles.size < n:
         return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
+    sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
         order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
-        message += f". If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
-    else:
-        message += ". Say"
-    message += f" with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
-    window = evenly_spaced_window(angles, n)
-    if window is not None:
-        low, high = np.degrees(angles[list(window)])
-        message += (
-            f"; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, "
-            f"from {low:.4f} to {high:.4f} degrees"
-        )
-    return message + "."
+        sinograms = f"If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+    message += (
+        f". {sinograms or 'Say'} with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
+    )
+    if window is None:
+        return f"{message}."
+    low, high = np.degrees(angles[list(window)])
+    return (
+        f"{message}; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, from "
+        f"{low:.4f} to {high:.4f} degrees."
+    )
 
 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
