@@ -30,7 +30,7 @@ def write(path: Path, config: Vectors, values: NDArray[np.generic], labels: str,
         data.attrs.update(pixel_size_v=PITCH[1] if values.ndim == 3 else PITCH[0])
         data.attrs.update({f"dim{i}": label for i, label in enumerate(labels.split())})
         for name, vector in config.items():
-            file[f"entry1/tomo_entry/config/{name}"] = np.float32(vector)
+            file[f"entry1/tomo_entry/config/{name}"] = np.array(vector, np.float32)
         angles = file.create_dataset("entry1/tomo_entry/config/angles", data=ANGLES.astype(np.float32))
         angles.attrs.update(angle_unit="degree", initial_angle=INITIAL)
     return path

@@ -151,7 +151,7 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     for suffix, picture in (("jpg", np.zeros(SHAPE, np.uint8)), ("png", np.zeros((*SHAPE, 3), np.uint8))):
         (tmp_path / suffix).mkdir()
         Image.fromarray(picture).save(tmp_path / suffix / f"p_1.{suffix}")
-    np.savez(tmp_path / "s.npz", a=picture, settings={"mode": "cone"})
+    np.savez(tmp_path / "s.npz", a=picture, settings=np.array({"mode": "cone"}, object))
     (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")
     for name, message in {
         "jpg": r"pictures such as p_1.jpg .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
