@@ -29,7 +29,7 @@ from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import with_order
 from beamline.storage.readers.reference_files import Images, load_images, overlaid, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import datasets_text, open_arrays, open_stacks
+from beamline.storage.readers.stacks import datasets_text, open_stacks
 from beamline.storage.readers.tiff import FOREIGN, no_image
 from beamline.storage.readers.transforms import (
     UNPACKED,
@@ -321,7 +321,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
         if holds_arrays(path):
-            return open_arrays(path)
+            return open_stacks(path, None)
     if path.suffix.lower() in FOREIGN:
         raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):

@@ -126,13 +126,15 @@ class StacksSource(ScanSource):
         self._file.close()
 
 
-def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
+def open_stacks(
+    path: Path, data: str | None, darks: str | None = None, flats: str | None = None, angles: str | None = None
+) -> StacksSource:
     """The scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
     image [row, col].
 
     Args:
-        data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
-            flats are in the same order.
+        data: of the projections, None: the only array of images. Their dimensions may follow it, as in
+            `/images:view,col,row`, and those of darks and flats are in the same order.
         angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the views.
 
     Raises:
@@ -140,7 +142,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     """
     file = open_array_file(path)
     with hdf5.closed_on_error(file):
-        views, where, order = _named_order(file, data)
+        views, where, order = _named_order(file, _only_images(file) if data is None else data)
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
         references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
         n_angles = None if angles is None else dataset_at(file, angles).size
@@ -222,16 +224,15 @@ def _vector(config: h5py.Group, where: str, default: tuple[float, ...]) -> F64:
     return np.pad(values[:3], (0, 3 - min(values.size, 3)))
 
 
-def open_arrays(path: Path) -> StacksSource:
-    """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
-    with closing(ArrayFile(path)) as file:
-        images = [name for name, item in file.items() if item.ndim > 1]
-        if len(images) != 1:
-            raise DataError(
-                f"{path} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the scan: "
-                "--data-path, --angles-path, --darks-path, --flats-path."
-            )
-    return open_stacks(path, images[0], None, None)
+def _only_images(file: ArrayFile) -> str:
+    """The name of the one array that may be images. DataError: there are several, or none."""
+    images = [name for name, item in file.items() if item.ndim > 1]
+    if len(images) != 1:
+        raise DataError(
+            f"{file.filename} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the "
+            "scan: --data-path, --angles-path, --darks-path, --flats-path."
+        )
+    return images[0]
 
 
 def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
@@ -282,4 +283,4 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return isinstance(data, h5py.Dataset) and datasets.attribute(data, "data_type") == "AcquisitionData"
 
 
-FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL, None, None))
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL))
