@@ -327,7 +327,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
     if not hdf5.is_hdf5(path):
         raise DataError(
             f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
-            f"folder or .zip of one or more images.{' Save a .mat with -v7.3.' * (path.suffix.lower() == '.mat')}"
+            f"folder or .zip of one or more images.{_WAYS.get(path.suffix.lower(), '')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -343,6 +343,10 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
     )
+
+
+_VOLUME = " It may be a volume: `beamline view` shows those of NIfTI."
+_WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}
 
 
 def scan_format(path: Path) -> str | None:
