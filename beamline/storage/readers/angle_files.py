@@ -18,7 +18,6 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, turned
-from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike
 """A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
@@ -158,11 +157,11 @@ def assign(
     Raises:
         DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
     """
-    projections, numbers = source.image_key == FrameKind.PROJECTION, source.numbers
+    projections, numbers = source.table.views, source.table.numbers
     series = None if numbers is None else numbers[projections]
-    spread, all_frames = np.full(projections.size, np.nan), angles.size == projections.size and not of_views
+    spread, all_frames = np.full(len(source.table), np.nan), angles.size == len(source.table) and not of_views
     known = np.isfinite(angles)
-    if angles.size == projections.sum():
+    if angles.size == projections.size:
         spread[projections] = angles
     elif numbers is not None and not of_views and _count_all(numbers, angles.size):
         spread = angles[numbers - numbers.min()]
@@ -170,7 +169,7 @@ def assign(
         spread = angles
     elif series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
         spread[projections] = angles[series - series.min()]
-    elif all_frames and known.sum() == projections.sum():
+    elif all_frames and known.sum() == projections.size:
         spread[projections] = angles[known]
     else:
         raise DataError(_misfit(source, angles, name, series))
@@ -190,9 +189,8 @@ def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
 
 
 def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
-    key = source.image_key
-    n = int((key == FrameKind.PROJECTION).sum())
-    if key.size == 1 < angles.size:
+    n, frames = source.table.views.size, len(source.table)
+    if frames == 1 < angles.size:
         return (
             f"{name} has {angles.size} angles, and {source.path} holds one image of {source.shape[0]} x "
             f"{source.shape[1]} pixels. As a sinogram it has as many rows, or columns, as views: give so many angles, "
@@ -200,19 +198,19 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     if angles.size < n:
         message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
-    elif angles.size == key.size:
+    elif angles.size == frames:
         message = (
             f"{name} has {angles.size} angles, one for each frame, and {source.path} does not say when its darks and "
             f"flats were taken"
         )
     else:
-        message = f"{name} has {angles.size} angles, but there are {n} projections among {key.size} frames"
+        message = f"{name} has {angles.size} angles, but there are {n} projections among {frames} frames"
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
             f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
             f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
         )
-    elif series is not None and n < angles.size != key.size:
+    elif series is not None and n < angles.size != frames:
         lost = angles.size - n
         message += (
             f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets
 from beamline.storage.datasets import bytes_unpacked
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.writers.rows import ScanEnding
-from drivers.base.frame import FrameKind
 
 Order = tuple[int | None, int | None, int | None]
 """Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
@@ -142,10 +142,10 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     Raises:
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
     """
-    sizes = (base.image_key.size, *base.shape)
-    fits, unlike = [axis for axis, n in enumerate(sizes) if n == n_angles], base.image_key != FrameKind.PROJECTION
-    counted = base.numbers is not None and sizes[0] > 1  # images that are files of a series are views
-    if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or unlike.any() or counted):
+    sizes, alike = (len(base.table), *base.shape), base.table.are_views.all()
+    fits = [axis for axis, n in enumerate(sizes) if n == n_angles]
+    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are views
+    if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or not alike or counted):
         return base
     if order is None and len(fits) > 1:
         raise DataError(
@@ -154,9 +154,9 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         )
     order = order or ("col,view" if max(sizes[: fits[0]]) > 1 else "view,col")
     images = as_frames(_ImageStack(base), places := stated_order(order))
-    if not isinstance(images, TurnedFrames) or unlike.any():
+    if not isinstance(images, TurnedFrames) or not alike:
         raise DataError(
-            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
+            f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
             f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
             "flats with --darks and --flats."
         )
@@ -167,18 +167,14 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         datasets.read_frames(images, indices, rows, out)
         return out
 
-    unknown = np.full(len(images), np.nan)
     return Frames(
         base,
         pixels=pixels,
-        image_key=np.zeros(len(images), np.int32),
-        angles=unknown,
-        exposures=unknown,
+        table=lambda known: FrameTable.of(np.zeros(len(images))),
         shape=images.shape[1:],
-        numbers=None,
         in_order=True,
         ending=ScanEnding(),
-        frame_bytes=base.frame_bytes * base.image_key.size,
+        frame_bytes=base.frame_bytes * len(base.table),
         attributes=lambda known: {**known, "dimensions": dimensions(places)},
     )
 
@@ -187,7 +183,7 @@ class _ImageStack:
     """All images of a scan as an array [image, row, col]."""
 
     def __init__(self, base: ScanSource) -> None:
-        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
+        self.shape, self.dtype, self.ndim = (len(base.table), *base.shape), base.dtype, 3
         self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
 
     def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:

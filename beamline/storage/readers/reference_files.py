@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.datasets import require_real
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import Quantity, ScanSource, Stated
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
@@ -158,7 +160,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
 def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
     """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
     with source:
-        return _stack(source.read(np.flatnonzero(source.image_key == kind)), str(source.path))
+        return _stack(source.read(source.table.of_kind(kind)), str(source.path))
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
@@ -213,22 +215,20 @@ def overlaid(
                 f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
                 f"{base.shape} as in {base.path}."
             )
-    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
+    if base.quantity == "unknown" and base.table.has(*{*_REFERENCES} - {*given}):
         quantity = quantity or "counts"
     base = Frames(
         base,
         quantity=quantity or base.quantity,
-        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
+        table=lambda known: known.without(known.of_kind(*given)),
     )
     if not given:
         return base
     stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
     front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
-    n = front.image_key.size
-    return Frames(
-        front,
-        base,
-        in_order=base.in_order,
-        checksummed=base.checksummed,
-        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
-    )
+
+    def of_all_parts(table: FrameTable) -> FrameTable:
+        starts = np.where((table.part_starts > len(front.table)) & (flats is None), table.part_starts, 0)
+        return replace(table, part_starts=np.unique(starts))
+
+    return Frames(front, base, in_order=base.in_order, checksummed=base.checksummed, table=of_all_parts)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import ArrayFile, NamedArray, open_array_file
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, Attributes, Opening, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.orders import (
@@ -77,8 +78,7 @@ class StacksSource(ScanSource):
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
         self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
-        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.rows[:, 0]]
-        self.angles, self.exposures = np.full((2, len(self.rows)), np.nan)
+        self.table = FrameTable.of(np.array([stack.kind for stack in self._stacks])[self.rows[:, 0]])
 
     @property
     def finished(self) -> bool:
@@ -105,7 +105,7 @@ class StacksSource(ScanSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for number, stack in enumerate(self._stacks):
             wanted = np.flatnonzero(self.rows[indices, 0] == number)
@@ -186,8 +186,8 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
         axis = start + (axis - start) * source.cone[1] / source.cone[0]
     source.axis_col = float((middle + plane @ (axis - end) / pitch)[1])
     angles = datasets.dataset(config, "angles")
-    if angles is not None and angles.size == source.image_key.size:
-        source.angles = turned(angles, datasets.radians(angles), "")
+    if angles is not None and angles.size == len(source.table):
+        source.table = replace(source.table, angles=turned(angles, datasets.radians(angles), ""))
 
 
 def turned(item: Any, angles: F64, unit: str | None) -> F64:

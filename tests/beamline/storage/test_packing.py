@@ -93,8 +93,8 @@ def test_every_dataset_of_a_scan_is_packed_for_itself(tmp_path: Path) -> None:
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.dtype, source.quantity) == (np.float32, "counts")
         for kind, (array, scale) in zip((0, 1, 2), packed.values(), strict=True):
-            np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == kind)), scale * array)
-        np.testing.assert_allclose(np.degrees(source.angles[-5:]), [0, 36, 72, 108, 144])
+            np.testing.assert_array_equal(source.read(source.table.of_kind(kind)), scale * array)
+        np.testing.assert_allclose(np.degrees(source.table.angles[-5:]), [0, 36, 72, 108, 144])
 
 
 def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
@@ -117,7 +117,9 @@ def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
     options = SourceOptions(tmp_path / "s.nxs", data_path=f"{entry}/data/data", angles_path=f"{entry}/config/angles")
     with open_scan(options) as source:
         np.testing.assert_allclose(source.read(slice(None)), values, atol=1 / scale)
-        np.testing.assert_allclose(np.degrees(source.angles), np.arange(9) * -40.0)  # of the view, not of the object
+        np.testing.assert_allclose(
+            np.degrees(source.table.angles), np.arange(9) * -40.0
+        )  # of the view, not of the object
         assert (source.cone, source.pixel_size_mm) == ((20, 40), 0.2)
         assert source.central_ray == pytest.approx((3.5 - 0.4 / 0.2, 5.5))
 

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.angle_files import assign, evenly_spaced_window, load_angles, parse_angles, select_rows
 from beamline.storage.readers.stacks import StacksSource
 
@@ -111,8 +112,8 @@ class Frames(StacksSource):
     """Frames without pixels, with image keys and the numbers of their files."""
 
     def __init__(self, key: list[int], *, in_order: bool = True, numbers: list[int] | None = None) -> None:
-        self.path, self.image_key, self.in_order = Path("scan"), np.array(key, np.int32), in_order
-        self.numbers = None if numbers is None else np.array(numbers, np.int64)
+        self.path, self.in_order = Path("scan"), in_order
+        self.table = FrameTable.of(key, numbers=None if numbers is None else np.array(numbers, np.int64))
         self.facts, self.shape = {"missing_numbers": "some"}, (1, 1)
 
 

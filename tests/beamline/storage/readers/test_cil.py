@@ -77,7 +77,7 @@ def test_points_fall_on_the_pixels_of_cil(tmp_path: Path, case: str) -> None:
     path = write(tmp_path / "s.nxs", config, np.zeros((6, 4, 10), np.float32), "vertical angle horizontal", origin)
     with open_scan(path) as source:
         assert source.shape == SHAPE and source.axis_col is not None
-        angles, axis, cone, pixel = source.angles, source.axis_col, source.cone, source.pixel_size_mm
+        angles, axis, cone, pixel = source.table.angles, source.axis_col, source.cone, source.pixel_size_mm
         pitch = source.row_pitch_mm
     assert (pixel, pitch) == PITCH
     across = np.array(config["detector/direction_x"]) * (-1 if "right" in origin else 1)
@@ -104,5 +104,5 @@ def test_a_sinogram_of_cil_and_its_angles_by_name(tmp_path: Path) -> None:
     for scan in (SourceOptions(path), SourceOptions(path, **named)):  # type: ignore[arg-type]
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), values[:, None])
-            np.testing.assert_allclose(np.degrees(source.angles), -INITIAL - ANGLES, rtol=1e-6)
+            np.testing.assert_allclose(np.degrees(source.table.angles), -INITIAL - ANGLES, rtol=1e-6)
             assert source.axis_col == pytest.approx(4.5 + (0.5 - 0.3) / PITCH[0])

@@ -52,7 +52,7 @@ def test_a_dimension_of_one_is_none(tmp_path: Path, at: int) -> None:
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"], file["w"], file["k"] = np.expand_dims(VIEWS, at), VIEWS[:2, None], VIEWS[None, 0]
     with open_scan(SourceOptions(tmp_path / "s.h5", data_path="d", flats_path="w", darks_path="k")) as source:
-        assert source.image_key.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
         np.testing.assert_array_equal(source.read(slice(3, None)), VIEWS)
 
 
@@ -71,7 +71,7 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
     for scan in (*scans, SourceOptions(tmp_path / "s.h5", data_path="d", angles=ANGLES)):
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
-            np.testing.assert_array_equal(source.angles, ANGLES)
+            np.testing.assert_array_equal(source.table.angles, ANGLES)
 
 
 @pytest.mark.parametrize(("turned", "other"), [(False, "--order col,view"), (True, "--order view,col")])
@@ -103,9 +103,9 @@ def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]
     for own in ({}, {"data_path": "projections"}):
         scan = SourceOptions(tmp_path / "s.npz", angles_path="angles", angles_unit="rad", **own, **references)  # type: ignore[arg-type]
         with open_scan(scan) as source:
-            assert source.image_key.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+            assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
             np.testing.assert_array_equal(source.read(slice(1, None)), np.concatenate([VIEWS[:2] + 1, VIEWS]))
-            np.testing.assert_allclose(source.angles[3:], ANGLES)
+            np.testing.assert_allclose(source.table.angles[3:], ANGLES)
     with pytest.raises(DataError, match=r"no dataset b.* It has /projections \(5 x 3 x 4\), /angles \(5\)"):
         open_scan(SourceOptions(tmp_path / "s.npz", data_path="b"))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
@@ -146,7 +146,7 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
     apart = SourceOptions(tmp_path / "s.npy", angles=ANGLES, flats=tmp_path / "w.npy", darks=tmp_path / "k.npy")
     for scan in (apart, SourceOptions(tmp_path / "s.h5")):
         with open_scan(scan) as source:
-            assert source.image_key.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
+            assert source.table.kinds.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
             expected = np.concatenate([counts[:1, 2], counts[:3, 1], counts[:, 0]])[:, None]
             np.testing.assert_array_equal(source.read(slice(None)), expected)
 
@@ -193,7 +193,9 @@ def test_a_zarr_is_read_as_hdf5_is(tmp_path: Path) -> None:
     found = []
     for name in ("s.h5", "s.zarr"):
         with open_scan(tmp_path / name) as source:
-            found.append((source.format, source.quantity, source.image_key.tolist(), source.angles[2:].tolist()))
+            found.append(
+                (source.format, source.quantity, source.table.kinds.tolist(), source.table.angles[2:].tolist())
+            )
             np.testing.assert_array_equal(source.read(slice(2, None)), VIEWS)
     assert found[0] == found[1]
 

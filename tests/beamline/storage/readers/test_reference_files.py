@@ -69,7 +69,7 @@ def test_they_are_found_in_any_layout(tmp_path: Path, layout: str, suffix: str) 
     np.testing.assert_array_equal(load_images(path, FrameKind.DARK, SHAPE), IMAGES)
     tifffile.imwrite(tmp_path / "views.tif", OTHERS, photometric="minisblack")
     with open_scan(SourceOptions(tmp_path / "views.tif", darks=path, flats=IMAGES[:1])) as source:
-        assert source.image_key.tolist() == [2] * 4 + [1] + [0] * 4 and source.quantity == "counts"
+        assert source.table.kinds.tolist() == [2] * 4 + [1] + [0] * 4 and source.quantity == "counts"
         np.testing.assert_array_equal(source.read(range(4)), IMAGES)
 
 
