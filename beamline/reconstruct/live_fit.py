@@ -322,7 +322,7 @@ class ScanFollower:
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file leaves out the views of the shorter side."
             )
-        wide = np.flatnonzero(self.source.image_key == FrameKind.WIDE_VIEW)
+        wide = self.source.table.wide_views
         why = _OUTDATED if self._correction.outdated else _WIDE if wide.size else _SEVERAL_PARTS
         self.correct_again(usable, why, wide)
         return self._prepared(self.axis_col, usable)

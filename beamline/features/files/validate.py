@@ -27,6 +27,7 @@ from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held
@@ -245,7 +246,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
-            *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),
+            *(each.message for each in findings if each.severity != "info" or each.rule in (CONSTANT_DARKS, SINOGRAM)),
             *([altered_sentence(source)] if source.table.altered.any() else []),
             *(_fringes(brief) if facts["reconstructable"] else []),
         ],

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
-from beamline.storage.readers.replacements import overlaid
+from beamline.storage.readers.reference_files import overlaid
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO
