@@ -118,7 +118,8 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 
 def report_defects(projections: Projections, first_row: int, binning: int, warn: Warn) -> None:
-    """Report what measured nothing, by frames, rows and columns, and repaired pixels if more than one in a thousand.
+    """Report what measured nothing, by frames, rows and columns, spots left as they are, and repaired pixels if more
+    than one in a thousand.
 
     Args:
         first_row: of the detector, at which the (binned) rows begin.
@@ -135,6 +136,13 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
             f"of columns {cols} and rows {rows} measured nothing: zeros or values that are not finite at a border, as "
             "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
             "as a post or a clamp. These rays have no weight."
+        )
+    if projections.left:
+        warn(
+            Note(
+                f"{projections.left} pixels brighter than the open beam are of spots larger than 3 x 3 pixels, which are "
+                "not filled and make streaks: shield the detector against scattered and direct X-rays."
+            )
         )
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
