@@ -65,7 +65,7 @@ class OpenBeam:
         Args:
             read: detector rows that are read.
             rows: those of them that are wanted.
-            warn: takes a sentence on damaged frames, and on parts of the scan without flats.
+            warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
 
         Raises:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
@@ -75,7 +75,7 @@ class OpenBeam:
         alike = not (asked.by_current or views_differ(source))
         light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
         used = groups_taken(source) if asked.accepted else reference_groups(source)
-        references = read_references(source, used, read, selection)
+        references = read_references(source, used, read, selection, warn)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
         tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)

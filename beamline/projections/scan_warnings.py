@@ -138,12 +138,10 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
             "as a post or a clamp. These rays have no weight."
         )
     if projections.left:
-        warn(
-            Note(
-                f"{projections.left} pixels brighter than the open beam are of spots larger than 3 x 3 pixels, which are "
-                "not filled and make streaks: shield the detector against scattered and direct X-rays."
-            )
+        large = (
+            f"{projections.left} pixels brighter than the open beam are of spots of more than 3 x 3 pixels, which stay"
         )
+        warn(Note(f"{large} and make streaks: shield the detector against scattered and direct X-rays."))
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
         (

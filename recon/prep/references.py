@@ -17,6 +17,7 @@ from recon.base.declared_types import check_settings
 from recon.base.masks import Image
 from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.spots import without_spots
 
 Kept = TypeVar("Kept", F32, F64)
 
@@ -25,7 +26,7 @@ Kept = TypeVar("Kept", F32, F64)
 class References:
     """Darks and flats: the images without beam, and with beam but without a sample.
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean.
+    A stack of frames [frame, row, col], any real type, is replaced by its mean without bright spots of single frames.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks, as a stack.
@@ -42,9 +43,10 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dark", _mean(self.dark, "darks"))
+        light = float(np.ma.median(self.flats[0][1])) if self.flats and np.size(self.flats[0][1]) else 0.0
+        object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
         check_settings(self)
-        flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
+        flats = tuple((position, _mean(flat, f"flats at {position:g}", light)) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 
     def rows(self, rows: slice) -> References:
@@ -54,12 +56,14 @@ class References:
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
 
 
-def _mean(frames: Image, what: str) -> Image:
+def _mean(frames: Image, what: str, light: float) -> Image:
     """The mean of a stack, or an image as it is; NaN where all is masked."""
     if np.ndim(frames) != 3:
         return cast(Image, without_mask(frames))
     if not len(frames):
         raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
+    if not np.ma.is_masked(frames):
+        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), light)])
     return np.asarray(without_mask(np.mean(frames, axis=0, dtype=np.float64)), np.float32)
 
 

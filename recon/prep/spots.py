@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +19,7 @@ _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot that show how much the views differ there
 _SAMPLE = 600  # pixels, about, that show the noise of a view, and whether its light has changed
 _OPAQUE = DARK**0.5  # √light, below which matter shows nothing of a gap that opens in it
+_OF_REFERENCES = 8.0  # standard deviations, by which spots of darks and flats are brighter
 _MEDIAN = MEDIAN * 2**0.5  # of |x - y|, for normal variables of standard deviation 1
 
 
@@ -114,7 +115,35 @@ class SpotFilter:
         return views[:n]
 
 
-def spots(view: Image, before: Image | None, after: Image | None, threshold: float) -> tuple[Mask, int]:
+def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:
+    """Darks or flats [row, col] as they were taken, of each the number of pixels in spots: there it has the mean of the
+    frames beside it. A single frame stays as it is.
+
+    Args:
+        light: counts of the open beam.
+    """
+    before: NDArray[Any] | None = None
+    left = iter(frames)
+    here = next(left, None)
+    while here is not None:
+        after = next(left, None)
+        roots = [None if each is None else _root_of(each, light) for each in (before, after)]
+        n, beside = 0, [each for each in (before, after) if each is not None]
+        if beside:
+            found, _ = spots(_root_of(here, light), *roots, _OF_REFERENCES, still=True)
+            if n := np.count_nonzero(found):
+                here = np.where(found, np.mean(beside, axis=0), here)
+        yield here, n
+        before, here = here, after
+
+
+def _root_of(counts: NDArray[Any], light: float) -> Image:
+    return np.sqrt(np.maximum(counts, 0) / max(light, 1e-30), dtype=np.float32)
+
+
+def spots(
+    view: Image, before: Image | None, after: Image | None, threshold: float, *, still: bool = False
+) -> tuple[Mask, int]:
     """bool [row, col], pixels that a stray photon lit: brighter than the neighbouring views, and than what is around;
     and how many belong to spots that are too large.
 
@@ -130,6 +159,7 @@ def spots(view: Image, before: Image | None, after: Image | None, threshold: flo
         threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three: that
             between the pixels of this view, that between both neighbours around the pixel (the sample turns), and 1 %
             of the light. A normal variable exceeds 8 of them once in 10¹⁵ pixels.
+        still: there is no sample that moves, nor gaps in it.
     """
     found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
     first, *others = beside or [np.zeros_like(view)] * 2
@@ -139,7 +169,7 @@ def spots(view: Image, before: Image | None, after: Image | None, threshold: flo
     if change > 1 + _LEAST:
         first, second = first * np.float32(change), second * np.float32(change)
         against = second if others else view
-    beam = 1.0 if beside else np.inf
+    beam = 1.0 if beside and not still else np.inf
     return found, _mark(view, first, second, against, limit, beam, threshold / _MEDIAN, found)
 
 
@@ -170,8 +200,8 @@ def _mark(  # type: ignore[no-untyped-def]
     view, before, after, against, limit, beam, errors, found
 ):
     """Mark the spots of `spots`, and count the pixels of larger ones: `against` is compared with the view before around
-    them; `beam`: √light of the open beam, inf without neighbours; `errors`: the threshold over the median difference of
-    two normal variables."""
+    them; `beam`: √light of the open beam, inf where no sample has gaps; `errors`: the threshold over the median
+    difference of two normal variables."""
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
     left, brightest = 0, beam

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recon.base.arrays import F32
-from recon.prep.spots import SpotFilter, Transmission
+from recon.prep.references import References
+from recon.prep.spots import SpotFilter, Transmission, without_spots
 
 VIEWS, ROWS, COLS, LIGHT = 12, 24, 60, 4e4
 
@@ -121,3 +122,29 @@ def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
     taken = Transmission(views[passes], passes, np.zeros(90, int), np.ones(90, np.float32))
     found = SpotFilter(8.0, root).feed(taken, order=np.argsort(passes))
     np.testing.assert_array_equal(found.data[np.argsort(passes)], filtered(views).data)
+
+
+@pytest.mark.parametrize(("level", "light"), [(4e4, 4e4), (100.0, 4e4)])
+@pytest.mark.parametrize("frames", [2, 5])
+def test_spots_of_flats_and_darks_are_not_in_their_mean(frames: int, level: float, light: float) -> None:
+    rng = np.random.default_rng(6)
+    pattern = rng.normal(level, level / 20, (20, 30))
+    pattern[4, 5] *= 2  # a hot pixel
+    clean = rng.poisson(pattern, (frames, 20, 30)).astype(np.uint16)
+    assert sum(n for _, n in without_spots(clean, light)) == 0
+    spotted = clean.copy()
+    spotted[0, 3:5, 7:9] += 20000
+    spotted[-1, 15, 0] += 20000
+    images, found = zip(*without_spots(spotted, light), strict=True)
+    assert found == (4, *[0] * (frames - 2), 1)
+    assert np.abs(np.mean(images, axis=0) - clean.mean(axis=0)).max() < 6 * np.sqrt(1.2 * level / frames)
+    flat = np.full((20, 30), light, np.float32)
+    made = References(spotted, ((0.0, flat),)).dark
+    np.testing.assert_allclose(made, np.mean(images, axis=0), rtol=1e-6)
+
+
+def test_a_single_frame_stays_as_it_is() -> None:
+    frame = np.full((9, 9), 100.0)
+    frame[4, 4] = 60000
+    ((image, n),) = without_spots([frame], 4e4)
+    assert n == 0 and image is frame
