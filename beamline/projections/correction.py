@@ -82,6 +82,7 @@ class ScanCorrection:
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
+        self._fed = np.zeros(0, np.int64)
 
     @property
     def _n_views(self) -> int:
@@ -188,6 +189,7 @@ class ScanCorrection:
         asked = frames
         data, frames = self._read(frames, None)
         self._tell_unlit(asked, frames)
+        self._fed = np.append(self._fed, frames)
         if self._stream is None:
             self._stream = self._correction(None)
         if not frames.size and not (last and self._stream is not None and self._stream.spots.waiting):
@@ -226,9 +228,12 @@ class ScanCorrection:
 
     @property
     def outdated(self) -> bool:
-        """Whether views already fed would now be corrected differently: by references that came later, or other air
-        columns.
+        """Whether views already fed would now be corrected differently: by references that came later, other air
+        columns, or neighbours in angle that were not taken beside them.
         """
+        finds_spots = np.isfinite(self._selection.step(Preparation).zinger_threshold)
+        if finds_spots and (np.diff(self._by_angle(self._fed)) != 1).any():
+            return True
         if self._beam is None or self._stream is None:
             return False
         more = count_references(self._source) != self._beam.n_references

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
+from beamline.monitor.evidence import lit_places
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
@@ -198,12 +199,13 @@ def photons_of(
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons per pixel in the open beam, the median of the flats."""
+    """Photons per pixel in the open beam, the median of the flats where the beam is, see `lit_places`."""
     return _counts_of_light(references) / photons.gain
 
 
 def _counts_of_light(references: References) -> float:
-    return float(np.median(references.flats[0][1] - references.dark))
+    light = references.flats[0][1] - references.dark
+    return float(np.median(light[lit] if (lit := lit_places(light)).any() else light))
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:

@@ -43,7 +43,8 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        light = float(np.ma.median(self.flats[0][1])) if self.flats and np.size(self.flats[0][1]) else 0.0
+        some = np.ma.filled(self.flats[0][1], 0) if self.flats else np.zeros(0)
+        light = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
         object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
         check_settings(self)
         flats = tuple((position, _mean(flat, f"flats at {position:g}", light)) for position, flat in self.flats)
@@ -111,6 +112,7 @@ _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and st
 SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
 _WHOLE = 0.9  # of the pixels of a row: noise lights some
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
+_BRIGHT = 90.0  # percentile of a flat that is in the beam
 
 
 def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0) -> Mask:
@@ -129,7 +131,7 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
             f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
         )
     # Behind a slit, flat and view are both noise, and their ratio has no meaning.
-    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
+    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], _BRIGHT) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
     def outliers(image: Image, least: float) -> Mask:

@@ -17,7 +17,7 @@ from recon.prep.unmeasured import DARK, NO_RUNS
 _LEAST = 0.005  # least noise of √light, of that of the open beam: 1 % of its light, as grain of screen and optics
 _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot that show how much the views differ there
-_SAMPLE = 600  # pixels, about, that show the noise of a view, and whether its light has changed
+_SAMPLE, _FEWEST = 600, 30  # pixels, about, that show the noise of a view, and whether its light has changed
 _OPAQUE = DARK**0.5  # √light, below which matter shows nothing of a gap that opens in it
 _OF_REFERENCES = 8.0  # standard deviations, by which spots of darks and flats are brighter
 _MEDIAN = MEDIAN * 2**0.5  # of |x - y|, for normal variables of standard deviation 1
@@ -175,8 +175,8 @@ def spots(
 
 @njit(nogil=True, cache=True)
 def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
-    """Medians over some pixels: of the difference to the next one, and of the light over that of the brighter neighbour
-    where this is lit (0 where none is, or their sum is no larger)."""
+    """Medians over some lit pixels: of the difference to the next one, and of the light over that of the brighter
+    neighbour (0 where none is lit, or the sum is no larger)."""
     rows, cols = view.shape
     step = max(1, rows * cols // _SAMPLE)
     differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
@@ -184,7 +184,7 @@ def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
     more = 0.0
     for at in range(0, rows * cols, step):
         r, c = at // cols, at % cols
-        if c + 1 < cols:
+        if c + 1 < cols and view[r, c] > _OPAQUE:
             differences[n] = abs(view[r, c + 1] - view[r, c])
             n += 1
         usual = max(before[r, c], after[r, c])
@@ -192,7 +192,8 @@ def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
             ratios[lit] = view[r, c] / usual
             more += view[r, c] - usual
             lit += 1
-    return np.median(differences[:n]) if n else 0.0, np.median(ratios[:lit]) if more > 0 else 0.0
+    noise = np.median(differences[:n]) if n > _FEWEST else 0.0
+    return noise, np.median(ratios[:lit]) if more > 0 else 0.0
 
 
 @njit(nogil=True, cache=True)

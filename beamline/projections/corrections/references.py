@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Note, Warn
 from beamline.core.text import count, spans
+from beamline.monitor.evidence import BRIGHT
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import Selection
@@ -51,7 +52,7 @@ class _Reading:
     @classmethod
     def of(cls, source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> _Reading:
         binning, flat = selection.binning, read_binned(source, groups.flats[0][:1], rows, selection.binning)
-        light = float(np.median(np.nan_to_num(flat)))
+        light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
         return cls(source, rows, binning, not selection.step(Preparation).uses_flags, light)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
