@@ -96,7 +96,7 @@ def _axis_by_views(
         frames = frames[poses.stated(frames)]
     views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
+    geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
@@ -163,11 +163,11 @@ def locate_axis(
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
-    frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
+    frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     hidden = band.masked.all(axis=0)  # columns behind slits, which were filled: their noise has a long lever
     lit = np.flatnonzero(~hidden | hidden.all())
-    angles = source.angles[band.view_ids]
+    angles = source.table.angles[band.view_ids]
     try:
         estimate = find_axis(np.ascontiguousarray(band.data[..., lit[0] : lit[-1] + 1]), angles)
         estimate = replace(estimate, value=estimate.value + lit[0], candidates=estimate.candidates + lit[0])

@@ -68,7 +68,7 @@ class ScanCorrection:
         if self._filters.filters:
             selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
         self._source, self._selection, self._warn = source, selection, warn
-        if source.altered:
+        if source.table.altered.any():
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
@@ -87,7 +87,7 @@ class ScanCorrection:
     @property
     def _n_views(self) -> int:
         """Number of views that the scan has, whichever were asked for."""
-        return int((self._source.image_key == FrameKind.PROJECTION).sum())
+        return int((self._source.table.image_key == FrameKind.PROJECTION).sum())
 
     @property
     def photons(self) -> Photons | None:
@@ -217,7 +217,7 @@ class ScanCorrection:
         if self._beam is None:
             return np.zeros((0, 0, 0), np.float32)
         flats = self._beam.used.flats[-1][:most]
-        exposures = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
+        exposures = float(np.median(self._source.table.exposures[flats])) / usual_exposure(self._source)
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
@@ -333,12 +333,12 @@ class ScanCorrection:
         elif views.size >= SHADOW_VIEWS:
             given = read_binned(self._source, some, read, self.binning)
             lines = LineIntegralCorrection(np.inf).transmission(given, some.astype(np.float64), some).data
-            foreign = foreign_rows(np.exp(-lines), self._source.angles[some])
+            foreign = foreign_rows(np.exp(-lines), self._source.table.angles[some])
             self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
     def _by_angle(self, frames: NDArray[np.int64]) -> NDArray[np.intp]:
         """The order of frames in which neighbours are beside each other: as taken, unless that skips angles."""
-        angles = self._source.angles[frames]
+        angles = self._source.table.angles[frames]
         steps = np.diff(np.unwrap(angles))
         in_time = (steps >= 0).all() or (steps <= 0).all()
         return np.arange(frames.size) if in_time else np.argsort(angles, kind="stable")

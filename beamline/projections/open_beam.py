@@ -24,7 +24,6 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
@@ -136,13 +135,13 @@ class OpenBeam:
             data = np.nan_to_num(read_binned(source, views, read, binning))
             light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
             in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-            foreign[rows] |= foreign_rows(light, source.angles[views])
+            foreign[rows] |= foreign_rows(light, source.table.angles[views])
         return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
 def count_references(source: ScanSource) -> int:
     """Numbers of darks and flats in the file so far."""
-    return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
+    return source.table.darks.size + source.table.flats.size
 
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side

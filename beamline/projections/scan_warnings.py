@@ -19,7 +19,6 @@ from beamline.projections.selection import Selection, pixel_size
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.light import without_air
-from drivers.base.frame import FrameKind
 from recon.base.masks import areas
 from recon.prep.correct import Projections
 from recon.voxels.direct import has_direct_method
@@ -71,7 +70,7 @@ def warn_of_the_field(source: ScanSource, selection: Selection, prepared: Prepar
         if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
             light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.ordinary.all() or bool((source.image_key == FrameKind.WIDE_VIEW).any())
+        wide = not geometry.ordinary.all() or bool(source.table.wide_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(source, selection)):
             warn(change)

@@ -28,7 +28,6 @@ from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import central_ray_taken, references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
-from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
 
@@ -41,14 +40,14 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not fit the scan.
     """
-    frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    frames = source.table.placed_views
     poses = poses_of(source, selection, frames)
     if poses is not None:
         frames = frames[poses.stated(frames)]
     frames = frames[choose_views(source, frames, selection)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, selection, axis_col, source.angles[frames])
+    geometry = geometry_of(source, selection, axis_col, source.table.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
     return selection.step(Width).rays(source, selection, geometry)[0]
@@ -103,8 +102,8 @@ class ViewGeometry:
 
     def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views without calibration."""
-        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
-        if (aside := self.source.aside_mm) is not None:
+        geometry = geometry_of(self.source, part, self.stated_axis, self.source.table.angles[view_ids])
+        if (aside := self.source.table.aside) is not None:
             geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)

@@ -38,7 +38,6 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
-from drivers.base.frame import FrameKind
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.in_time import LastRound
@@ -162,7 +161,7 @@ class ScanFollower:
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._cursor.taken]
-        parts = np.searchsorted(self.source.part_starts, new, "right") - 1
+        parts = np.searchsorted(self.source.table.part_starts, new, "right") - 1
         if new.size and parts[0] != self._cursor.part:
             self._begin_part(int(parts[0]))
         batch = new[parts == parts[:1]][:BATCH_VIEWS]
@@ -245,7 +244,7 @@ class ScanFollower:
         frames = fed[kept]
         gone = fed.size - frames.size
         shaded = self._correction.finds_shadow(frames)
-        if not (gone or shaded or self._correction.outdated or self.source.part_starts.size > 1):
+        if not (gone or shaded or self._correction.outdated or self.source.table.part_starts.size > 1):
             return
         if shaded:
             why = _SHADED
@@ -317,7 +316,7 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if wide := int((self.source.image_key == FrameKind.WIDE_VIEW).sum()):
+        if wide := self.source.table.wide_views.size:
             self._warn(
                 f"{count(wide, 'wide view')} of this scan are not used: this volume grew with the scan, from ordinary "
                 f"views. `beamline recon {self.source.path}` uses them, which gives densities near the axis."
@@ -371,7 +370,9 @@ class ScanFollower:
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
-                    done[step.name] = step.apply(prepared, self.source.angles[projections.view_ids], lambda n, of: None)
+                    done[step.name] = step.apply(
+                        prepared, self.source.table.angles[projections.view_ids], lambda n, of: None
+                    )
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue

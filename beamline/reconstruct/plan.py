@@ -248,7 +248,7 @@ def prepare_within(
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
-    seconds = source.times
+    seconds = source.table.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
@@ -326,7 +326,7 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
     be unpacked in the memory."""
     if not (source.finished or options.unfinished):
         raise DataError(
-            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
+            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {len(source.table)} "
             "frames recorded so far. Nothing was written."
         )
     if source.unpack_bytes > (allowed := memory_of(options)):

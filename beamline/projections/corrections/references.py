@@ -111,7 +111,7 @@ def read_references(
         mean = reading.mean(group, scale)
         if dark is not None and mean is not None:
             used = np.setdiff1d(group, spoilt_frames(source, reading.use_damaged))
-            own, light = _dark_of(float(np.median(source.exposures[used])), darks), scale[used].mean()
+            own, light = _dark_of(float(np.median(source.table.exposures[used])), darks), scale[used].mean()
             net = (1 - light) * dark if own is dark or own is None else dark - light * own
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
@@ -123,7 +123,7 @@ def read_references(
         n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
         told = f"{count(n, 'pixel')} of darks and flats (frames {frames}) were bright spots of single frames (zingers)"
         warn(Note(f"{told}: filled from the frames beside them."))
-    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.table.part_starts.tolist()))
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
@@ -151,7 +151,7 @@ def with_dynamic_flats(
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame, image in reading.images(frames):
-            dark = references.dark if len(darks) < 2 else _dark_of(float(source.exposures[frame]), darks)
+            dark = references.dark if len(darks) < 2 else _dark_of(float(source.table.exposures[frame]), darks)
             yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
@@ -167,17 +167,14 @@ def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.floa
     `by_current` also from its own ring current.
     """
 
-    scale = _to_median(exposures_of(source), source.image_key)
+    scale = _to_median(exposures_of(source), source.table.views)
     return scale * current_scale(source) if by_current else scale
 
 
-def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:
+def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
     """The median of the projections over each frame's own; 1 where one is unknown."""
-    views = values[image_key == FrameKind.PROJECTION]
-    views = views[np.isfinite(views)]
-    if views.size == 0:
-        return np.ones(values.size)
-    return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+    known = values[views][np.isfinite(values[views])]
+    return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
@@ -186,19 +183,23 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
     Raises:
         ConfigError: the file has none for some view or flat.
     """
-    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
-    currents = source.currents
+    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    currents = source.table.currents
     if currents is None or not np.isfinite(currents[used]).all():
         lacking = "no ring current" if currents is None else "no ring current for some views or flats"
         raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
-    return _to_median(currents, source.image_key)
+    return _to_median(currents, source.table.views)
 
 
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
     change."""
-    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
-    if source.quantity != "counts" or selection.step(Preparation).by_current or (known := source.currents) is None:
+    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    if (
+        source.quantity != "counts"
+        or selection.step(Preparation).by_current
+        or (known := source.table.currents) is None
+    ):
         return ""
     currents = known[used]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
@@ -214,10 +215,10 @@ def flats_sentence(source: ScanSource, references: References, by_current: bool)
 
     sentences = []
     if views_differ(source):
-        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        views = source.table.exposures[source.table.views]
         sentences.append(f"Exposures of the views: {views.min():g} to {views.max():g} s; corrected.")
     if by_current:
-        currents = 1 / current_scale(source)[source.image_key == FrameKind.PROJECTION]
+        currents = 1 / current_scale(source)[source.table.views]
         sentences.append(
             f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
         )
@@ -233,10 +234,10 @@ def flats_sentence(source: ScanSource, references: References, by_current: bool)
 
 def warn_of_parts_without_flats(source: ScanSource, references: References, warn: Warn) -> None:
     """A warning for each part of the scan whose views are corrected by the flats of another part."""
-    starts = source.part_starts
+    starts = source.table.part_starts
     flats = [position for position, _ in references.flats]
-    for start, end in zip(starts, [*starts[1:], source.image_key.size], strict=True):
-        has_views = (source.image_key[start:end] == FrameKind.PROJECTION).any()
+    for start, end in zip(starts, [*starts[1:], len(source.table)], strict=True):
+        has_views = source.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
             warn(
                 f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. The "

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from beamline.core.text import printable
 from beamline.storage import datasets
 from beamline.storage.readers.base import NotUsed, ScanSource
-from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 """Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
@@ -52,7 +51,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
     Numbers that would be used, were their unit known, are among them.
     """
-    views = int((source.image_key == FrameKind.PROJECTION).sum())
+    frames, views = len(source.table), source.table.views
     unused = list[NotUsed]()
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
@@ -64,8 +63,8 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         value, why, doubt = np.asarray(datasets.values_of(item)), field.use, True
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
-        elif value.size not in (1, source.image_key.size, views):
-            why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
+        elif value.size not in (1, frames, views.size):
+            why = f"it has {value.size} values, and the scan {frames} frames"
         else:
             why = _unit_problem(field, value, item, source) or _varying(field, item, source)
         if why:
@@ -89,7 +88,7 @@ def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> str:
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:
         return ""
-    lengths = lengths[source.image_key == FrameKind.PROJECTION] if lengths.size == source.image_key.size else lengths
+    lengths = lengths[source.table.views] if lengths.size == len(source.table) else lengths
     typical = np.median(lengths)
     whole = typical if "pixel_size" in field.where else np.inf if source.cone is None else source.cone[1]
     moved = float(np.max(np.abs(lengths - typical)) / whole * max(source.shape) / 2)  # px at the edge of the field
@@ -120,9 +119,9 @@ def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
 def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
     factor = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
-    if value.dtype.kind not in "uif" or value.size != source.image_key.size:
+    if value.dtype.kind not in "uif" or value.size != len(source.table):
         return False
-    places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)
+    places = value.reshape(-1)[source.table.views].astype(np.float64)
     span = float(np.ptp(places)) if places.size and np.isfinite(places).all() else 0.0
     if factor is None or source.pixel_size_mm is None:
         return span > 0

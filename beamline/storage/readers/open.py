@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -210,7 +210,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     )
     if angles is not None:
         angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
-        base = Frames(base, angles=assign(base, angles, angles_from, of_views=options.angle_rows is not None))
+        assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
+        base = Frames(base, table=lambda known: replace(known, angles=assigned))
     if views is not None:
         base = selected(base, views)
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
@@ -326,7 +327,7 @@ def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | No
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
-        rows = np.flatnonzero(source.image_key == kind)
+        rows = source.table.of_kind(kind)
         if rows.size:
             some = spread(rows, _LOOKED_AT)
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)

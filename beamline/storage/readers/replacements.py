@@ -9,6 +9,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.foreign_zarr import holds_arrays, open_array_file
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
@@ -145,24 +147,22 @@ def assign(
     Raises:
         DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
     """
-    key = source.image_key
-    projections = key == FrameKind.PROJECTION
-    n = int(projections.sum())
-    spread = np.full(key.size, np.nan)
-    if angles.size == n:
+    n, projections = len(source.table), source.table.views
+    spread = np.full(n, np.nan)
+    if angles.size == projections.size:
         spread[projections] = angles
         return spread
-    numbers = source.numbers
+    numbers = source.table.numbers
     if numbers is not None and not of_views and _count_all(numbers, angles.size):
         return np.asarray(angles[numbers - numbers.min()])
     series = None if numbers is None else numbers[projections]
-    all_frames = angles.size == key.size and not of_views
+    all_frames = angles.size == n and not of_views
     if all_frames and source.in_order:
         return angles
     if series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
         spread[projections] = angles[series - series.min()]
         return spread
-    if all_frames and int(np.isfinite(angles).sum()) == n:
+    if all_frames and int(np.isfinite(angles).sum()) == projections.size:
         spread[projections] = angles[np.isfinite(angles)]
         return spread
     raise DataError(_misfit(source, angles, name, series))
@@ -181,23 +181,22 @@ def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
 
 
 def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
-    key = source.image_key
-    n = int((key == FrameKind.PROJECTION).sum())
+    n, frames = source.table.views.size, len(source.table)
     if angles.size < n:
         message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
-    elif angles.size == key.size:
+    elif angles.size == frames:
         message = (
             f"{name} has {angles.size} angles, one for each frame, and {source.path} does not say when its darks and "
             f"flats were taken"
         )
     else:
-        message = f"{name} has {angles.size} angles, but there are {n} projections among {key.size} frames"
+        message = f"{name} has {angles.size} angles, but there are {n} projections among {frames} frames"
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
             f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
             f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
         )
-    elif series is not None and n < angles.size != key.size:
+    elif series is not None and n < angles.size != frames:
         lost = angles.size - n
         message += (
             f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
@@ -334,7 +333,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
 def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
     """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
     with source:
-        return _stack(source.read(np.flatnonzero(source.image_key == kind)), str(source.path))
+        return _stack(source.read(source.table.of_kind(kind)), str(source.path))
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
@@ -389,22 +388,20 @@ def overlaid(
                 f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
                 f"{base.shape} as in {base.path}."
             )
-    if base.quantity == "unknown" and {*_REFERENCES} <= {*base.image_key.tolist(), *given}:
+    if base.quantity == "unknown" and base.table.has(*{*_REFERENCES} - {*given}):
         quantity = quantity or "counts"
     base = Frames(
         base,
         quantity=quantity or base.quantity,
-        image_key=lambda keys: np.where(np.isin(keys, [*given]), FrameKind.INVALID, keys).astype(np.int32),
+        table=lambda known: known.without(known.of_kind(*given)),
     )
     if not given:
         return base
     stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
     front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
-    n = front.image_key.size
-    return Frames(
-        front,
-        base,
-        in_order=base.in_order,
-        checksummed=base.checksummed,
-        part_starts=lambda starts: np.unique(np.where((starts > n) & (flats is None), starts, 0)),
-    )
+
+    def of_all_parts(table: FrameTable) -> FrameTable:
+        starts = np.where((table.part_starts > len(front.table)) & (flats is None), table.part_starts, 0)
+        return replace(table, part_starts=np.unique(starts))
+
+    return Frames(front, base, in_order=base.in_order, checksummed=base.checksummed, table=of_all_parts)

@@ -20,6 +20,7 @@ from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import bytes_unpacked
 from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from beamline.storage.superblock import marked_as_being_written
@@ -145,8 +146,7 @@ class StacksSource(ScanSource):
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
         self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
-        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.rows[:, 0]]
-        self.angles, self.exposures = np.full((2, len(self.rows)), np.nan)
+        self.table = FrameTable.of(np.array([stack.kind for stack in self._stacks])[self.rows[:, 0]])
 
     @property
     def finished(self) -> bool:
@@ -173,7 +173,7 @@ class StacksSource(ScanSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for number, stack in enumerate(self._stacks):
             wanted = np.flatnonzero(self.rows[indices, 0] == number)
@@ -374,7 +374,7 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
     """
     fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
-    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
+    if order is None and (len(base.table) != 1 or n_angles == 1 or not fits):
         return base
     if order is None and len(fits) > 1:
         raise DataError(
@@ -383,9 +383,9 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         )
     order = order or ("col,view" if fits[0] else "view,col")
     images = as_frames(_ImageStack(base), stated_order(order))
-    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
+    if not isinstance(images, TurnedFrames) or base.table.views.size < len(base.table):
         raise DataError(
-            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
+            f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
             f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
             "flats with --darks and --flats."
         )
@@ -396,18 +396,14 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         datasets.read_frames(images, indices, rows, out)
         return out
 
-    unknown = np.full(len(images), np.nan)
     return Frames(
         base,
         pixels=pixels,
-        image_key=np.zeros(len(images), np.int32),
-        angles=unknown,
-        exposures=unknown,
+        table=lambda known: FrameTable.of(np.zeros(len(images))),
         shape=images.shape[1:],
-        numbers=None,
         in_order=True,
         ending=ScanEnding(),
-        frame_bytes=base.frame_bytes * base.image_key.size,
+        frame_bytes=base.frame_bytes * len(base.table),
         attributes=lambda known: {**known, "dimensions": order},
     )
 
@@ -416,7 +412,7 @@ class _ImageStack:
     """All images of a scan as an array [image, row, col]."""
 
     def __init__(self, base: ScanSource) -> None:
-        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
+        self.shape, self.dtype, self.ndim = (len(base.table), *base.shape), base.dtype, 3
         self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
 
     def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanSource, TakesTooLongError, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
@@ -26,7 +26,7 @@ def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
-        n = frame_indices(frames, int(base.image_key.size)).size * len(range(base.shape[0])[rows])
+        n = frame_indices(frames, len(base.table)).size * len(range(base.shape[0])[rows])
         if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
             raise TakesTooLongError(
                 "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
@@ -48,11 +48,12 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
     if not 0 <= first < end <= base.shape[1]:
         raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
 
-    def moved(flags: FrameFlags | None) -> FrameFlags | None:
-        if flags is None:
-            return None
+    def moved(table: FrameTable) -> FrameTable:
+        if (flags := table.flags) is None:
+            return table
         there = flags.regions[..., :1] >= 0  # below 0: no region
-        return replace(flags, regions=flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32))
+        regions = flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32)
+        return replace(table, flags=replace(flags, regions=regions))
 
     return Frames(
         base,
@@ -61,7 +62,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         shape=(base.shape[0], end - first),
         axis_col=None if base.axis_col is None else base.axis_col - first,
         central_ray=None if base.central_ray is None else (base.central_ray[0], base.central_ray[1] - first),
-        flags=moved,
+        table=moved,
     )
 
 
@@ -73,7 +74,7 @@ def turned(base: ScanSource) -> ScanSource:
     Raises:
         DataError: a scan with flags, which has a vertical axis.
     """
-    if base.flags is not None:
+    if base.table.flags is not None:
         raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
     sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
     return Frames(
@@ -86,7 +87,7 @@ def turned(base: ScanSource) -> ScanSource:
         else (base.shape[1] - 1 - base.central_ray[1], base.central_ray[0]),
         pixel_size_mm=sizes[0],
         row_pitch_mm=sizes[1],
-        shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],
+        table=lambda known: known if known.shifts is None else replace(known, shifts=known.shifts[:, ::-1] * [1, -1]),
     )
 
 
@@ -103,14 +104,14 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
-    keys = _stated_keys(",".join(named), int(base.image_key.size)) if named else base.image_key.copy()
+    keys = _stated_keys(",".join(named), len(base.table)) if named else base.table.kinds.copy()
     for word in words:
         if word.startswith(_ENERGY):
             own["energy_kev"], others = _of_one_energy(base, word)
             keys[others] = FrameKind.INVALID
     if base.quantity == "unknown" and base.dtype.kind in "ui" and {*keys.tolist()} >= {1, 2}:
         own["quantity"] = "counts"
-    return Frames(base, image_key=keys, **own)
+    return Frames(base, table=lambda known: replace(known, kinds=keys), **own)
 
 
 def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
@@ -132,15 +133,15 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     Raises:
         DataError: no view is left.
     """
-    keys, n = base.image_key.copy(), int((base.image_key == FrameKind.PROJECTION).sum())
+    table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
     if first >= end:
         raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
     for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
-        rows = np.flatnonzero(keys == kind)
+        rows = table.of_kind(kind)
         in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
-        keys[np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn)] = FrameKind.INVALID
-    return Frames(base, image_key=keys)
+        out.append(np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn))
+    return Frames(base, table=lambda known: known.without(np.concatenate(out)))
 
 
 def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
@@ -160,7 +161,7 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
         kev = float(word.removeprefix(_ENERGY))
     except ValueError:
         raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
-    known = source.energies
+    known = source.table.energies
     if known is None:
         raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
     others = np.abs(known - kev) > _SAME_ENERGY * kev
@@ -366,5 +367,7 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
                 f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
             )
     in_order = all(source.in_order for source in (*earlier, last))
-    own: dict[str, Any] = {} if path is None else {"path": path, "part_starts": np.zeros(1, np.int64)}
-    return Frames(*earlier, last, in_order=in_order, **own)
+    if path is None:
+        return Frames(*earlier, last, in_order=in_order)
+    one = np.zeros(1, np.int64)
+    return Frames(*earlier, last, in_order=in_order, path=path, table=lambda known: replace(known, part_starts=one))

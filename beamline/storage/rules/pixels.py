@@ -154,7 +154,7 @@ def _rises(source: ScanSource) -> bool:
 
 def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
     """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
-    rows = np.flatnonzero(source.image_key == kind)
+    rows = source.table.of_kind(kind)
     if rows.size == 0:
         return None
     rows = spread(rows, count)

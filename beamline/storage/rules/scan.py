@@ -6,6 +6,8 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
 from beamline.plan.passes import ended_by
@@ -30,11 +32,11 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 
 def scan_ended(source: ScanSource) -> Iterator[Finding]:
     """The writer closed the file, and the scan ended as planned; else a remedy, or who ended it."""
-    ending, n = source.ending, count(source.image_key.size, "frame")
+    ending, n = source.ending, count(len(source.table), "frame")
     if not source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
-        planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
+        planned, taken = source.plan.get("angles_deg", ()), source.table.views.size
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
         of_plan += "; it had decided against the others" if ended_by(source.decisions) else ""
         sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
@@ -47,7 +49,7 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
 
 def altered_sentence(source: ScanSource) -> str:
     """Sentences on the rows of a scan whose record differs from its checksum."""
-    rows = sorted(source.altered)
+    rows = np.flatnonzero(source.table.altered).tolist()
     return (
         f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "
         f"checksum written with it: {spans(rows)}. Nothing uses {'it' if len(rows) == 1 else 'them'}. Look for a good "
@@ -57,7 +59,7 @@ def altered_sentence(source: ScanSource) -> str:
 
 def enough_views(source: ScanSource) -> Iterator[Finding]:
     """A reconstruction needs at least two projections."""
-    n = int((source.image_key == FrameKind.PROJECTION).sum())
+    n = source.table.views.size
     if n < 2:
         yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
 
@@ -71,7 +73,7 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
     beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
     way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
-        if not (source.image_key == kind).any():
+        if not source.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
@@ -145,7 +147,7 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """The file is not a single part of a resumed scan."""
-    if source.part_starts.size > 1:
+    if source.table.part_starts.size > 1:
         return
     if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):
         joined, n = joined_file

@@ -134,9 +134,9 @@ def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(fla
 @pytest.mark.parametrize("unknown", ["flats", "views"])
 def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     source = exposed([0.1])
-    source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
-    source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
-    source.exposures[source.image_key == 2] = np.nan
+    source.table.exposures[source.table.kinds == (1 if unknown == "flats" else 0)] = np.nan
+    source.table.exposures[source.table.kinds == (0 if unknown == "flats" else 1)] = 7.0
+    source.table.exposures[source.table.kinds == 2] = np.nan
     prepared, told = prepare(source, GIVEN)
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
     assert told == []

@@ -68,11 +68,13 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     looks, told = list[int](), list[str]()
     warn = Warnings(lambda event: told.append(event.data["message"]), SystemClock())
     correction: Any = None
-    source: Any = SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8)), axis_col=None, cone=None)
+    source: Any = SimpleNamespace(
+        table=SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8))), axis_col=None, cone=None
+    )
 
     def locate(source: Any, correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         looks.append(frames.size)
-        sure = source.angles[frames[-1]] > np.radians(175)
+        sure = source.table.angles[frames[-1]] > np.radians(175)
         return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)

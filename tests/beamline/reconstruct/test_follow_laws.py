@@ -306,7 +306,8 @@ def test_a_law_waits_for_views_of_its_pass_that_may_show_the_axis(
     """The end of a pass is read after the number of frames: the file may have grown in between."""
     scan = follow(changes={"selection": Selection()})
     monkeypatch.setattr(scan.follower, "_cursor", Cursor(frames=13))
-    scan.follower.source.pass_ends = np.array([14])
+    source = scan.follower.source
+    source.table = replace(source.table, pass_ends=np.array([14]))
     scan.follower.measure_law()
     assert not scan.of("error_law")
 

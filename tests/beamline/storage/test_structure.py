@@ -71,7 +71,7 @@ def test_links_to_nothing_to_folders_to_itself_and_in_circles_do_no_harm(path: P
         file["entry/soft"] = h5py.SoftLink("/entry/soft")
         file["entry/circle"] = file["entry"]
     with open_scan(path) as source:
-        assert source.image_key.size == len(frames)
+        assert len(source.table) == len(frames)
 
 
 def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(path: Path) -> None:

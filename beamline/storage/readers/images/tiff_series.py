@@ -16,6 +16,7 @@ import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,6 +30,7 @@ from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
 from beamline.storage.foreign_zarr import zarr_root
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.packing import packing
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
@@ -82,9 +84,8 @@ class TiffSeriesSource(ScanSource):
             if not among:
                 raise DataError(no_image(path, names))
             images = in_order(path, among, one_series=one_series or listed is not None)
-            self.names, self.image_key, self.angles = images.names, images.kinds, images.angles
-            self.in_order, self.numbers = len(images.series) == len(images.names), images.numbers
-            self.exposures = np.full(len(self.names), np.nan)
+            self.names, self.in_order = images.names, len(images.series) == len(images.names)
+            self.table = FrameTable.of(images.kinds, images.angles, numbers=images.numbers)
             references, series = images.references, images.series
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
@@ -100,7 +101,7 @@ class TiffSeriesSource(ScanSource):
         if images.half_turn:
             self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
-        if np.isfinite(self.angles).any() and len(self._texts) != 1:
+        if np.isfinite(self.table.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
         if images.doubt:
             self.facts |= {"angles": images.doubt}
@@ -111,7 +112,7 @@ class TiffSeriesSource(ScanSource):
         return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):
             name = self.names[number]
@@ -276,7 +277,7 @@ def _open_scene(folder: Path) -> ScanSource:
         )
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
-    source.angles = np.array([angles[name] for name in source.names])
+    source.table = replace(source.table, angles=np.array([angles[name] for name in source.names]))
     source.cone = beams[mode]
     size, n = np.broadcast_to(scanner.get("sDetector", 0), 2), np.broadcast_to(scanner["nDetector"], 2)
     height, width = map(float, np.broadcast_to(scanner.get("dDetector", size / n), 2))

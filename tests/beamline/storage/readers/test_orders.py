@@ -46,7 +46,7 @@ def test_a_dimension_of_one_is_none(tmp_path: Path, at: int) -> None:
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"], file["w"], file["k"] = np.expand_dims(VIEWS, at), VIEWS[:2, None], VIEWS[None, 0]
     with open_scan(SourceOptions(tmp_path / "s.h5", data_path="d", flats_path="w", darks_path="k")) as source:
-        assert source.image_key.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
         np.testing.assert_array_equal(source.read(slice(3, None)), VIEWS)
 
 
@@ -62,7 +62,7 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
     for scan in (*scans, SourceOptions(tmp_path / "s.h5", data_path="d", angles=ANGLES)):
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
-            np.testing.assert_array_equal(source.angles, ANGLES)
+            np.testing.assert_array_equal(source.table.angles, ANGLES)
 
 
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
     apart = SourceOptions(tmp_path / "s.npy", angles=ANGLES, flats=tmp_path / "w.npy", darks=tmp_path / "k.npy")
     for scan in (apart, SourceOptions(tmp_path / "s.h5")):
         with open_scan(scan) as source:
-            assert source.image_key.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
+            assert source.table.kinds.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
             expected = np.concatenate([counts[:1, 2], counts[:3, 1], counts[:, 0]])[:, None]
             np.testing.assert_array_equal(source.read(slice(None)), expected)
 
@@ -122,7 +122,9 @@ def test_a_zarr_is_read_as_hdf5_is(tmp_path: Path) -> None:
     found = []
     for name in ("s.h5", "s.zarr"):
         with open_scan(tmp_path / name) as source:
-            found.append((source.format, source.quantity, source.image_key.tolist(), source.angles[2:].tolist()))
+            found.append(
+                (source.format, source.quantity, source.table.kinds.tolist(), source.table.angles[2:].tolist())
+            )
             np.testing.assert_array_equal(source.read(slice(2, None)), VIEWS)
     assert found[0] == found[1]
 

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.replacements import (
     assign,
@@ -51,8 +52,8 @@ class Frames(StacksSource):
     """Frames without pixels, with image keys and the numbers of their files."""
 
     def __init__(self, key: list[int], *, in_order: bool = True, numbers: list[int] | None = None) -> None:
-        self.path, self.image_key, self.in_order = Path("scan"), np.array(key, np.int32), in_order
-        self.numbers = None if numbers is None else np.array(numbers, np.int64)
+        self.path, self.in_order = Path("scan"), in_order
+        self.table = FrameTable.of(key, numbers=None if numbers is None else np.array(numbers, np.int64))
         self.facts, self.shape = {"missing_numbers": "some"}, (1, 1)
 
 
@@ -206,7 +207,7 @@ def test_they_are_found_in_any_layout(tmp_path: Path, layout: str, suffix: str) 
     np.testing.assert_array_equal(load_images(path, FrameKind.DARK, SHAPE), IMAGES)
     tifffile.imwrite(tmp_path / "views.tif", OTHERS, photometric="minisblack")
     with open_scan(SourceOptions(tmp_path / "views.tif", darks=path, flats=IMAGES[:1])) as source:
-        assert source.image_key.tolist() == [2] * 4 + [1] + [0] * 4 and source.quantity == "counts"
+        assert source.table.kinds.tolist() == [2] * 4 + [1] + [0] * 4 and source.quantity == "counts"
         np.testing.assert_array_equal(source.read(range(4)), IMAGES)
 
 

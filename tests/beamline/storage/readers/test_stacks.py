@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import axis_vertical
 
-PATHS = {
+PATHS: dict[str, Any] = {
     "data_path": "/raw/images",
     "darks_path": "/raw/before/dark",
     "flats_path": "/raw/before/flat",
@@ -46,19 +46,19 @@ def test_a_unit_that_is_given_goes_before_the_file(path: Path, unit: str) -> Non
     for where, values in (("/motors/omega", np.linspace(0, np.pi, 5)), ("/motors/plain", np.linspace(0, 180, 5))):
         with open_scan(SourceOptions(path, **{**PATHS, "angles_path": where}, angles_unit=unit)) as source:
             expected = values if unit == "rad" else np.radians(values)
-            np.testing.assert_allclose(source.angles[5:], expected)
+            np.testing.assert_allclose(source.table.angles[5:], expected)
 
 
 def test_a_reference_may_be_a_single_image(path: Path, images: np.ndarray) -> None:
     with open_scan(SourceOptions(path, **{**PATHS, "darks_path": "/raw/before/one"})) as source:
-        assert source.image_key.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
         np.testing.assert_array_equal(source.read([0])[0], images[0])
 
 
 def test_what_is_not_named_is_not_there(path: Path, images: np.ndarray) -> None:
     with open_scan(SourceOptions(path, data_path="raw/images")) as source:
-        assert (source.quantity, source.image_key.tolist()) == ("unknown", [0] * 5)
-        assert np.isnan(source.angles).all()
+        assert (source.quantity, source.table.kinds.tolist()) == ("unknown", [0] * 5)
+        assert np.isnan(source.table.angles).all()
         np.testing.assert_array_equal(source.read(slice(None)), images[5:])
 
 
@@ -69,7 +69,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
     for where in ("/motors/omega", "/motors/text"):
         with open_scan(SourceOptions(path, angles_path=where)) as source:
             assert source.format == "data_exchange"
-            np.testing.assert_allclose(source.angles, np.linspace(0, np.pi, 5))
+            np.testing.assert_allclose(source.table.angles, np.linspace(0, np.pi, 5))
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def _stored(path: Path, images: np.ndarray, order: tuple[int, ...], matlab: bool
 
 
 def _options(path: Path, dimensions: str = "") -> SourceOptions:
-    names = {"darks_path": "dark", "flats_path": "flat", "angles_path": "omega", "angles_unit": "deg"}
+    names: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "omega", "angles_unit": "deg"}
     return SourceOptions(path, data_path=f"/images{dimensions}", **names)
 
 
@@ -171,7 +171,7 @@ def test_the_advice_for_exchanged_rows_and_columns_gives_no_mirror_image(tmp_pat
             group[name] = part.transpose(0, 2, 1)
         group["theta"] = angles
         group["theta"].attrs["units"] = "deg"
-    given = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
+    given: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
     with open_scan(SourceOptions(tmp_path / "s.h5", **(given if store == "stacks" else {}))) as source:
         (finding,) = axis_vertical(source)
     options = dict(re.findall(r"--(\w+)-path ([\w/,:]+\w)", finding.message))

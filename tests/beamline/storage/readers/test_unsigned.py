@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ SCAN = TwoCylinders()
     seed=st.integers(0, 99),
     sign=st.sampled_from([np.int16, ">i2"]),
 )
-def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: float, seed: int, sign: object) -> None:
+def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: float, seed: int, sign: Any) -> None:
     rng = np.random.default_rng(seed)
     views = beam * np.exp(-SCAN.line_integrals()[:6]) + noise * rng.standard_normal((6, *SCAN.shape))
     counts = views.clip(0, 65535).astype(np.uint16)
@@ -68,8 +69,8 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         options = SourceOptions(path)
     with open_scan(options) as source:
         assert source.dtype == np.uint16 and source.quantity == "counts"
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 0)), counts)
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 1)), flats)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 0)), counts)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 1)), flats)
         np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
     assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
 
@@ -82,5 +83,5 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
     changes = {"data": counts.view(np.int16), "data_white": flats.view(flats_as)}
     with open_scan(write_exchange(tmp_path / "s.h5", SCAN, changes)) as source:
         assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION)), counts)
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.FLAT)), flats)
+        np.testing.assert_array_equal(source.read(source.table.views), counts)
+        np.testing.assert_array_equal(source.read(source.table.flats), flats)

@@ -77,11 +77,11 @@ def test_angles_in_names_go_with_their_frames_in_the_order_of_numbers(tmp_path: 
     facts = [{"whole": int(a), "thousandths": round(a % 1 * 1000), "degrees": a, "i": i} for i, a in enumerate(degrees)]
     _written(tmp_path, [pattern.format(**fact) for fact in facts])
     with open_scan(tmp_path) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), degrees, atol=1e-9)
+        np.testing.assert_allclose(np.degrees(source.table.angles), degrees, atol=1e-9)
         assert source.read(range(VIEWS))[:, 0, 0].tolist() == list(range(VIEWS))
         assert source.attributes["angles_from"] == "the names of the files"
     with open_scan(SourceOptions(tmp_path, angles=np.radians(degrees[::-1]))) as source:  # those given go first
-        np.testing.assert_allclose(np.degrees(source.angles), degrees[::-1])
+        np.testing.assert_allclose(np.degrees(source.table.angles), degrees[::-1])
 
 
 @pytest.mark.parametrize(
@@ -116,8 +116,8 @@ def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
     (tmp_path / "._angles.txt").write_bytes(b"\0\5\26\7")
     (tmp_path / "angles.txt").write_text("0\n1\n2\n")
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [2, 2, 0, 0, 0]
-        np.testing.assert_allclose(np.degrees(source.angles[2:]), [0, 1, 2])
+        assert source.table.kinds.tolist() == [2, 2, 0, 0, 0]
+        np.testing.assert_allclose(np.degrees(source.table.angles[2:]), [0, 1, 2])
     assert len(load_images(tmp_path, DARK)) == 5
 
 
@@ -136,7 +136,7 @@ def test_references_named_after_the_views_come_after_them(tmp_path: Path, before
             image = np.full(SHAPE, number, np.uint16)
             tifffile.imwrite(tmp_path / folder / f"IMAT0002673{number}_bone_{folder}_{i:04d}.tif", image)
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [2] * 3 + [1] * 2 + [0] * 12 + [1] * 2 + [3]
+        assert source.table.kinds.tolist() == [2] * 3 + [1] * 2 + [0] * 12 + [1] * 2 + [3]
         assert source.read(slice(None))[:, 0, 0].tolist() == [3] * 3 + [1] * 2 + [0] * 12 + [2] * 2 + [4]
         assert [field.value for field in source.not_used] == ["1 image"] and source.ending.missing == ()
 
@@ -167,4 +167,4 @@ def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
     np.save(tmp_path / "theta.npy", np.arange(4.0))
     Image.fromarray(np.zeros(SHAPE, np.uint8)).save(tmp_path / "preview.png")
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [0] * 4
+        assert source.table.kinds.tolist() == [0] * 4
