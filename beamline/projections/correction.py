@@ -24,6 +24,7 @@ from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
+from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.views import spread
 from recon.prep.correct import (
@@ -82,6 +83,12 @@ class ScanCorrection:
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
+        self._fed = np.zeros(0, np.int64)
+
+    @property
+    def _n_views(self) -> int:
+        """Number of views that the scan has, whichever were asked for."""
+        return int((self._source.table.image_key == FrameKind.PROJECTION).sum())
 
     @property
     def photons(self) -> Photons | None:
@@ -183,6 +190,7 @@ class ScanCorrection:
         asked = frames
         data, frames = self._read(frames, None)
         self._tell_unlit(asked, frames)
+        self._fed = np.append(self._fed, frames)
         if self._stream is None:
             self._stream, self._fed_by = self._correction(None), self._shadow
         if not frames.size and not (last and self._stream is not None and self._stream.spots.waiting):
@@ -221,9 +229,12 @@ class ScanCorrection:
 
     @property
     def outdated(self) -> bool:
-        """Whether views already fed would now be corrected differently: by references that came later, or other air
-        columns.
+        """Whether views already fed would now be corrected differently: by references that came later, other air
+        columns, or neighbours in angle that were not taken beside them.
         """
+        finds_spots = np.isfinite(self._selection.step(Preparation).zinger_threshold)
+        if finds_spots and (np.diff(self._by_angle(self._fed)) != 1).any():
+            return True
         if self._beam is None or self._stream is None:
             return False
         more = count_references(self._source) != self._beam.n_references
@@ -261,7 +272,7 @@ class ScanCorrection:
             dark = frames[~alive]
             if rows is None:  # in a band it says nothing of the views
                 self._warn(
-                    f"{dark.size} of {len(frames)} views hold no finite pixel (first: frame {dark[0]}): left out."
+                    f"{dark.size} of {self._n_views} views hold no finite pixel (first: frame {dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
         lit = np.ones(len(frames), np.bool_)
@@ -282,7 +293,7 @@ class ScanCorrection:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self._warn(
-                f"{count(len(copies), 'view')} of {len(frames)} (frames {spans(copies)}) hold the pixels of the view "
+                f"{count(len(copies), 'view')} of {self._n_views} (frames {spans(copies)}) hold the pixels of the view "
                 "before: the camera or its driver gave an image twice. Their angles are then wrong for what they show: "
                 "leave them out with --views or --flags judge, or repeat them."
             )
@@ -307,7 +318,7 @@ class ScanCorrection:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._named_unlit.update(news.tolist())
         self._warn(
-            f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "
+            f"{count(news.size, 'view')} of {self._n_views} (frames {spans(news.tolist())}) have no light: the shutter "
             f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."
         )
 

@@ -22,11 +22,11 @@ from beamline.projections.protocols import EstimatedStep, ScanStep
 from beamline.projections.read import ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
+    report_defects,
     warn_of_joined_views,
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
-    warn_of_unmeasured,
 )
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
@@ -285,7 +285,7 @@ def assemble(
         stretch=_stretch(source, geometry, resampled=resampling is not None),
         sample_radius=_stated_radius(source, selection),
     )
-    warn_of_unmeasured(prepared, first, binning, warn)
+    report_defects(prepared, first, binning, warn)
     warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
 

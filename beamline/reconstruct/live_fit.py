@@ -49,7 +49,10 @@ _BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/be
 _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
-_OUTDATED = "Flats or darks came after views, or air columns changed: all views are corrected again"
+_OUTDATED = (
+    "Flats or darks came after views, air columns changed, or views between others came later, beside which spots "
+    "show: all views are corrected again"
+)
 _NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
 _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
 _WIDE = "The wide views of the scan are corrected with all others, as the volume of a wide sample takes them"

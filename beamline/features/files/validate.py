@@ -20,7 +20,7 @@ from beamline.features.files.frame_log import framestamp_order, time_order
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.transforms import brief_source
+from beamline.storage.readers.transforms import WRAPPED, brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
@@ -101,13 +101,16 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
-    """Findings in an open scan: its content, its references, and its flagged frames."""
+    """Findings in an open scan: its content, its references, and its flagged frames. Numbers that wrapped explain all
+    that light and references show."""
     findings = list[Finding]()
     for rule in (*SOURCE_RULES, central_ray_taken, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
         except TakesTooLongError as error:
             findings.append(Finding("warning", "brief", str(error)))
+    if any(finding.rule == WRAPPED and finding.severity == "error" for finding in findings):
+        findings = [finding for finding in findings if finding.rule not in ("light", "bad-references")]
     return [*dict.fromkeys(findings)]
 
 

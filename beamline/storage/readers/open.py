@@ -218,7 +218,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     flat = np.median(looked[1], axis=0) if len(looked) > 1 else None  # of darks alone it is dim
     wraps = [wrapped_edges(images, images.dtype, flat) for images in looked]
     if any(below for _, below in wraps) and all(below for edges, below in wraps if edges):
-        base = without_wraps(base, sum(edges for edges, _ in wraps))
+        base = without_wraps(base, sum(edges for edges, _ in wraps), max(below for _, below in wraps))
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
