@@ -114,7 +114,7 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
     given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = entered(projector, given.data, given.rays, None, True, watch, decide)
+    scan, _ = entered(projector, given.data, given.weights, None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 

@@ -154,7 +154,7 @@ def _refitted(
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     given = problem.views.masked()
-    data, known = given.data, given.rays
+    data, known = given.data, given.weights
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
     def told(iteration: int, residual: float) -> bool:

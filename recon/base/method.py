@@ -179,7 +179,7 @@ class ReconProblem:
     wide: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "use", replace(self.use, weights=self.views.rays))
+        object.__setattr__(self, "use", replace(self.use, weights=self.views.weights))
 
     @property
     def projections(self) -> F32:

@@ -156,7 +156,7 @@ def finish(
         return control.stop()
 
     refined = solve(
-        method, projector, data, weight=prepared.rays, start=start, nonnegative=nonnegative,
+        method, projector, data, weight=prepared.weights, start=start, nonnegative=nonnegative,
         watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
     )  # fmt: skip
     return Finished(refined, min(count, made))
@@ -180,5 +180,5 @@ def _without_outliers(views: Views, model: F32) -> Views:
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return views
-    kept = np.where(wild, np.float32(0), np.float32(1) if (rays := views.rays) is None else rays)
+    kept = np.where(wild, np.float32(0), np.float32(1) if (rays := views.weights) is None else rays)
     return replace(views, weights=kept).masked()

@@ -82,7 +82,7 @@ class _FitViews:
             )
         used, apart = used_and_kept_back(problem.geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         views = problem.views.masked()
-        if (rays := views.rays) is not None:  # only ratios mean something: total variation has a weight of its own
+        if (rays := views.weights) is not None:  # only ratios mean something: total variation has a weight of its own
             views = replace(views, weights=rays / np.float32(usual_weight(rays, views.data)))
         blank = apart[~views.data[apart].any(axis=(1, 2))]
         if blank.size:
@@ -108,7 +108,7 @@ class _FitViews:
             return None
         geometry = self.kept_back.geometry.at_row(0).seen_with(self.seen.geometry.width)
         views = join_pixels(replace(self.kept_back, geometry=geometry), self.joined)
-        return fit.problem_of(views.data, views.geometry, self.field, unit, settings, problem.backend, views.rays)
+        return fit.problem_of(views.data, views.geometry, self.field, unit, settings, problem.backend, views.weights)
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
@@ -244,7 +244,7 @@ def _started(
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
     fitting = fit.problem_of(
-        views.seen.data, views.seen.geometry, views.field, state.unit, settings, backend, views.seen.rays
+        views.seen.data, views.seen.geometry, views.field, state.unit, settings, backend, views.seen.weights
     )
     if settings.tv_weight is None:
         change = decide(

@@ -204,7 +204,7 @@ class VoxelMethod(Checked, ABC):
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         volume = solve(
-            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.rays,
+            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
             nonnegative=not settings["allow_negative"], watch=watch, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}

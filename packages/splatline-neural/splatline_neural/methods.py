@@ -135,7 +135,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
         warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
     used = np.setdiff1d(np.arange(geometry.n_views), np.asarray(problem.use.held_out, int))
     given = problem.views.masked()
-    data, weights = given.data, given.rays
+    data, weights = given.data, given.weights
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
     if unit <= 0 or not (data[used] > 0).any():

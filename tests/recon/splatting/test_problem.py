@@ -98,7 +98,7 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
     weights[rng.random(data.shape) < share] = 0
     weights[:, 0, 0] = 1  # no view is blind
     joined = join_pixels(Views(data, VIEWS, weights), factor)
-    found, kept, views = joined.data, joined.rays, joined.geometry
+    found, kept, views = joined.data, joined.weights, joined.geometry
     rows, cols = 12 // factor, 18 // factor
     assert kept is not None and found.shape == kept.shape == (3, rows, cols) == (3, *views.detector_shape)
     for view, row, col in np.ndindex(3, rows, cols):
