@@ -24,7 +24,6 @@ from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ViewLight, usual_exposure
 from beamline.storage.rules.scan import altered_sentence
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.views import spread
 from recon.prep.correct import (
@@ -84,11 +83,6 @@ class ScanCorrection:
         self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
         self._fed = np.zeros(0, np.int64)
-
-    @property
-    def _n_views(self) -> int:
-        """Number of views that the scan has, whichever were asked for."""
-        return int((self._source.table.image_key == FrameKind.PROJECTION).sum())
 
     @property
     def photons(self) -> Photons | None:
@@ -272,7 +266,8 @@ class ScanCorrection:
             dark = frames[~alive]
             if rows is None:  # in a band it says nothing of the views
                 self._warn(
-                    f"{dark.size} of {self._n_views} views hold no finite pixel (first: frame {dark[0]}): left out."
+                    f"{dark.size} of {self._source.table.views.size} views hold no finite pixel (first: frame "
+                    f"{dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
         lit = np.ones(len(frames), np.bool_)
@@ -293,7 +288,8 @@ class ScanCorrection:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self._warn(
-                f"{count(len(copies), 'view')} of {self._n_views} (frames {spans(copies)}) hold the pixels of the view "
+                f"{count(len(copies), 'view')} of {self._source.table.views.size} "
+                f"(frames {spans(copies)}) hold the pixels of the view "
                 "before: the camera or its driver gave an image twice. Their angles are then wrong for what they show: "
                 "leave them out with --views or --flags judge, or repeat them."
             )
@@ -318,7 +314,8 @@ class ScanCorrection:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._named_unlit.update(news.tolist())
         self._warn(
-            f"{count(news.size, 'view')} of {self._n_views} (frames {spans(news.tolist())}) have no light: the shutter "
+            f"{count(news.size, 'view')} of {self._source.table.views.size} "
+            f"(frames {spans(news.tolist())}) have no light: the shutter "
             f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."
         )
 

@@ -248,7 +248,7 @@ def measured_share(known: Mask, geometry: Geometry, grid: Grid) -> F32:
     some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _LOOKED_AT)))
     projector, rays = Projector(some, grid, matched=False), np.ones((some.n_views, *some.detector_shape), np.float32)
     every = projector.adjoint(rays)
-    return projector.adjoint(rays * known[:, None]) / np.maximum(every, np.finfo(np.float32).tiny)
+    return np.asarray(projector.adjoint(rays * known[:, None]) / np.maximum(every, np.float32(1e-30)), np.float32)
 
 
 def volume_slices(lines: F32) -> F32:
