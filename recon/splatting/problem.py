@@ -153,7 +153,10 @@ def join_pixels(views: Views, factor: int) -> Views:
     Raises:
         ValueError: as `binned_geometry`.
     """
-    return views if factor == 1 else views.binned(factor, binned_geometry(views.geometry, factor))
+    if factor == 1:
+        return views
+    geometry = binned_geometry(views.geometry, factor)
+    return views.binned(factor, geometry)
 
 
 def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:

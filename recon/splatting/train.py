@@ -229,7 +229,7 @@ def _started(
     method: FitMethod, problem: ReconProblem, control: RunControl, decide: Decisions, views: _FitViews, begin: float
 ) -> _Run:
     """The fit before its first step, or as a checkpoint holds it."""
-    now, settings, start, backend = control.now, method.fit, method.gaussians, backend_for(problem.device)
+    settings, start, backend = method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
     first = None
     if control.resume is None:
@@ -253,11 +253,8 @@ def _started(
         fitting = replace(fitting, change=change)
     unseen = views.unseen(fitting, settings, state.unit)
     tracker = HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
-    seconds = method.seconds
-    if seconds is not None:
-        seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     planned = method.finish_sweeps == 0 or method.seconds is None
-    length = _Length(method.planned_steps, seconds, method.finish, True, planned)
+    length = _Length(method.planned_steps, method.seconds, method.finish, True, planned)
     if length.steps is not None:
         settings = in_steps(settings, length.steps)
     return _Run(method, problem, control, decide, views, begin, end, state, fitting, tracker, length, settings)
@@ -266,6 +263,9 @@ def _started(
 def _steps(run: _Run) -> None:
     """The steps of the fit, to its end or until it is stopped."""
     now, length, state, method = run.control.now, run.length, run.state, run.method
+    if length.seconds is not None:  # the volume is filled after the steps
+        filling = fill_seconds(fit.gaussians_of(state, run.fitting.backend), run.problem.grid, now)
+        length.seconds = max(0.0, run.end - filling - now())
     begin = reported = saved = now()
     done = 0
     while length.steps is None or state.step < length.steps:

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
+from recon.auto import Auto
 from recon.base.geometry import Geometry
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
@@ -138,7 +139,7 @@ def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generato
     grid = Grid.matching(views)
     truth = (0.02 * (1 + rng.integers(0, 3, (3, 8, 8)))).astype(np.float32).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     data = Projector(views, grid).forward(truth) + rng.normal(0, 0.01, (40, 12, 32)).astype(np.float32)
-    fitted, found = (reconstruct(data, views, fit).volume.data for fit in (R2(finish=0), R2()))
+    fitted, found = (reconstruct(data, views, method).volume.data for method in (R2(finish=0), Auto()))
     assert psnr(truth, found) > psnr(truth, fitted) + 3
 
 
