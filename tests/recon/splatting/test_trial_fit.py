@@ -49,7 +49,7 @@ def problem(rng: np.random.Generator) -> ReconProblem:
 def test_a_fit_that_voxels_lead_ends_after_a_quarter_of_its_steps(problem: ReconProblem) -> None:
     poor = Poor()
     choice = Auto((Fbp(), FistaTv(), PnpDct(), poor)).choose(problem, RunControl())
-    assert choice.at in (1, 2) and choice.prior is not None and choice.prior.strength > 0
+    assert choice.at in (1, 2) and choice.prior is not None and choice.prior.weight > 0
     assert poor.views == [26]  # views held out are not fitted
     assert "r2 stopped after 25% of its steps" in choice.reason and "a full trial: about" in choice.reason
     poor.views.clear()
