@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
+from beamline.monitor.evidence import lit_places
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
@@ -64,7 +65,7 @@ class OpenBeam:
         Args:
             read: detector rows that are read.
             rows: those of them that are wanted.
-            warn: takes a sentence on damaged frames, and on parts of the scan without flats.
+            warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
 
         Raises:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
@@ -74,7 +75,7 @@ class OpenBeam:
         alike = not (asked.by_current or views_differ(source))
         light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
         used = groups_taken(source) if asked.accepted else reference_groups(source)
-        references = read_references(source, used, read, selection)
+        references = read_references(source, used, read, selection, warn)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
         tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
@@ -197,12 +198,13 @@ def photons_of(
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons per pixel in the open beam, the median of the flats."""
+    """Photons per pixel in the open beam, the median of the flats where the beam is, see `lit_places`."""
     return _counts_of_light(references) / photons.gain
 
 
 def _counts_of_light(references: References) -> float:
-    return float(np.median(references.flats[0][1] - references.dark))
+    light = references.flats[0][1] - references.dark
+    return float(np.median(light[lit] if (lit := lit_places(light)).any() else light))
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:

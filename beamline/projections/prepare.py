@@ -27,7 +27,6 @@ from beamline.projections.scan_warnings import (
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
-    warn_of_unmeasured_rows,
 )
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
@@ -252,7 +251,6 @@ def assemble(
     """
     rows, (height, width) = rows_of(source, selection), geometry.detector_shape
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
-    report_defects(projections, first, binning, warn)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
@@ -287,7 +285,7 @@ def assemble(
         stretch=_stretch(source, geometry, resampled=resampling is not None),
         sample_radius=_stated_radius(source, selection),
     )
-    warn_of_unmeasured_rows(prepared, warn)
+    report_defects(prepared, first, binning, warn)
     warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
 

@@ -152,15 +152,16 @@ class AxisSearch:
         if views.size < self._next and not passed and not ended:
             return
         self._next, self.settled = views.size + views.size // 2, ended
-        self._search(correction, views, ended and self.col is None)
+        self._search(correction, views, ended)
         if self.col is None and np.pi / 2 <= self._turned < np.pi and not self._told:
             self._told = True
             self._warn(_UNKNOWN)
 
-    def _search(self, correction: ScanCorrection, views: NDArray[np.int64], last_chance: bool) -> None:
+    def _search(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
+        last_chance = ended and self.col is None
         warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
         try:
-            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
+            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=ended)
         except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise

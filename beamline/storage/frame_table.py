@@ -192,6 +192,7 @@ class FrameTable:
         columns: dict[str, Any] = {name: _joined([getattr(table, name) for table in tables], sizes) for name in _ARRAYS}
         for name in ("part_starts", "pass_ends"):
             columns[name] = np.concatenate([getattr(table, name) + n for table, n in zip(tables, before, strict=True)])
+        columns["part_starts"] = np.unique(columns["part_starts"])  # an empty part is none beside another
         if (replaces := columns["replaces"]) is not None:
             columns["replaces"] = np.where(replaces < 0, -1, replaces + np.repeat(before, sizes))
         flags = FrameFlags.joined([table.flags for table in tables], sizes)

@@ -95,7 +95,7 @@ def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
     """Triggers, counted within their block, of the references after the last view of all files."""
     table = FrameTable.concat([frames_in(file) for file in files])
-    after = table.views.max(initial=len(table))
+    after = table.views[-1] if table.views.size else len(table)
     rows = {kind: table.of_kind(kind) for kind in (FrameKind.FLAT, FrameKind.DARK)}
     return {kind: set(table.triggers[some[some > after]].tolist()) for kind, some in rows.items()}
 

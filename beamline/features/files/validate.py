@@ -20,13 +20,14 @@ from beamline.features.files.frame_log import framestamp_order, time_order
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.transforms import brief_source
+from beamline.storage.readers.transforms import WRAPPED, brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held
@@ -100,13 +101,16 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
-    """Findings in an open scan: its content, its references, and its flagged frames."""
+    """Findings in an open scan: its content, its references, and its flagged frames. Numbers that wrapped explain all
+    that light and references show."""
     findings = list[Finding]()
     for rule in (*SOURCE_RULES, central_ray_taken, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
         except TakesTooLongError as error:
             findings.append(Finding("warning", "brief", str(error)))
+    if any(finding.rule == WRAPPED and finding.severity == "error" for finding in findings):
+        findings = [finding for finding in findings if finding.rule not in ("light", "bad-references")]
     return [*dict.fromkeys(findings)]
 
 
@@ -245,7 +249,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
-            *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),
+            *(each.message for each in findings if each.severity != "info" or each.rule in (CONSTANT_DARKS, SINOGRAM)),
             *([altered_sentence(source)] if source.table.altered.any() else []),
             *(_fringes(brief) if facts["reconstructable"] else []),
         ],

@@ -29,12 +29,14 @@ WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field of a file that is ignored: its path, its value, why or what to do, and whether it may matter."""
+    """A field of a file that is ignored: its path, its value, why or what to do, whether it may matter, and whether a
+    volume without it is wrong by more than a hundredth."""
 
     where: str
     value: str
     why: str
     doubt: bool
+    wrong: bool = False
 
 
 class ScanSource(ABC):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import open_array_file, zarr_root
+from beamline.storage.array_file import open_array_file, zarr_root
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
@@ -23,16 +23,16 @@ from beamline.storage.readers.fields import (
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import (
+from beamline.storage.readers.orders import (
     SINOGRAM,
     USUAL,
-    FrameStack,
     Order,
-    StacksSource,
     as_frames,
+    dimensions,
     dimensions_without_ones,
     order_of_axes,
 )
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
@@ -63,7 +63,8 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             for kind, where, item in items
             if item is not None
         ]
-        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
+        facts = {**_attributes(file), "dimensions": dimensions(usual)}
+        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=facts)
         source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
         if source.grows:
             source.rows = source.rows[:0]

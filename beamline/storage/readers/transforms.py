@@ -287,13 +287,14 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
+_NEARER = (10, 20, 40, 80, 160)  # parts of the range at the top, of which one holds what lies below 0, and no light
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 _SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
 
 
-def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, bool]:
-    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
-    all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, int]:
+    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and the
+    count from which on all lies below 0, as counts below a dark that was taken off them; 0: it is light.
 
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
     at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
@@ -301,7 +302,7 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     it.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
-        return 0, False
+        return 0, 0
     counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
     top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
@@ -309,23 +310,34 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     steps &= upper[..., 2:-1] == upper[..., 3:]
     change, above = np.abs(np.diff(counts)), upper[..., 1:-2]
     if flat is not None:
-        lit = flat - np.iinfo(dtype).min >= whole - whole // _NEAR
+        flat = flat - np.iinfo(dtype).min
+        lit = flat >= whole - whole // _NEAR
         beside = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
         steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * beside)
     edges = int(steps.sum())
     of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
     most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
     if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
-        return 0, False
+        return 0, 0
     if np.median(of_low) < _ALIKE * np.median(of_high):
-        return 0, False
-    steps_left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
-    return edges, bool(steps_left.sum() < _A_ROW * edges)
+        return 0, 0
+    at_top = np.maximum(counts[..., 1:-2], counts[..., 2:-1])[steps]
+    flats = np.zeros((1, 2)) if flat is None else flat
+    for least in (whole - whole // part for part in _NEARER):
+        odd = int((at_top < least).sum()) + _crossings(counts, least)
+        if odd < _A_ROW * edges and np.mean(flats >= least) < 0.5 and _crossings(flats, least) < _A_ROW * len(flats):
+            return edges, least + np.iinfo(dtype).min
+    return edges, 0
 
 
-def without_wraps(base: ScanSource, edges: int) -> ScanSource:
-    """A scan whose counts near the end of their range, which lay below a dark taken off them, are 0."""
-    least = 2**16 - 2**16 // _NEAR
+def _crossings(counts: NDArray[Any], least: int) -> int:
+    """Neighbours in a row on either side of `least` that differ by less than what is left of the range above it."""
+    over = counts >= least
+    return int(((over[..., 1:] != over[..., :-1]) & (np.abs(np.diff(counts)) < 2**16 - least)).sum())
+
+
+def without_wraps(base: ScanSource, edges: int, least: int) -> ScanSource:
+    """A scan whose counts from `least` on, which lay below a dark taken off them, are 0."""
     fact = (
         f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as 16-bit "
         f"whole numbers do where the dark subtracted from them was larger. Those from {least} on are taken as 0. "

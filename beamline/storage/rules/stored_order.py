@@ -132,6 +132,26 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
         )
 
 
+SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
+
+
+def sinogram_said(source: ScanSource) -> Iterator[Finding]:
+    """One array [view, col] has no rows: what is taken for its views, and how another order is said."""
+    axes = str(source.attributes.get("dimensions", "")).split(",")
+    if sorted(axes) == ["col", "frame"]:
+        n = source.table.views.size
+        first = axes[0] == "frame"
+        option = "--order col,view" if first else "--order view,col"
+        if source.format == "data_exchange":
+            option = f"the attribute axes of /exchange/data ({'x:theta' if first else 'theta:x'})"
+        yield Finding(
+            "info",
+            SINOGRAM,
+            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
+            f"Where these are exchanged, {option} says so.",
+        )
+
+
 def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
     """Share of the change of values [view, of each] that is a sine of the angles [view]."""
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])

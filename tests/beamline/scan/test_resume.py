@@ -32,7 +32,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.interrupted import whole_scan
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import overlaid
+from beamline.storage.readers.reference_files import overlaid
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind

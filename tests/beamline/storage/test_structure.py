@@ -18,7 +18,7 @@ from beamline.storage import datasets, structure
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.volume_file import read_volume
 from drivers.base.frame import Frame, FrameKind
 

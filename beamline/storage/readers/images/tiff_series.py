@@ -28,8 +28,8 @@ from beamline.core.errors import DataError
 from beamline.core.files import TEXT, decoded, is_below, text_in
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
+from beamline.storage.array_file import zarr_root
 from beamline.storage.datasets import require_real
-from beamline.storage.foreign_zarr import zarr_root
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.packing import packing
@@ -60,7 +60,7 @@ LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-_SCALES = "scaleoffset.json"
+_SCALES, _PICTURE = "scaleoffset.json", ".png"
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
@@ -296,6 +296,8 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
+    if path.suffix.lower() == _PICTURE and path.is_file():
+        return Frames(TiffSeriesSource(path.parent, listed=[path.name]), path=path)
     scene = _scene_of(path)
     return _with_values(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
 
@@ -318,7 +320,7 @@ FORMAT = ScanFormat(
     "a folder or .zip of images (TIFF, .npy or PNG), or a scene of R²-Gaussian",
     lambda path, opening: (
         (path.is_dir() and zarr_root(path) is None)
-        or (path.is_file() and path.suffix.lower() == ".zip" and zarr_root(path) is None)
+        or (path.is_file() and path.suffix.lower() in (".zip", _PICTURE) and zarr_root(path) is None)
         or _scene_of(path) is not None
     ),
     _open,

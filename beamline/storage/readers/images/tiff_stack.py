@@ -65,7 +65,7 @@ class TiffStackSource(ScanSource):
         refuse_packed(self._tif)
         require_possible(self._tif)
         series, *others = parts = images_of(self._tif)
-        if len(series.shape) not in (2, 3) or others:
+        if len(series.shape) not in (2, 3) or others or "S" in series.axes:  # samples of a colour
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
             shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")

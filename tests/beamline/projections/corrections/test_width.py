@@ -39,7 +39,7 @@ def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple
 
 def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
     unknown = _source()
-    unknown.exposures[:] = np.nan
+    unknown.table.exposures[:] = np.nan
     for source in (_source("step"), unknown):
         before, after, done = _rays(Width(), source)
         assert after is before and (done.sentence, done.parameters) == ("", {})

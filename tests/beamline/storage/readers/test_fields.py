@@ -11,7 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
+from beamline.projections.selection import Selection
+from beamline.projections.views import checked_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -299,9 +302,33 @@ def test_pixel_sizes_that_differ_from_view_to_view(tmp_path: Path, side: str, n:
         sizes = np.r_[[9.0] * (n - VIEWS), 6.5 * (1 + spread * np.linspace(-1, 1, VIEWS))]
         path = nxtomo(tmp_path / "s.nx", (f"detector/{side}_pixel_size", sizes, "um"))
         hits = [hit for hit in validate(path) if f"detector/{side}_pixel_size" in hit.message]
-        assert all(hit.severity == "warning" and "differs from view to view" in hit.message for hit in hits)
+        assert all(hit.severity == "error" and "differs from view to view" in hit.message for hit in hits)
         return [hit.message for hit in hits]
 
     assert not said(0.1)  # 0.3 of a pixel at the edge of six columns
     (message,) = said(0.2)
     assert "by up to 0.6 px" in message
+
+
+@pytest.mark.parametrize("option", [{}, {"pixel_size_mm": 0.0065}])
+def test_a_volume_of_sizes_that_differ_is_refused_unless_one_is_said(tmp_path: Path, option: dict[str, float]) -> None:
+    sizes = 6.5 * (1 + 0.2 * np.linspace(-1, 1, VIEWS))
+    refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/x_pixel_size", sizes, "um")), Selection(**option))  # type: ignore[arg-type]
+    assert ("differs from view to view" in refused) == (not option)
+
+
+@pytest.mark.parametrize("cone", [None, (10.0, 20.0)])
+def test_a_scan_is_judged_as_the_beam_that_is_said(tmp_path: Path, cone: tuple[float, float] | None) -> None:
+    """High pixels are slices apart in a parallel beam, and refused in a cone."""
+    refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/y_pixel_size", 2e-6, "m")), Selection(cone=cone))
+    assert ("in a cone beam" in refused) == (cone is not None)
+
+
+def _refused(path: Path, selection: Selection) -> str:
+    """Why `recon` refuses a scan; "" if it does not."""
+    with open_scan(path) as source:
+        try:
+            checked_views(source, selection, lambda sentence: None)
+        except DataError as error:
+            return str(error)
+    return ""

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
-from beamline.storage.readers.replacements import overlaid
+from beamline.storage.readers.reference_files import overlaid
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO
@@ -141,11 +141,9 @@ def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
         np.testing.assert_array_equal(source.table.angles, [np.nan, np.nan, 0, 1, 2, np.nan])
 
 
-def test_float_frames_are_of_unknown_quantity_and_no_frames_of_a_camera(tmp_path: Path) -> None:
+def test_float_frames_are_of_unknown_quantity_and_stay_floats(tmp_path: Path) -> None:
     with open_scan(foreign(tmp_path / "f.nxs", dtype="f4")) as source:
-        assert source.quantity == "unknown"
-        with pytest.raises(DataError, match="uint16"):
-            next(source.frames())
+        assert source.quantity == "unknown" and next(source.frames()).counts.dtype == np.float32
 
 
 def test_several_entries_need_a_default(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.readers.transforms import type_wrapped
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders, write_exchange, write_nxtomo

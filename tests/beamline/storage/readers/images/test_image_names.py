@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12
@@ -150,16 +151,25 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     for suffix, picture in (("jpg", np.zeros(SHAPE, np.uint8)), ("png", np.zeros((*SHAPE, 3), np.uint8))):
         (tmp_path / suffix).mkdir()
         Image.fromarray(picture).save(tmp_path / suffix / f"p_1.{suffix}")
-    np.savez(tmp_path / "s.npz", a=picture)
+    np.savez(tmp_path / "s.npz", a=picture, settings=np.array({"mode": "cone"}, object))
     (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")
     for name, message in {
-        "jpg": r"pictures such as p_1.jpg, .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
+        "jpg": r"pictures such as p_1.jpg .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
         "png": "its pixels are RGB, 6 x 4; expected grey ones",
-        "s.npz": "arrays saved by Python.*np.save",
+        "s.npz": "objects of Python among its arrays, which are pickles.*numpy.savez",
         "s.pickle": "is a pickle, which is never opened here.*np.save",
     }.items():
         with pytest.raises(DataError, match=message):
             open_scan(tmp_path / name)
+
+
+@pytest.mark.parametrize("quantity", ["counts", None])
+def test_folders_of_references_beside_the_views_are_named(tmp_path: Path, quantity: str | None) -> None:
+    for name in ("Tomo", "Flat_Before", "Dark_After"):
+        _written(tmp_path / name, [f"IMAT_{name}_{i}.tif" for i in range(4)])
+    found = validate(SourceOptions(tmp_path / "Tomo", angles=np.arange(4.0), quantity=quantity))  # type: ignore[arg-type]
+    said = " ".join(each.message for each in found if each.rule == "references")
+    assert f"Beside it lie Dark_After, Flat_Before: {tmp_path} is read with all of them" in said
 
 
 def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)

@@ -12,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.readers.transforms import real_type
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders
