@@ -26,8 +26,8 @@ from recon.base.volume import Grid
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import ViewResolution, at_voxel_resolution
-from recon.voxels.voxel_problem import VoxelProblem, whitened
+from recon.voxels.residuals import unseen_residuals
+from recon.voxels.voxel_problem import VoxelProblem
 
 TRIAL_SWEEPS = 20
 """Sweeps of total variation in a trial, and by default of `FistaTv`: a trial that gets less far than its volume prefers
@@ -82,27 +82,6 @@ def cheapest_not_led(residuals: Sequence[F64 | None], least_gain: float = LEAST_
         return None
     best = min(tried.values(), key=lambda each: float(each.mean()))
     return next(at for at, each in tried.items() if not leads(best, each, least_gain))
-
-
-def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """[view] root mean square residual of a volume in each view, at the resolution of voxels.
-
-    The truth leaves the noise alone, by that; of views as measured it would leave more than a sharper volume does.
-
-    Args:
-        model: [view, col, row], the projection of the volume by a `Projector` of this resolution.
-        views: line integrals as measured, less what no voxel can explain. Values that are not finite do not count.
-        weight: of the rays; None: one for all.
-
-    Returns:
-        One value for each view of which a ray counts; [inf] where there is none.
-    """
-    counts = np.isfinite(views) if weight is None else np.isfinite(views) & (weight > 0)
-    left = whitened(model - at_voxel_resolution(views, resolution, counts), weight)
-    counting = [view[there] for view, there in zip(left, counts, strict=True) if there.any()]
-    if not counting:
-        return np.full(1, np.inf)
-    return np.sqrt(np.array([np.mean(np.square(view, dtype=np.float64)) for view in counting]))
 
 
 def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

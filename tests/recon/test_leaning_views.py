@@ -12,6 +12,7 @@ from recon import methods
 from recon.auto import Auto, part_of
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
+from recon.base.views import Views
 from recon.voxels.odd_views import odd_views
 from recon.voxels.projector import Projector, seen_rays
 from tests.recon.helpers import data_residual
@@ -118,6 +119,6 @@ def test_a_view_that_differs_is_found_among_leaning_ones(cone: bool, rng: np.ran
     geometry = leaning(cone)
     data = rays(geometry) + rng.normal(0, 0.003, (32, 32, 38)).astype(np.float32)
     truth = recon.Volume(smooth_ball(GRID, AXES, CENTRE), GRID)
-    assert odd_views(truth, data, geometry, None) == ()
+    assert odd_views(truth, Views(data, geometry)) == ()
     data[11, 10:20, 14:24] += 0.1
-    assert [odd.view for odd in odd_views(truth, data, geometry, None)] == [11]
+    assert [odd.view for odd in odd_views(truth, Views(data, geometry))] == [11]
